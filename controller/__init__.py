@@ -1,0 +1,1 @@
+"""The controller on the PC: rig, capture, archive, jobs, HTTP interface and page."""

@@ -1,0 +1,35 @@
+"""From a session of images to displacement, stretch and strain of the whole surface, with nothing to click.
+
+Conventions, stated once
+------------------------
+Lengths are millimetres, image positions pixels, angles radians (degrees only in ``rig.toml``).
+
+Pixel
+    (0, 0) is the centre of the top-left pixel, x to the right, y down. A position is ``(x, y)``; an image array
+    is indexed ``[y, x]``.
+World
+    The frame of the calibration target: z along the cylinder's axis, upwards, z = 0 at its lower edge; dot
+    column 1 lies on +x; columns run counter-clockwise seen from +z. Right-handed.
+Camera
+    Poses map world to camera: ``X_camera = R X_world + t``; camera axes x right, y down, z forward.
+    ``K = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]``; ``distortion = (k1, k2, p1, p2, k3)`` after Brown-Conrady.
+    A *distorted* pixel is what the image shows. An *undistorted* pixel is ``(fx x + cx, fy y + cy)``: the skew
+    goes with the distortion. Projection matrices ``P`` (3, 4) and the DLT parameters act on undistorted pixels.
+Mesh
+    Triangles are vertex indices (M, 3), counter-clockwise seen from outside: normals point outwards.
+Correlation
+    ``C_LS = 2 (1 - ZNCC)`` from 0 (best) to 4. Displacement ``uv`` is current minus reference position, given at
+    the reference position; ``gradient[i, j] = d u_i / d x_j``.
+Deformation
+    ``F`` maps reference to current; ``C = FᵀF``, ``E = (C - I)/2``, ``e = (I - B⁻¹)/2``; λ1 ≤ λ2 are the in-plane
+    principal stretches, ``J = λ1 λ2``.
+Lost points
+    A point that could not be measured is NaN and carries a status; it is never an exception and never zero.
+
+The rooms
+---------
+``session`` and ``rig`` read what was captured; ``images`` decodes; ``calibration`` finds the cameras;
+``correlation`` matches images; ``triangulation`` lifts matches into space; ``deformation`` and ``rigid_motion``
+turn positions into strain; ``results`` and ``export`` keep them. Stages do not know one another: ``pipeline`` is
+the only place that joins them.
+"""

@@ -1,0 +1,154 @@
+"""The session folder: the interface between capture and processing. Standard library only.
+
+::
+
+    SESSION/
+      rig.toml                    the rig as used
+      session.json                schema, session, rig, created, source (capture | import)
+      captures/
+        0001-board/               NNNN-kind; kinds: board, target, specimen, static
+          capture.json            the record: per camera status, file, SHA-256, times, exposure, metadata
+          201.pgm …               one image a camera, byte for byte as delivered
+        0002-target/ …
+        0003-specimen/ …          the first specimen capture is the reference, the others are the steps
+      mask/<camera>.png           optional region of interest on the reference image
+      results/
+        0001/ …                   one folder a processing run, written aside and renamed
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from shutil import rmtree
+from typing import Any
+
+from processing.errors import InputError
+from processing.rig import Rig, read_rig
+
+KINDS = ("board", "target", "specimen", "static")
+_CAPTURE_NAME = re.compile(r"(\d{4,})-(board|target|specimen|static)")
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One capture of a session. ``images`` maps camera ids to the image files that arrived."""
+
+    id: str
+    number: int
+    kind: str
+    folder: Path
+    images: dict[str, Path]
+    record: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Session:
+    """A session folder, read. Captures are in order of their number."""
+
+    path: Path
+    name: str
+    rig: Rig
+    captures: tuple[Capture, ...]
+
+    def of_kind(self, kind: str) -> tuple[Capture, ...]:
+        """The captures of one kind, in order."""
+        return tuple(capture for capture in self.captures if capture.kind == kind)
+
+    def mask(self, camera_id: str) -> Path | None:
+        """The region of interest given for a camera, if any."""
+        path = self.path / "mask" / f"{camera_id}.png"
+        return path if path.is_file() else None
+
+    def runs(self) -> tuple[Path, ...]:
+        """Finished processing runs, oldest first."""
+        return runs(self.path)
+
+
+def read_session(path: Path) -> Session:
+    """The session of a folder; InputError says what is missing."""
+    path = Path(path)
+    if not path.is_dir():
+        raise InputError(f"{path}: no such session folder")
+    if not (path / "session.json").is_file():
+        raise InputError(
+            f"{path}: not a session (no session.json); "
+            f"a folder of images becomes one with 'ringdic import {path} SESSION'"
+        )
+    header = _read_json(path / "session.json")
+    captures = sorted(_captures(path / "captures"), key=lambda capture: capture.number)
+    return Session(path, str(header.get("session", path.name)), read_rig(path / "rig.toml"), tuple(captures))
+
+
+def runs(path: Path) -> tuple[Path, ...]:
+    """Finished processing runs of a session folder, oldest first."""
+    results = Path(path) / "results"
+    if not results.is_dir():
+        return ()
+    return tuple(sorted(p for p in results.iterdir() if p.is_dir() and p.name.isdigit()))
+
+
+def newest_results(path: Path) -> Path:
+    """The results file of the newest run; InputError if the session has not been processed."""
+    finished = runs(path)
+    if not finished:
+        raise InputError(f"{path}: no results yet; run 'ringdic process {path}' first")
+    return finished[-1] / "results.h5"
+
+
+@contextmanager
+def new_run(path: Path) -> Iterator[Path]:
+    """A folder to write a run into; it gets its number when everything is written, and never replaces another.
+
+    A run that fails leaves nothing behind.
+    """
+    results = Path(path) / "results"
+    results.mkdir(exist_ok=True)
+    number = 1 + max((int(p.name) for p in runs(path)), default=0)
+    while True:
+        partial = results / f".{number:04d}.partial"
+        try:
+            partial.mkdir()
+            break
+        except FileExistsError:  # another run is at work, or one was killed: leave its folder alone
+            number += 1
+    try:
+        yield partial
+        while (results / f"{number:04d}").exists():
+            number += 1
+        partial.rename(results / f"{number:04d}")
+    except BaseException:
+        rmtree(partial, ignore_errors=True)
+        raise
+
+
+def _captures(folder: Path) -> Iterator[Capture]:
+    if not folder.is_dir():
+        return
+    for path in folder.iterdir():
+        match = _CAPTURE_NAME.fullmatch(path.name)
+        if not match or not (path / "capture.json").is_file():
+            continue
+        record = _read_json(path / "capture.json")
+        images = {
+            camera_id: path / frame["file"]
+            for camera_id, frame in record.get("cameras", {}).items()
+            if frame.get("file")
+        }
+        for camera_id, image in images.items():
+            if not image.is_file():
+                raise InputError(
+                    f"{image}: the record of {path.name} names this image of camera {camera_id}, but it is not there"
+                )
+        yield Capture(path.name, int(match[1]), match[2], path, images, record)
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not readable as JSON ({error})") from error
