@@ -1,0 +1,155 @@
+"""``ringdic …``: a thin table of commands over the packages' public functions.
+
+Exit codes: 0 done, 2 bad input, 3 could not be computed, 1 a bug.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from controller.console import narrated, show_table
+from processing.errors import RingdicError
+
+app = typer.Typer(
+    name="ringdic",
+    help="Multi-view 3D digital image correlation, from trigger to strain map.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
+Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="A setting; repeatable.")]
+SettingsFile = Annotated[Path | None, typer.Option("--settings", help="Settings as a TOML file.")]
+
+
+@app.command()
+def demo(
+    cameras: Annotated[int, typer.Option(min=4, max=30, help="Cameras on the ring.")] = 12,
+    scale: Annotated[float, typer.Option(min=0.1, max=1.0, help="Image size; 1 is 2464 x 3280 px.")] = 0.25,
+    steps: Annotated[int, typer.Option(min=1, max=20, help="Deformed steps after the reference.")] = 3,
+    no_serve: Annotated[bool, typer.Option("--no-serve", help="End after the table.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder for everything the demo writes.")] = Path("ringdic-demo"),
+    as_json: AsJson = False,
+) -> None:
+    """Capture, process and show a simulated rig: every node a process, every image over Zenoh."""
+    from controller.demo import run_demo
+
+    comparison = run_demo(out, cameras=cameras, scale=scale, steps=steps, serve=not no_serve)
+    if as_json:
+        _print_json(comparison)
+
+
+@app.command()
+def controller(
+    config: Annotated[Path | None, typer.Option(help="The controller's configuration (TOML).")] = None,
+) -> None:
+    """Run the controller: router, archive, jobs and the page."""
+    from controller.config import read_config
+    from controller.service import run_controller
+
+    run_controller(read_config(config))
+
+
+@app.command(name="import")
+def import_(
+    source: Annotated[Path, typer.Argument(help="A folder with rig.toml, board, target and specimen.")],
+    session: Annotated[Path, typer.Argument(help="The session folder to make.")],
+    as_json: AsJson = False,
+) -> None:
+    """Make a session of a folder of images."""
+    from controller.importing import import_folder
+
+    import_folder(source, session)
+    if as_json:
+        _print_json({"session": str(session)})
+    else:
+        typer.echo(f"imported {source} as session {session}", err=True)
+
+
+@app.command()
+def process(
+    session: Annotated[Path, typer.Argument(help="The session folder.")],
+    settings: SettingsFile = None,
+    set_: Overrides = None,
+    cluster: Annotated[str | None, typer.Option(help="Address of a cluster's scheduler.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Calibrate, correlate, triangulate and compute strain, with nothing to click."""
+    from processing.pipeline import process_session
+    from processing.settings import load_settings
+
+    from processing.errors import InputError
+
+    if cluster is not None:
+        raise InputError("--cluster: computing on a cluster is not available in this version; leave the option out")
+    chosen = load_settings(settings, set_ or [])
+    with narrated() as report:
+        run = process_session(session, chosen, report)
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    if as_json:
+        _print_json({"run": str(run), **summary})
+    else:
+        show_table(f"{session}: results in {run}", summary["table"])
+
+
+@app.command()
+def correlate(
+    ref: Annotated[Path, typer.Argument(metavar="REF", help="Reference image.")],
+    cur: Annotated[Path, typer.Argument(metavar="CUR", help="Current image.")],
+    out: Annotated[Path, typer.Option(help="Where the points go (npz).")],
+    mask: Annotated[Path | None, typer.Option(help="Region of interest: an image, not 0 inside.")] = None,
+    radius: Annotated[int, typer.Option(min=3, help="Subset radius, px.")] = 20,
+    step: Annotated[int, typer.Option(min=1, help="Grid step, px.")] = 10,
+    order: Annotated[int, typer.Option(min=1, max=2, help="Order of the shape function.")] = 1,
+    subset: Annotated[str, typer.Option(help="circle or square.")] = "circle",
+    threads: Annotated[int | None, typer.Option(min=1, help="Threads; all cores unless given.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """2D correlation of one pair of images."""
+    from processing.correlation.command import correlate_files
+
+    summary = correlate_files(
+        ref, cur, out, mask=mask, radius=radius, step=step, order=order, subset=subset, threads=threads
+    )
+    if as_json:
+        _print_json(summary)
+    else:
+        typer.echo(f"{summary['good']} of {summary['points']} points matched, written to {out}", err=True)
+
+
+@app.command()
+def export(
+    session: Annotated[Path, typer.Argument(help="The session folder.")],
+    format_: Annotated[str, typer.Option("--format", help="npz, vtkhdf, vtp, mat, csv, ply or glb.")] = "npz",
+    out: Annotated[Path | None, typer.Option(help="Where to; beside the results unless given.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """The newest results in another program's form."""
+    from processing.export import export as export_session
+
+    written = export_session(session, format_, out)
+    if as_json:
+        _print_json({"written": str(written)})
+    else:
+        typer.echo(f"written {written}", err=True)
+
+
+def main() -> None:
+    """The command's entry: sentences instead of tracebacks for whatever an operator can mend."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", stream=sys.stderr)
+    try:
+        app()
+    except RingdicError as error:
+        typer.echo(f"ringdic: {error}", err=True)
+        sys.exit(error.exit_code)
+
+
+def _print_json(value: dict[str, Any]) -> None:
+    typer.echo(json.dumps(value, ensure_ascii=False, default=float))

@@ -1,0 +1,225 @@
+"""Matching one camera pair over all steps: region, start values, correlation.
+
+The reference is the first camera's first image; every image of both cameras is matched to it (Solav et al. 2018,
+step 2). Start values between the cameras come from the calibration and a sweep of proxy cylinders, at the
+reference and again at every step, so a large motion does not matter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.camera import Camera
+from processing.correlation import (
+    Correlation,
+    CorrelationSettings,
+    Current,
+    Reference,
+    Status,
+    correlate,
+    grid,
+    prepare_current,
+    prepare_reference,
+    search_hypotheses,
+)
+from processing.errors import ComputationError
+from processing.proxy import compose, stereo_hypotheses, sweep_radii
+from processing.region import coherent, lattice, paint, well_seen
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Search:
+    """How the surface is looked for. Lengths mm, angles degrees.
+
+    radius, reach : the proxy cylinder and how far from it the surface may lie.
+    incidence : the steepest angle at which both cameras must see the surface.
+    zncc_min : of a convincing match of the sweep.
+    """
+
+    radius: float
+    reach: float
+    incidence: float
+    zncc_min: float = 0.75
+
+
+@dataclass(frozen=True)
+class PairMatches:
+    """The points of one camera pair in all images, F steps with the reference first.
+
+    pair : ids, reference camera first. xy : (n, 2) px in the reference image. faces : (m, 3), outwards.
+    px : (F, 2, n, 2) positions in both cameras' images, NaN where lost.
+    c_ls : (F, n), the larger of the two images'. sigma : (F, 2, n, 2) px. status : (F, n).
+    seconds : (prepare, start, refine) spent. refined : matches made, for the rate.
+    """
+
+    pair: tuple[str, str]
+    xy: Array
+    faces: NDArray[np.int32]
+    px: Array
+    c_ls: Array
+    sigma: Array
+    status: NDArray[np.int8]
+    seconds: dict[str, float]
+    refined: int
+
+
+@dataclass(frozen=True)
+class _Stereo:
+    """What a pair keeps from its reference step."""
+
+    cameras: tuple[Camera, Camera]
+    search: Search
+    settings: CorrelationSettings
+    radii: Array
+
+
+def match_pair(
+    cameras: tuple[Camera, Camera],
+    image: Callable[[str, int], Image],
+    steps: int,
+    mask: Mask | None,
+    search: Search,
+    settings: CorrelationSettings,
+    progress: Callable[[float], None] = lambda _: None,
+) -> PairMatches:
+    """Match all points of a pair in ``steps`` images (reference included) of both cameras.
+
+    image : gives the grey image of a camera id and a step. mask : a region drawn by the user, or None to find it.
+    Raises ComputationError where the cameras share no textured surface.
+    """
+    first, second = cameras
+    stereo = _Stereo(cameras, search, settings, _radii(cameras, search))
+    reference_image = image(first.id, 0)
+    current = prepare_current(image(second.id, 0), settings)
+    region, seeds, warps = _find_region(stereo, reference_image, current, mask)
+    xy, faces = grid(region, settings.step)
+    reference = prepare_reference(reference_image, region, settings)
+    start = _start_at(xy, seeds, warps)
+    images = 2 * steps - 1
+    matches: dict[tuple[int, int], Correlation] = {}
+    matches[0, 1] = correlate(reference, current, xy, settings, start=start)
+    progress(1 / images)
+    for step in range(1, steps):
+        in_time = correlate(reference, prepare_current(image(first.id, step), settings), xy, settings)
+        matches[step, 0] = in_time
+        progress((2 * step) / images)
+        current = prepare_current(image(second.id, step), settings)
+        start = _start_after_motion(stereo, reference, current, xy, in_time)
+        matches[step, 1] = correlate(reference, current, xy, settings, start=start)
+        progress((2 * step + 1) / images)
+    return _collect((first.id, second.id), xy, faces, matches, steps)
+
+
+def _radii(cameras: tuple[Camera, Camera], search: Search) -> Array:
+    """Radii of the sweep, so close that the match moves by 1.5 px from one to the next."""
+    first, second = cameras
+    towards = first.centre[:2] + second.centre[:2]
+    towards = towards / np.linalg.norm(towards)
+    height = 0.5 * (first.centre[2] + second.centre[2])
+    ends = [np.array([*(radius * towards), height]) for radius in (search.radius, search.radius + 1.0)]
+    px_per_mm = np.linalg.norm(
+        np.diff(second.project(np.array(ends)), axis=0) - np.diff(first.project(np.array(ends)), axis=0)
+    )
+    return sweep_radii(search.radius, search.reach, float(np.clip(1.5 / max(px_per_mm, 1e-6), 0.1, 2.0)))
+
+
+def _find_region(stereo: _Stereo, image: Image, current: Current, mask: Mask | None) -> tuple[Mask, Array, Array]:
+    """The region of interest (height, width), lattice positions (k, 2) px in it and their warps (k, 6)."""
+    first, second = stereo.cameras
+    settings = stereo.settings
+    spacing = settings.step * max(1, round(1.5 * settings.radius / settings.step))
+    points = lattice(first.size, spacing, settings.radius + 2)
+    shape = points.xy.shape[:2]
+    px = points.xy.reshape(-1, 2)
+    hypotheses = stereo_hypotheses(first, second, px, stereo.radii, settings.radius)
+    everywhere = prepare_reference(image, np.ones(image.shape, bool), settings)
+    warps, zncc, second_best = search_hypotheses(everywhere, current, px, hypotheses.warps, settings.radius)
+    which = _nearest(hypotheses.warps, warps)
+    radius = stereo.radii[which].reshape(shape)
+    xyz = hypotheses.xyz[np.arange(len(px)), which].reshape(*shape, 3)
+    with np.errstate(invalid="ignore"):
+        convincing = (zncc > stereo.search.zncc_min) & (second_best < 0.9 * zncc)
+    convincing &= (which > 0) & (which < len(stereo.radii) - 1)
+    if mask is not None:
+        convincing &= mask[px[:, 1].astype(int), px[:, 0].astype(int)]
+    good = coherent(radius, convincing.reshape(shape), tolerance=2.0)
+    if mask is None:
+        xyz = np.where(good[..., None], xyz, np.nan)
+        good &= well_seen(xyz, stereo.cameras, stereo.search.incidence)
+    if good.sum() < 4:
+        raise ComputationError(
+            f"cameras {first.id} and {second.id}: no textured surface that both see was found; check that the "
+            "specimen is speckled, stands where the target stood, and that the images are in focus"
+        )
+    region = mask if mask is not None else paint(points, good, first.size)
+    return region, px[good.ravel()], warps[good.ravel()]
+
+
+def _nearest(candidates: Array, chosen: Array) -> NDArray[np.int_]:
+    """Index (n,) of the chosen warp among the candidates (n, K, 6)."""
+    distance = np.abs(candidates[..., :2] - chosen[:, None, :2]).sum(axis=-1)
+    return np.argmin(np.where(np.isfinite(distance), distance, np.inf), axis=1)
+
+
+def _start_at(xy: Array, seeds: Array, warps: Array) -> Array:
+    """Start values (n, 6) of the grid: known at the seeds, NaN elsewhere."""
+    start = np.full((len(xy), 6), np.nan)
+    where = {(int(x), int(y)): i for i, (x, y) in enumerate(xy)}
+    for (x, y), warp in zip(seeds, warps, strict=True):
+        i = where.get((int(x), int(y)))
+        if i is not None:
+            start[i] = warp
+    return start
+
+
+def _start_after_motion(
+    stereo: _Stereo, reference: Reference, current: Current, xy: Array, in_time: Correlation
+) -> Array:
+    """Start values (n, 6) in the second camera's image of a later step, from the first camera's motion and a sweep."""
+    settings = stereo.settings
+    spacing = settings.step * max(1, round(2 * settings.radius / settings.step))
+    chosen = np.flatnonzero((in_time.status == Status.GOOD) & (np.mod(xy, spacing) == 0).all(axis=1))
+    moved = xy[chosen] + in_time.uv[chosen]
+    hypotheses = stereo_hypotheses(*stereo.cameras, moved, stereo.radii, settings.radius)
+    motion = np.concatenate([in_time.uv[chosen], in_time.gradient[chosen].reshape(-1, 4)], axis=1)
+    candidates = compose(motion[:, None, :], hypotheses.warps)
+    warps, zncc, second_best = search_hypotheses(reference, current, xy[chosen], candidates, settings.radius)
+    with np.errstate(invalid="ignore"):
+        convincing = (zncc > stereo.search.zncc_min) & (second_best < 0.9 * zncc)
+    start = np.full((len(xy), 6), np.nan)
+    start[chosen[convincing]] = warps[convincing]
+    return start
+
+
+def _collect(
+    pair: tuple[str, str],
+    xy: Array,
+    faces: NDArray[np.int32],
+    matches: dict[tuple[int, int], Correlation],
+    steps: int,
+) -> PairMatches:
+    n = len(xy)
+    px = np.full((steps, 2, n, 2), np.nan)
+    sigma = np.zeros((steps, 2, n, 2))
+    c_ls = np.zeros((steps, n))
+    status = np.zeros((steps, n), np.int8)
+    px[0, 0] = xy
+    for (step, camera), match in matches.items():
+        good = match.status == Status.GOOD
+        px[step, camera, good] = xy[good] + match.uv[good]
+        sigma[step, camera] = match.sigma
+        c_ls[step] = np.fmax(c_ls[step], match.c_ls)
+        status[step] = np.where(status[step] == Status.GOOD, match.status, status[step])
+    seconds = {
+        name: float(sum(match.seconds.get(name, 0.0) for match in matches.values()))
+        for name in ("prepare", "start", "refine")
+    }
+    return PairMatches(pair, xy, faces, px, c_ls, sigma, status, seconds, n * len(matches))
