@@ -1,0 +1,63 @@
+"""From matched pixels to points in space: linear, unweighted (Solav et al. 2018, eq. 7-9).
+
+Every camera that sees a point gives two equations in three unknowns. With the rows p1, p2, p3 of its projection
+matrix and the undistorted pixel (u, v): ``(p1 - u p3) · (X, 1) = 0`` and ``(p2 - v p3) · (X, 1) = 0``. The
+least-squares solution is closed: three normal equations a point, well conditioned because the rows are scaled as the DLT gives them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.camera import Camera
+
+Array = NDArray[np.float64]
+
+
+def triangulate(cameras: Sequence[Camera], px: Array) -> Array:
+    """Points in space from their pixels in two or more images.
+
+    Parameters
+    ----------
+    cameras : the C cameras, C ≥ 2.
+    px : (C, n, 2) image pixels as they are in the images (distorted); NaN where a camera did not match the point.
+
+    Returns
+    -------
+    (n, 3) mm, world frame. NaN where fewer than two cameras saw the point or the lines of sight are parallel.
+    """
+    px = np.asarray(px, dtype=float)
+    if len(cameras) < 2 or px.shape[:1] != (len(cameras),) or px.ndim != 3 or px.shape[2] != 2:
+        raise ValueError(f"{len(cameras)} cameras do not go with pixels of shape {px.shape}; wanted (C, n, 2), C >= 2")
+    undistorted = np.stack([camera.undistort(image) for camera, image in zip(cameras, px, strict=True)])
+    return triangulate_undistorted(np.stack([camera.P for camera in cameras]), undistorted)
+
+
+def triangulate_undistorted(P: Array, px: Array) -> Array:
+    """The same from projection matrices (C, 3, 4) and undistorted pixels (C, n, 2). (n, 3) mm, NaN as above."""
+    normal, right, seen = normal_equations(P, px)
+    solvable = (seen.sum(axis=0) >= 2) & (np.linalg.cond(normal) < 1e12)
+    xyz = np.full((px.shape[1], 3), np.nan)
+    xyz[solvable] = np.linalg.solve(normal[solvable], right[solvable][..., None])[..., 0]
+    return xyz
+
+
+def normal_equations(P: Array, px: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """``A^T A`` (n, 3, 3), ``A^T b`` (n, 3) and which camera takes part (C, n) of eq. 7-9, summed over cameras."""
+    P, px = np.asarray(P, dtype=float), np.asarray(px, dtype=float)
+    seen: NDArray[np.bool_] = np.all(np.isfinite(px), axis=-1)
+    rows = P[:, None, :2, :] - px[..., None] * P[:, None, 2:, :]  # (C, n, 2, 4)
+    rows = np.where(seen[..., None, None], rows, 0.0)
+    A, b = rows[..., :3], -rows[..., 3]
+    return np.einsum("cnri,cnrj->nij", A, A), np.einsum("cnri,cnr->ni", A, b), seen
+
+
+def reprojection_residuals(cameras: Sequence[Camera], xyz: Array, px: Array) -> Array:
+    """Measured minus projected pixels.
+
+    xyz : (n, 3) mm; px : (C, n, 2) image pixels. Returns (C, n, 2) px, NaN where either is.
+    """
+    return np.stack([image - camera.project(xyz) for camera, image in zip(cameras, px, strict=True)])
