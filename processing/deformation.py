@@ -1,8 +1,8 @@
 """Deformation of every triangle as a triangular Cosserat point element (Solav et al. 2018, eq. 12-18).
 
 A triangle with corners P1 P2 P3 carries the directors ``D1 = P2 - P1``, ``D2 = P3 - P1`` and its unit normal ``D3``;
-the deformation gradient maps the reference directors to the current ones, so its third principal stretch is 1, along the
-normal. All tensors are Cartesian in the world frame; E lives in the reference, e in the current configuration.
+the deformation gradient maps the reference directors to the current ones, so its third principal stretch is 1, along
+the normal. All tensors are Cartesian in the world frame; E lives in the reference, e in the current configuration.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def directors(vertices: Array, faces: NDArray[np.int_]) -> tuple[Array, Array]:
 
 
 def isotropy(vertices: Array, faces: NDArray[np.int_]) -> Array:
-    """Shape of triangles, (..., M), 1 equilateral … 0 degenerate: ``2 σ2/(σ2 + σ3)`` of ``X Xᵀ/3`` about the centroid."""
+    """Shape of triangles, (..., M), 1 equilateral … 0 degenerate: ``2 σ2/(σ2 + σ3)`` of ``X Xᵀ/3`` about centroids."""
     corners = vertices[..., faces, :]
     X = corners - corners.mean(axis=-2, keepdims=True)
     S = np.einsum("...ki,...kj->...ij", X, X) / 3.0

@@ -2,7 +2,8 @@
 
 Every camera that sees a point gives two equations in three unknowns. With the rows p1, p2, p3 of its projection
 matrix and the undistorted pixel (u, v): ``(p1 - u p3) · (X, 1) = 0`` and ``(p2 - v p3) · (X, 1) = 0``. The
-least-squares solution is closed: three normal equations a point, well conditioned because the rows are scaled as the DLT gives them.
+least-squares solution is closed: three normal equations a point, well conditioned because the rows are scaled as the
+DLT gives them.
 """
 
 from __future__ import annotations

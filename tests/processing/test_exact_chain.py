@@ -91,7 +91,7 @@ def test_every_deformation_field_is_multidics(reference: dict[str, np.ndarray]) 
 def test_principal_directions_are_multidics_up_to_sign(reference: dict[str, np.ndarray]) -> None:
     points, faces = reference["points3d"], reference["faces"]
     found = deformation(points[0], points[1:], faces)
-    # Round-off of about 1e-12 in a strain turns its directions by (round-off / gap of the principal values).
+    # Round-off, below 1e-11 in a strain, turns its directions by (round-off / gap of the principal values).
     gap = (found.E2 - found.E1)[..., None]
     assert gap.min() > 1e-7
     same = {
@@ -105,4 +105,4 @@ def test_principal_directions_are_multidics_up_to_sign(reference: dict[str, np.n
         for name in theirs:
             sign = np.sign(np.einsum("...i,...i->...", direction, reference[name]))[..., None]
             error = np.abs(direction - sign * reference[name])
-            assert (error <= 1e-10 + 2e-12 / gap).all(), (ours, name, error.max())
+            assert (error <= 1e-10 + 1e-11 / gap).all(), (ours, name, error.max())
