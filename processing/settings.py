@@ -1,0 +1,175 @@
+"""What a processing run is told: groups of settings from a TOML file and from ``name=value`` pairs.
+
+An unknown name, a wrong type and a choice that this version does not have are refused, never ignored.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from processing.errors import InputError
+
+
+class _Group(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class CorrelationGroup(_Group):
+    """2D matching. Radius and step in px; tolerance of the iteration in px."""
+
+    radius_px: int = Field(default=20, ge=2, le=500)
+    step_px: int = Field(default=10, ge=1)
+    order: Literal[1, 2] = 1
+    subset: Literal["circle", "square"] = "circle"
+    interpolation: Literal["quintic", "cubic"] = "quintic"
+    tolerance: float = Field(default=1e-5, gt=0)
+    max_iterations: int = Field(default=50, ge=1)
+    zncc_min: float = Field(default=0.7, ge=-1, lt=1)
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """The same under the names that the correlation uses inside."""
+        return {
+            "radius": self.radius_px,
+            "step": self.step_px,
+            "order": self.order,
+            "subset": self.subset,
+            "interpolation": self.interpolation,
+            "tolerance": self.tolerance,
+            "max_iterations": self.max_iterations,
+            "zncc_min": self.zncc_min,
+        }
+
+
+class CalibrationGroup(_Group):
+    """Cameras: the direct linear transformation, with or without the lens measured on the checkerboard.
+
+    drop_percentile : checkerboard views whose error lies above it are dropped and the rest is fitted again; 100 keeps
+    all views.
+    """
+
+    method: Literal["dlt", "bundle"] = "dlt"
+    distortion: bool = True
+    drop_percentile: float = Field(default=80.0, gt=0, le=100)
+
+    @field_validator("method")
+    @classmethod
+    def _available(cls, value: str) -> str:
+        if value == "bundle":
+            raise ValueError("'bundle' is not available in this version; use 'dlt'")
+        return value
+
+
+class SurfaceGroup(_Group):
+    """How matches become a surface, and where the surface is looked for.
+
+    radius_mm : of the cylinder from which the search sets out; 0 takes the target's.
+    reach_mm : how far from it the surface may lie. incidence_deg : the steepest angle of view that is used.
+    """
+
+    method: Literal["pairs", "global"] = "pairs"
+    radius_mm: float = Field(default=0.0, ge=0)
+    reach_mm: float = Field(default=20.0, gt=0)
+    incidence_deg: float = Field(default=65.0, gt=0, lt=90)
+
+    @field_validator("method")
+    @classmethod
+    def _available(cls, value: str) -> str:
+        if value == "global":
+            raise ValueError("'global' is not available in this version; use 'pairs'")
+        return value
+
+
+class StrainGroup(_Group):
+    """Strain. window_mm : width of the window strain is fitted over; 0 takes each triangle alone."""
+
+    window_mm: float = Field(default=0.0, ge=0)
+
+    @field_validator("window_mm")
+    @classmethod
+    def _available(cls, value: float) -> float:
+        if value > 0:
+            raise ValueError("a strain window is not available in this version; use 0, the triangle alone")
+        return value
+
+
+class Settings(_Group):
+    """All settings of a processing run."""
+
+    correlation: CorrelationGroup = CorrelationGroup()
+    calibration: CalibrationGroup = CalibrationGroup()
+    surface: SurfaceGroup = SurfaceGroup()
+    strain: StrainGroup = StrainGroup()
+
+    def to_toml(self) -> str:
+        """The settings as the text of a TOML file that :func:`load_settings` reads back."""
+        lines: list[str] = []
+        for group, values in self.model_dump().items():
+            lines += [f"[{group}]", *(f"{name} = {_toml(value)}" for name, value in values.items()), ""]
+        return "\n".join(lines)
+
+
+def load_settings(path: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
+    """Settings from a TOML file (or the defaults), changed by ``group.name=value`` pairs, the last one winning.
+
+    Raises InputError : the file cannot be read, or a name, type or value is not known; the sentence names it.
+    """
+    tables: dict[str, Any] = {}
+    if path is not None:
+        path = Path(path)
+        if not path.is_file():
+            raise InputError(f"{path}: no such settings file")
+        try:
+            tables = tomllib.loads(path.read_text(encoding="utf-8"))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: not readable as TOML ({error})") from error
+    for override in overrides:
+        _set(tables, override)
+    try:
+        return Settings.model_validate(tables)
+    except ValidationError as error:
+        source = "settings" if path is None else f"{path} and --set" if overrides else str(path)
+        raise InputError(f"{source}: {'; '.join(_sentence(e) for e in error.errors())}") from error
+
+
+def _set(tables: dict[str, Any], override: str) -> None:
+    name, equals, text = override.partition("=")
+    group, dot, key = name.strip().partition(".")
+    if not (equals and dot and group and key):
+        raise InputError(f"--set {override}: not of the form group.name=value, such as correlation.radius_px=20")
+    table = tables.setdefault(group, {})
+    if not isinstance(table, dict):
+        raise InputError(f"--set {override}: '{group}' is not a group of settings")
+    table[key] = _value(text.strip())
+
+
+def _value(text: str) -> Any:
+    """A value as TOML reads it; a bare word is text."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+def _sentence(error: Any) -> str:
+    where = ".".join(str(part) for part in error["loc"])
+    if error["type"] == "extra_forbidden":
+        group = Settings.model_fields.get(str(error["loc"][0]))
+        if len(error["loc"]) > 1 and group is not None:
+            known = ", ".join(group.default.__class__.model_fields)
+            return f"unknown setting '{where}'; [{error['loc'][0]}] has {known}"
+        return f"unknown group of settings '{where}'; known are {', '.join(Settings.model_fields)}"
+    if error["type"] == "value_error":
+        return f"{where}: {error['ctx']['error']}"
+    return f"{where}: {error['msg'][0].lower()}{error['msg'][1:]}, not {error['input']!r}"

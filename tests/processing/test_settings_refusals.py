@@ -1,0 +1,82 @@
+"""Settings: defaults, files, overrides, and a clear refusal of everything else."""
+
+from pathlib import Path
+
+import pytest
+
+from processing.correlation.settings import CorrelationSettings
+from processing.errors import InputError
+from processing.settings import Settings, load_settings
+
+
+def test_the_defaults_are_the_papers() -> None:
+    settings = load_settings()
+    assert (settings.correlation.radius_px, settings.correlation.step_px) == (20, 10)
+    assert (settings.correlation.order, settings.correlation.subset) == (1, "circle")
+    assert (settings.calibration.method, settings.calibration.distortion) == ("dlt", True)
+    assert (settings.surface.method, settings.strain.window_mm) == ("pairs", 0.0)
+
+
+def test_a_file_is_read_and_an_override_wins_over_it(tmp_path: Path) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text('[correlation]\nradius_px = 12\nstep_px = 6\nsubset = "square"\n')
+    settings = load_settings(path, ["correlation.radius_px=14", "calibration.distortion=false", "surface.method=pairs"])
+    assert settings.correlation.radius_px == 14
+    assert settings.correlation.step_px == 6
+    assert settings.correlation.subset == "square"
+    assert settings.calibration.distortion is False
+
+
+def test_what_is_written_reads_back_the_same(tmp_path: Path) -> None:
+    settings = load_settings(None, ["correlation.tolerance=1e-7", "correlation.radius_px=33", "surface.reach_mm=12.5"])
+    path = tmp_path / "settings.toml"
+    path.write_text(settings.to_toml())
+    assert load_settings(path) == settings
+    assert load_settings(path) != Settings()
+
+
+def test_the_correlation_understands_its_group() -> None:
+    engine = CorrelationSettings(**load_settings(None, ["correlation.radius_px=12"]).correlation.keywords)
+    assert engine == CorrelationSettings(radius=12)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("correlation.radius=20", ["correlation.radius", "radius_px"]),
+        ("correlaton.radius_px=20", ["correlaton", "correlation"]),
+        ("radius_px=20", ["group.name=value"]),
+        ("correlation.radius_px", ["group.name=value"]),
+        ("correlation.radius_px=many", ["correlation.radius_px", "many"]),
+        ("correlation.radius_px=0", ["correlation.radius_px", "0"]),
+        ("correlation.tolerance=nan", ["correlation.tolerance"]),
+        ("correlation.order=3", ["correlation.order", "1 or 2"]),
+        ("correlation.subset=hexagon", ["correlation.subset", "'circle' or 'square'", "hexagon"]),
+        ("calibration.method=bundle", ["calibration.method", "not available", "dlt"]),
+        ("surface.method=global", ["surface.method", "not available", "pairs"]),
+        ("surface.method=magic", ["surface.method", "magic"]),
+        ("strain.window_mm=5", ["strain.window_mm", "not available"]),
+        ("strain=5", ["group.name=value"]),
+    ],
+)
+def test_what_cannot_be_done_is_refused_with_its_name(override: str, words: list[str]) -> None:
+    with pytest.raises(InputError) as refusal:
+        load_settings(None, [override])
+    for word in words:
+        assert word in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_bad_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.toml: no such"):
+        load_settings(tmp_path / "none.toml")
+    path = tmp_path / "bad.toml"
+    path.write_text("[correlation\n")
+    with pytest.raises(InputError, match=r"bad\.toml: not readable as TOML"):
+        load_settings(path)
+    path.write_text("[correlation]\nradius = 3\n")
+    with pytest.raises(InputError, match=r"bad\.toml: unknown setting 'correlation\.radius'"):
+        load_settings(path)
+    path.write_text("strain = 3\n")
+    with pytest.raises(InputError, match="strain"):
+        load_settings(path)
