@@ -132,7 +132,7 @@ class Camera:
         return np.asarray(px, dtype=float) if self.intrinsics is None else self.intrinsics.to_undistorted(px)
 
     def ray(self, px: Array) -> Array:
-        """Unit directions (..., 3) in the world of the lines of sight of image pixels (..., 2), away from the camera."""
+        """Unit directions (..., 3) in the world of the lines of sight of image pixels (..., 2), outwards."""
         undistorted = self.undistort(px)
         h = np.concatenate([undistorted, np.ones((*undistorted.shape[:-1], 1))], axis=-1)
         M = self.P[:, :3]

@@ -100,8 +100,16 @@ def newest_results(path: Path) -> Path:
     return finished[-1] / "results.h5"
 
 
+@dataclass
+class NewRun:
+    """A run being written. ``folder`` is where to write now; ``final`` where it lies once it is whole."""
+
+    folder: Path
+    final: Path | None = None
+
+
 @contextmanager
-def new_run(path: Path) -> Iterator[Path]:
+def new_run(path: Path) -> Iterator[NewRun]:
     """A folder to write a run into; it gets its number when everything is written, and never replaces another.
 
     A run that fails leaves nothing behind.
@@ -116,11 +124,13 @@ def new_run(path: Path) -> Iterator[Path]:
             break
         except FileExistsError:  # another run is at work, or one was killed: leave its folder alone
             number += 1
+    run = NewRun(partial)
     try:
-        yield partial
+        yield run
         while (results / f"{number:04d}").exists():
             number += 1
-        partial.rename(results / f"{number:04d}")
+        run.final = results / f"{number:04d}"
+        partial.rename(run.final)
     except BaseException:
         rmtree(partial, ignore_errors=True)
         raise
