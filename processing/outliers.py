@@ -30,7 +30,7 @@ def crossing_outliers(residuals: Array, factor: float = 8.0, floor: float = 0.3)
     with np.errstate(invalid="ignore"):
         about = np.abs(residuals - _median(residuals, axis=1)[:, None])
         limit = np.maximum(factor * _SIGMA_OF_MAD * _median(about, axis=1), floor)
-        return (about > limit[:, None]).any(axis=(0, 2))
+        return np.asarray((about > limit[:, None]).any(axis=(0, 2)))
 
 
 def midpoint_residuals(xy: Array, values: Array, step: int, without: Mask | None = None) -> Array:

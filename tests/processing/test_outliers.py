@@ -26,12 +26,11 @@ def test_planted_outliers_are_found_and_no_good_point_is_lost() -> None:
     rng = np.random.default_rng(3)
     xy, xyz = cylinder_grid()
     xyz += rng.normal(0, 0.005, xyz.shape)
-    planted = rng.choice(len(xy), 20, replace=False)
-    xyz[planted] += rng.normal(0, 1, (20, 3)) + 1.0
-    found = surface_outliers(xy, xyz, STEP)
-    interior = np.isfinite(midpoint_residuals(xy, xyz, STEP))
-    assert found[planted[interior[planted]]].all()
-    assert found.sum() <= 20
+    apart = np.flatnonzero((xy % (4 * STEP) == 20).all(axis=1))
+    planted = rng.choice(apart, 20, replace=False)
+    xyz[planted] += rng.choice([-1.0, 1.0], (20, 3)) * rng.uniform(0.5, 2.0, (20, 3))
+    found = np.flatnonzero(surface_outliers(xy, xyz, STEP))
+    np.testing.assert_array_equal(found, np.sort(planted))
 
 
 def test_a_jump_of_one_camera_as_a_whole_is_no_outlier() -> None:
