@@ -88,7 +88,7 @@ class Intrinsics:
         error = self.distort_normalised(xy) - target
         J = self._jacobian_normalised(xy)
         det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-        # Beyond the largest radius that the lens can show, a root is one of the polynomial only: it turns the image over.
+        # Beyond the largest radius that the lens can show, roots of the polynomial turn the image over.
         real = (np.abs(error).max(axis=-1) < 1e-10) & (det > 0) & (J[..., 0, 0] + J[..., 1, 1] > 0)
         xy = np.where(real[..., None], xy, np.nan)
         return xy * np.array([fx, fy]) + np.array([cx, cy])

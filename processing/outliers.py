@@ -33,21 +33,25 @@ def crossing_outliers(residuals: Array, factor: float = 8.0, floor: float = 0.3)
         return np.asarray((about > limit[:, None]).any(axis=(0, 2)))
 
 
-def midpoint_residuals(xy: Array, values: Array, step: int, without: Mask | None = None) -> Array:
+def midpoint_residuals(xy: Array, values: Array, step: int, doubt: Array | None = None) -> Array:
     """How far values lie from the middle of opposite neighbours on the grid, (n,).
 
     xy : (n, 2) grid positions, multiples of ``step``. values : (n, k), NaN where lost. The prediction is the median
     over up to four pairs of opposite neighbours of the pair's mean: exact for a linear field and blind to one wrong
-    neighbour. NaN where no pair is complete. Points ``without`` (n,) judge nobody.
+    neighbour. NaN where no pair is complete. Where a ``doubt`` (n,) is given, nobody is judged by a neighbour more
+    doubtful than himself.
     """
     cells = np.round(xy / step).astype(int)
     cells -= cells.min(axis=0) - 1
-    columns, rows = cells.max(axis=0) + 2
-    field = np.full((columns, rows, values.shape[1]), np.nan)
-    field[cells[:, 0], cells[:, 1]] = values if without is None else np.where(without[:, None], np.nan, values)
-    means = [
-        0.5 * (field[cells[:, 0] + i, cells[:, 1] + j] + field[cells[:, 0] - i, cells[:, 1] - j]) for i, j in _OPPOSITE
-    ]
+    doubt = np.zeros(len(xy)) if doubt is None else doubt
+    field = np.full((*(cells.max(axis=0) + 2), values.shape[1] + 1), np.nan)
+    field[cells[:, 0], cells[:, 1]] = np.column_stack([values, doubt])
+    means = []
+    for i, j in _OPPOSITE:
+        after = field[cells[:, 0] + i, cells[:, 1] + j]
+        before = field[cells[:, 0] - i, cells[:, 1] - j]
+        fit_to_judge = np.fmax(after[:, -1], before[:, -1]) <= doubt
+        means.append(np.where(fit_to_judge[:, None], 0.5 * (after + before)[:, :-1], np.nan))
     return np.asarray(np.linalg.norm(values - _median(np.stack(means), axis=0), axis=1))
 
 
@@ -58,8 +62,8 @@ def surface_outliers(xy: Array, values: Array, step: int, factor: float = 10.0, 
     limit = max(factor * usual, floor)
     with np.errstate(invalid="ignore"):
         suspect = residual > limit
-        # At the rim a good point may have been judged by a wrong one: judge the suspects by the others alone.
-        again = midpoint_residuals(xy, values, step, without=suspect)
+        # At the rim a good point may have been judged by a wrong one, which then lies further off itself.
+        again = midpoint_residuals(xy, values, step, doubt=np.where(suspect, residual, 0.0))
         return suspect & (again > limit)
 
 
