@@ -1,0 +1,308 @@
+"""The results of a processing run, and the one HDF5 file that keeps them.
+
+::
+
+    results.h5
+      VTKHDF/                    moving triangles with all fields: opens in ParaView (a lost point stays at its
+                                 reference position there, with ``measured`` = 0 and NaN fields)
+      ringdic/                   attributes: schema, rig, steps, pairs, cameras, fields (JSON where not plain)
+        reference                (N, 3) mm
+        faces, pair, vertex_pair
+        rigid_motion/R, t        per step, the motion that takes it back onto the reference
+        cameras/<id>/            P, size, and K, distortion where the lens is known
+        matches/<k>/             2D matches of pair k: xy, px, c_ls, sigma, status, vertex
+        settings, calibration, summary    text: TOML, JSON, JSON
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from processing import vtkhdf
+from processing.camera import Camera, Intrinsics
+from processing.deformation import Deformation, deformation
+from processing.errors import InputError
+from processing.fields import FIELDS, compute_fields, pick
+from processing.fields import field as field_of
+from processing.mesh import Mesh
+from processing.ranges import Ranges
+from processing.rigid_motion import RigidMotion, motion_to_reference
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class Matches:
+    """2D matches of one camera pair at F steps.
+
+    pair : ids, reference camera first. xy : (n, 2) px in the reference image. px : (F, 2, n, 2) in both
+    images. c_ls : (F, n). sigma : (F, 2, n, 2) px. status : (F, n), 0 good. vertex : (n,) index of the vertex, or -1.
+    seconds : time spent by stage.
+    """
+
+    pair: tuple[str, str]
+    xy: Array
+    px: Array
+    c_ls: Array
+    sigma: Array
+    status: NDArray[np.int8]
+    vertex: Ints
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n, steps = len(self.xy), len(self.px)
+        expected = {"px": (steps, 2, n, 2), "c_ls": (steps, n), "sigma": (steps, 2, n, 2), "status": (steps, n)}
+        _check(self, {**expected, "xy": (n, 2), "vertex": (n,)})
+
+
+@dataclass(frozen=True)
+class Results:
+    """Everything a run found. F steps including the reference, N vertices, M triangles; mm, world frame.
+
+    rig : its name. steps : (F) capture ids. cameras : all that were calibrated. pairs : camera ids of the pairs.
+    vertices_ref : (N, 3), finite. vertices : (F, N, 3), NaN where lost. faces : (M, 3), normals outwards.
+    pair : (M,) index of the pair, -1 where a face joins two. vertex_pair : (N,).
+    correlation : (F, N) C_LS, the largest over the images used. sigma_xyz : (F, N, 3). status : (F, N), 0 measured.
+    settings : TOML text. calibration, summary : JSON values.
+    """
+
+    rig: str
+    steps: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    pairs: tuple[tuple[str, str], ...]
+    vertices_ref: Array
+    vertices: Array
+    faces: Ints
+    pair: Ints
+    vertex_pair: Ints
+    correlation: Array
+    sigma_xyz: Array
+    status: NDArray[np.int8]
+    matches: tuple[Matches, ...] = ()
+    settings: str = ""
+    calibration: dict[str, Any] = field(default_factory=dict)
+    summary: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        F, N, M = len(self.steps), len(self.vertices_ref), len(self.faces)
+        per_vertex = {"correlation": (F, N), "sigma_xyz": (F, N, 3), "status": (F, N), "vertex_pair": (N,)}
+        _check(self, {**per_vertex, "vertices_ref": (N, 3), "vertices": (F, N, 3), "faces": (M, 3), "pair": (M,)})
+        if not np.isfinite(self.vertices_ref).all():
+            raise ValueError("a vertex without a reference position cannot be tracked; leave it out")
+        Mesh(self.vertices_ref, self.faces)
+
+    def motion(self, step: int) -> RigidMotion:
+        """The rigid motion that takes a step back onto the reference."""
+        return motion_to_reference(self.vertices_ref, self.vertices[step])
+
+    def deformation(self, step: int, rigid_motion_removed: bool = False) -> Deformation:
+        """Every deformation field of a step, in full precision."""
+        current = self.vertices[step]
+        if rigid_motion_removed:
+            current = self.motion(step).apply(current)
+        return deformation(self.vertices_ref, current, self.faces)
+
+
+def write_results(path: Path, results: Results, progress: Callable[[float], None] = lambda _: None) -> None:
+    """Compute all fields and write the file; ``path`` must not exist. ``progress`` is told the share done."""
+    with h5py.File(path, "x") as file:
+        group = vtkhdf.create(file, results.faces, len(results.vertices_ref), len(results.steps))
+        ranges = Ranges()
+        motions = [results.motion(step) for step in range(len(results.steps))]
+        for step, motion in enumerate(motions):
+            current = results.vertices[step]
+            fields = compute_fields(
+                results.vertices_ref, current, results.faces, motion,
+                results.correlation[step], results.sigma_xyz[step], results.pair,
+            )  # fmt: skip
+            measured = np.isfinite(current).all(axis=1)
+            positions = np.where(measured[:, None], current, results.vertices_ref)
+            flags = {"measured": measured.astype(np.uint8), "status": results.status[step].astype(np.int8)}
+            vtkhdf.write_step(group, step, positions, {**fields.point, **flags}, fields.face)
+            ranges.add(fields)
+            progress((step + 1) / len(results.steps))
+        _write_rest(file.create_group("ringdic"), results, motions, ranges)
+
+
+def read_results(path: Path) -> Results:
+    """The results of a file, as they were written (fields are not read: they follow from the positions)."""
+    with _open(path) as file:
+        own, group = file["ringdic"], file["VTKHDF"]
+        steps = tuple(json.loads(own.attrs["steps"]))
+        F, N = len(steps), len(own["reference"])
+        measured = group["PointData/measured"][:].reshape(F, N).astype(bool)
+        return Results(
+            rig=str(own.attrs["rig"]),
+            steps=steps,
+            cameras=tuple(_read_camera(own["cameras"], name) for name in json.loads(own.attrs["cameras"])),
+            pairs=_pairs(own),
+            vertices_ref=own["reference"][:],
+            vertices=np.where(measured[..., None], group["Points"][:].reshape(F, N, 3), np.nan),
+            faces=own["faces"][:],
+            pair=own["pair"][:],
+            vertex_pair=own["vertex_pair"][:],
+            correlation=group["PointData/correlation"][:].reshape(F, N).astype(float),
+            sigma_xyz=group["PointData/sigma_xyz"][:].reshape(F, N, 3).astype(float),
+            status=group["PointData/status"][:].reshape(F, N),
+            matches=tuple(_read_matches(own["matches"][str(k)]) for k in range(len(own["matches"]))),
+            settings=_text(own, "settings"),
+            calibration=json.loads(_text(own, "calibration")),
+            summary=json.loads(_text(own, "summary")),
+        )
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """What a file holds, as JSON values: rig, steps, cameras, pairs, counts, the table of fields with their ranges.
+
+    ``fields`` : name, label, unit, location, centre, rigid (whether removing the rigid motion changes it), ``range``
+    (2nd to 98th percentile over all steps after the reference), ``steps`` ([least, greatest] of each step, null where
+    nothing was measured), and ``range_without_rigid_motion``, ``steps_without_rigid_motion`` where rigid.
+    """
+    with _open(path) as file:
+        own = file["ringdic"]
+        return {
+            "schema": int(own.attrs["schema"]),
+            "rig": str(own.attrs["rig"]),
+            "steps": json.loads(own.attrs["steps"]),
+            "cameras": json.loads(own.attrs["cameras"]),
+            "pairs": json.loads(own.attrs["pairs"]),
+            "points": len(own["reference"]),
+            "faces": len(own["faces"]),
+            "fields": json.loads(own.attrs["fields"]),
+            "summary": json.loads(_text(own, "summary")),
+        }
+
+
+def read_mesh(path: Path) -> Mesh:
+    """The surface in the reference configuration."""
+    with _open(path) as file:
+        return Mesh(file["ringdic/reference"][:], file["ringdic/faces"][:])
+
+
+def read_positions(path: Path, step: int, rigid_motion_removed: bool = False) -> Array:
+    """Positions of the vertices at one step. (N, 3) mm, NaN where lost. Raises InputError for a step it has not."""
+    with _open(path) as file:
+        group, own = file["VTKHDF"], file["ringdic"]
+        _check_step(path, own, step)
+        rows = len(own["reference"])
+        positions = group["Points"][step * rows : (step + 1) * rows]
+        positions[vtkhdf.read_step(group, "PointData", "measured", step) == 0] = np.nan
+        motion = RigidMotion(own["rigid_motion/R"][step], own["rigid_motion/t"][step])
+        return motion.apply(positions) if rigid_motion_removed else positions
+
+
+def read_field(path: Path, name: str, step: int, rigid_motion_removed: bool = False) -> tuple[NDArray[np.float32], str]:
+    """One scalar field at one step, and whether it lies on each "point" (N,) or each "face" (M,); NaN where lost.
+
+    Raises InputError for a field or a step that the results do not have.
+    """
+    try:
+        entry = field_of(name)
+    except KeyError:
+        raise InputError(f"no field '{name}'; there are {', '.join(f.name for f in FIELDS)}") from None
+    stored = f"{entry.stored}_without_rigid_motion" if entry.rigid and rigid_motion_removed else entry.stored
+    with _open(path) as file:
+        _check_step(path, file["ringdic"], step)
+        place = "PointData" if entry.location == "point" else "CellData"
+        values = vtkhdf.read_step(file["VTKHDF"], place, stored, step)
+    return pick(entry, np.asarray(values, dtype=np.float32)), entry.location
+
+
+def _write_rest(own: h5py.Group, results: Results, motions: list[RigidMotion], ranges: Ranges) -> None:
+    own.attrs["schema"] = SCHEMA
+    own.attrs["rig"] = results.rig
+    own.attrs["steps"] = json.dumps(results.steps)
+    own.attrs["pairs"] = json.dumps(results.pairs)
+    own.attrs["cameras"] = json.dumps([camera.id for camera in results.cameras])
+    own.attrs["fields"] = json.dumps(ranges.table())
+    own["reference"] = results.vertices_ref
+    own["faces"] = np.asarray(results.faces, dtype=np.int64)
+    own["pair"] = np.asarray(results.pair, dtype=np.int64)
+    own["vertex_pair"] = np.asarray(results.vertex_pair, dtype=np.int64)
+    own["rigid_motion/R"] = np.array([motion.R for motion in motions])
+    own["rigid_motion/t"] = np.array([motion.t for motion in motions])
+    own["settings"] = results.settings
+    own["calibration"] = json.dumps(_plain(results.calibration), allow_nan=False)
+    own["summary"] = json.dumps(_plain(results.summary), allow_nan=False)
+    cameras = own.create_group("cameras")
+    for camera in results.cameras:
+        group = cameras.create_group(camera.id)
+        group["P"], group["size"] = camera.P, np.array(camera.size)
+        if camera.intrinsics is not None:
+            group["K"], group["distortion"] = camera.intrinsics.K, camera.intrinsics.distortion
+    for k, matches in enumerate(results.matches):
+        group = own.create_group(f"matches/{k}")
+        group.attrs["pair"] = json.dumps(matches.pair)
+        group.attrs["seconds"] = json.dumps(matches.seconds)
+        for name in ("xy", "px", "c_ls", "sigma", "status", "vertex"):
+            group[name] = getattr(matches, name)
+    own.require_group("matches")
+
+
+def _open(path: Path) -> h5py.File:
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such results file; process the session first")
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        raise InputError(f"{path}: not readable as HDF5 ({error})") from error
+    if "ringdic" not in file or "VTKHDF" not in file:
+        file.close()
+        raise InputError(f"{path}: an HDF5 file, but not results of a processing run")
+    return file
+
+
+def _check_step(path: Path, own: h5py.Group, step: int) -> None:
+    count = len(json.loads(own.attrs["steps"]))
+    if not 0 <= step < count:
+        raise InputError(f"{path}: no step {step}; there are {count}, from 0, the reference")
+
+
+def _check(holder: object, shapes: dict[str, tuple[int, ...]]) -> None:
+    for name, shape in shapes.items():
+        if np.shape(getattr(holder, name)) != shape:
+            raise ValueError(f"{name} has shape {np.shape(getattr(holder, name))}, wanted {shape}")
+
+
+def _pairs(own: h5py.Group) -> tuple[tuple[str, str], ...]:
+    return tuple((first, second) for first, second in json.loads(own.attrs["pairs"]))
+
+
+def _plain(value: Any) -> Any:
+    """The same as JSON knows it: arrays as lists, what is not finite as null."""
+    if isinstance(value, dict):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _text(own: h5py.Group, name: str) -> str:
+    return str(own[name].asstr()[()])
+
+
+def _read_camera(cameras: h5py.Group, name: str) -> Camera:
+    group = cameras[name]
+    size = (int(group["size"][0]), int(group["size"][1]))
+    lens = Intrinsics(group["K"][:], group["distortion"][:], size) if "K" in group else None
+    return Camera(name, group["P"][:], size, lens)
+
+
+def _read_matches(group: h5py.Group) -> Matches:
+    first, second = json.loads(group.attrs["pair"])
+    arrays = {name: group[name][:] for name in ("xy", "px", "c_ls", "sigma", "status", "vertex")}
+    return Matches(pair=(first, second), seconds=json.loads(group.attrs["seconds"]), **arrays)

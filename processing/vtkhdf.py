@@ -1,0 +1,76 @@
+"""The VTKHDF group of a results file: triangles that move in time, as ParaView and VTK read it.
+
+Layout after the VTK file format specification, "VTKHDF", version 2.0, type PolyData: the steps of every array lie one
+after the other, connectivity is stored once and all steps point to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+_CELL_GROUPS = ("Vertices", "Lines", "Polygons", "Strips")
+
+
+def create(file: h5py.File, faces: NDArray[np.int64], points: int, steps: int) -> h5py.Group:
+    """A new group for ``steps`` steps of constant triangles (M, 3); :func:`write_step` fills its arrays."""
+    group = file.create_group("VTKHDF", track_order=True)
+    group.attrs["Version"] = np.array([2, 0], dtype=np.int64)
+    group.attrs["Type"] = np.bytes_("PolyData")
+    group.create_dataset("NumberOfPoints", data=np.array([points], dtype=np.int64))
+    group.create_dataset("Points", shape=(steps * points, 3), dtype=np.float64)
+    for name in _CELL_GROUPS:
+        cells = np.asarray(faces, dtype=np.int64) if name == "Polygons" else np.empty((0, 3), dtype=np.int64)
+        part = group.create_group(name)
+        part.create_dataset("NumberOfCells", data=np.array([len(cells)], dtype=np.int64))
+        part.create_dataset("NumberOfConnectivityIds", data=np.array([cells.size], dtype=np.int64))
+        part.create_dataset("Connectivity", data=cells.ravel())
+        part.create_dataset("Offsets", data=np.arange(0, cells.size + 1, 3, dtype=np.int64))
+    group.create_group("PointData", track_order=True)
+    group.create_group("CellData", track_order=True)
+    timeline = group.create_group("Steps")
+    timeline.attrs["NSteps"] = np.int64(steps)
+    timeline.create_dataset("Values", data=np.arange(steps, dtype=np.float64))
+    timeline.create_dataset("NumberOfParts", data=np.ones(steps, dtype=np.int64))
+    timeline.create_dataset("PartOffsets", data=np.zeros(steps, dtype=np.int64))
+    timeline.create_dataset("PointOffsets", data=points * np.arange(steps, dtype=np.int64))
+    timeline.create_dataset("CellOffsets", data=np.zeros((steps, 4), dtype=np.int64))
+    timeline.create_dataset("ConnectivityIdOffsets", data=np.zeros((steps, 4), dtype=np.int64))
+    timeline.create_group("PointDataOffsets")
+    timeline.create_group("CellDataOffsets")
+    return group
+
+
+def write_step(
+    group: h5py.Group,
+    step: int,
+    positions: NDArray[np.float64],
+    point: Mapping[str, NDArray[np.generic]],
+    cell: Mapping[str, NDArray[np.generic]],
+) -> None:
+    """Fill one step. positions : (N, 3) mm, all finite; arrays of points (N, ...) and of faces (M, ...)."""
+    rows = len(positions)
+    group["Points"][step * rows : (step + 1) * rows] = positions
+    for place, arrays in (("PointData", point), ("CellData", cell)):
+        for name, values in arrays.items():
+            _array(group, place, name, values)[step * len(values) : (step + 1) * len(values)] = values
+
+
+def read_step(group: h5py.Group, place: str, name: str, step: int) -> NDArray[np.generic]:
+    """One array of one step; ``place`` is "PointData" or "CellData"."""
+    dataset = group[place][name]
+    steps = int(group["Steps"].attrs["NSteps"])
+    rows = dataset.shape[0] // steps
+    return np.asarray(dataset[step * rows : (step + 1) * rows])
+
+
+def _array(group: h5py.Group, place: str, name: str, values: NDArray[np.generic]) -> h5py.Dataset:
+    if name not in group[place]:
+        steps = int(group["Steps"].attrs["NSteps"])
+        group[place].create_dataset(name, shape=(steps * len(values), *values.shape[1:]), dtype=values.dtype)
+        offsets = len(values) * np.arange(steps, dtype=np.int64)
+        group["Steps"][f"{place}Offsets"].create_dataset(name, data=offsets)
+    return group[place][name]
