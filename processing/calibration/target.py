@@ -1,0 +1,296 @@
+"""The dots of the calibration cylinder told apart: which row, which column, which point in space.
+
+The dots nearest the camera are joined to a lattice. All rows are in the image, so the rows number themselves. The
+columns do once the camera's azimuth is roughly known: each numbering that is possible gives a camera by DLT, and only
+one of these cameras stands where the rig says, because neighbouring numberings are a column's angle apart. Where the
+seam of the columns is in view it decides by itself. The camera then says where every other dot must be.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from processing.calibration import dlt, lattice
+from processing.calibration.dots import Dots
+from processing.camera import Camera, Intrinsics
+from processing.errors import ComputationError, InputError
+from processing.rig import Target
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+log = logging.getLogger(__name__)
+
+#: Fewest dots and columns that make a camera.
+DOTS_NEEDED, COLUMNS_NEEDED = 24, 3
+#: A nominal azimuth further off than this is not believed, degrees.
+_AZIMUTH_LIMIT = 12.0
+#: Numberings whose distances from the nominal azimuth differ by less than this cannot be told apart, degrees.
+_AZIMUTH_MARGIN = 1.0
+#: A dot belongs to the lattice if it lies within this part of the row spacing of its place.
+_PLACE = 0.06
+
+
+@dataclass(frozen=True)
+class DotObservations:
+    """Dots of the target seen by one camera.
+
+    rows, columns : (n,), from 1, as DOT (row, column) of the target: row 1 lowest, column 1 on +x.
+    px : (n, 2) centroids in the image, px.
+    xyz : (n, 3) nominal positions of the dots' centres, mm.
+    azimuth_deg : where the camera stands, about +z from +x.
+    margin_deg : how much worse the second-best numbering of the columns agrees with the nominal azimuth.
+    """
+
+    camera: str
+    rows: Index
+    columns: Index
+    px: Array
+    xyz: Array
+    azimuth_deg: float
+    margin_deg: float
+
+    def __post_init__(self) -> None:
+        n = len(self.px)
+        if self.px.shape != (n, 2) or self.xyz.shape != (n, 3) or len(self.rows) != n or len(self.columns) != n:
+            raise ValueError("dot observations need one row, column and point for each position")
+
+    def __len__(self) -> int:
+        return len(self.px)
+
+    def chosen(self, keep: NDArray[np.bool_]) -> DotObservations:
+        """Some of the dots."""
+        return DotObservations(
+            self.camera,
+            self.rows[keep],
+            self.columns[keep],
+            self.px[keep],
+            self.xyz[keep],
+            self.azimuth_deg,
+            self.margin_deg,
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """The dots as JSON values."""
+        return {
+            "camera": self.camera,
+            "rows": self.rows.tolist(),
+            "columns": self.columns.tolist(),
+            "px": self.px.tolist(),
+            "xyz": self.xyz.tolist(),
+            "azimuth_deg": self.azimuth_deg,
+            "margin_deg": self.margin_deg if math.isfinite(self.margin_deg) else None,
+        }
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> DotObservations:
+        """The dots of :meth:`to_dict`."""
+        margin = values["margin_deg"]
+        return cls(
+            values["camera"],
+            np.array(values["rows"], dtype=np.intp),
+            np.array(values["columns"], dtype=np.intp),
+            np.array(values["px"], dtype=float).reshape(-1, 2),
+            np.array(values["xyz"], dtype=float).reshape(-1, 3),
+            float(values["azimuth_deg"]),
+            math.inf if margin is None else float(margin),
+        )
+
+
+def dot_points(target: Target, rows: Index, columns: Index) -> Array:
+    """Centres of dots on the cylinder. rows, columns : (n,), from 1. (n, 3) mm."""
+    angle = (np.asarray(columns) - 1) * target.column_angle
+    z = target.first_row_z_mm + (np.asarray(rows) - 1) * target.row_spacing_mm
+    return np.column_stack([target.radius_mm * np.cos(angle), target.radius_mm * np.sin(angle), z])
+
+
+def identify(
+    dots: Dots,
+    target: Target,
+    azimuth_deg: float,
+    *,
+    camera: str = "",
+    intrinsics: Intrinsics | None = None,
+    rotation_deg: float = 0.0,
+    max_incidence_deg: float = 60.0,
+) -> DotObservations:
+    """Row, column and point of every dot seen under less than ``max_incidence_deg``.
+
+    dots : spots of the image, most of them dots of the target.
+    azimuth_deg : nominal azimuth of the camera, good to ± 5°.
+    intrinsics : the lens, if known: it makes the expected places sharper, the positions stay image pixels.
+    rotation_deg : by how much the image is turned clockwise; the nearest multiple of 90 is used.
+
+    Raises InputError, with the camera's name and what was found, where the dots do not make a camera.
+    """
+    px = dots.px if intrinsics is None else intrinsics.to_undistorted(dots.px)
+    upright = _upright(Dots(px, dots.width, dots.height, dots.contrast), rotation_deg)
+    upright = upright[np.flatnonzero(np.isfinite(px).all(axis=1))]
+    spots, rows, columns = lattice.walk(upright, target)
+    _require_dots(camera, len(spots), len(set(columns.tolist())))
+    if rows.max() + 1 < target.rows:
+        raise InputError(
+            f"camera {camera}: {rows.max() + 1} rows of dots hang together in the target image, the target has "
+            f"{target.rows}; all rows must be in view and unobstructed near the middle, and [target] rows must be right"
+        )
+    numbering = _number(upright.px[spots], rows, columns, target, azimuth_deg, camera)
+    L = numbering.L
+    for _ in range(3):
+        found, rows, columns = _match(upright, L, target, max_incidence_deg)
+        _require_dots(camera, len(found), len(set(columns.tolist())))
+        xyz = dot_points(target, rows, columns)
+        L, kept = dlt.solve_dlt_robust(xyz, upright.px[found], sigmas=8.0, floor=2.0)
+    found, rows, columns, xyz = found[kept], rows[kept], columns[kept], xyz[kept]
+    _require_dots(camera, len(found), len(set(columns.tolist())))
+    observed = dots.px[np.flatnonzero(np.isfinite(px).all(axis=1))][found]
+    centre = Camera(camera, dlt.to_projection(L), (1, 1)).centre
+    azimuth = math.degrees(math.atan2(centre[1], centre[0])) % 360.0
+    log.info(
+        "camera %s: %d dots in columns %s, azimuth %.1f° (nominal %.1f°)",
+        camera,
+        len(found),
+        sorted(set(columns.tolist())),
+        azimuth,
+        azimuth_deg,
+    )
+    return DotObservations(camera, rows, columns, observed, xyz, azimuth, numbering.margin)
+
+
+def _upright(dots: Dots, rotation_deg: float) -> Dots:
+    """Dots of an image turned back to upright; positions are turned about the origin."""
+    quarters = round(rotation_deg / 90.0) % 4
+    x, y = dots.px.T
+    turned = {0: (x, y), 1: (y, -x), 2: (-x, -y), 3: (-y, x)}[quarters]
+    width, height = (dots.width, dots.height) if quarters % 2 == 0 else (dots.height, dots.width)
+    return Dots(np.column_stack(turned), width, height, dots.contrast)
+
+
+def _require_dots(camera: str, dots: int, columns: int) -> None:
+    if dots < DOTS_NEEDED or columns < COLUMNS_NEEDED:
+        raise InputError(
+            f"camera {camera}: {dots} dots in {columns} columns of the calibration target were recognised; at least "
+            f"{DOTS_NEEDED} in {COLUMNS_NEEDED} columns are needed. Check that the image shows the whole target, "
+            "upright, evenly lit and sharp, and that [target] in rig.toml describes it"
+        )
+
+
+@dataclass(frozen=True)
+class _Numbering:
+    """One way of numbering rows and columns, and the camera it means."""
+
+    L: Array
+    agreeing: int
+    cost: float
+    deviation: float
+    margin: float = math.inf
+
+
+def _number(px: Array, rows: Index, columns: Index, target: Target, azimuth_deg: float, camera: str) -> _Numbering:
+    """The numbering that puts the camera where the rig says it is."""
+    step = math.degrees(target.column_angle)
+    spacing = float(np.median(np.abs(px[:, 1] - np.mean(px[:, 1])))) * 4 / target.rows
+    possible = []
+    for shift in _shifts(columns, azimuth_deg, step):
+        # Signs above the dots may look like one more row; the row that fits worse is theirs.
+        tried = [
+            _try(px, rows - first_row + 1, columns + shift, target, azimuth_deg, _PLACE * spacing)
+            for first_row in range(int(rows.max()) + 2 - target.rows)
+        ]
+        best = min((t for t in tried if t is not None), key=lambda numbering: numbering.cost, default=None)
+        if best is not None and abs(best.deviation) <= _AZIMUTH_LIMIT:
+            possible.append(best)
+    if not possible:
+        raise InputError(
+            f"camera {camera}: no numbering of the target's columns puts the camera within {_AZIMUTH_LIMIT:.0f}° of "
+            f"its nominal azimuth {azimuth_deg:.1f}°; check azimuth_deg, and [target] columns and spacings, in rig.toml"
+        )
+    most = max(numbering.agreeing for numbering in possible)
+    good = sorted(
+        (numbering for numbering in possible if numbering.agreeing >= 0.97 * most),
+        key=lambda numbering: abs(numbering.deviation),
+    )
+    margin = abs(good[1].deviation) - abs(good[0].deviation) if len(good) > 1 else math.inf
+    if margin < _AZIMUTH_MARGIN:
+        raise InputError(
+            f"camera {camera}: its nominal azimuth {azimuth_deg:.1f}° lies half-way between two numberings of the "
+            f"target's columns (the camera stands at {azimuth_deg + good[0].deviation:.1f}° or "
+            f"{azimuth_deg + good[1].deviation:.1f}°); give azimuth_deg to within 5°"
+        )
+    return replace(good[0], margin=margin)
+
+
+def _shifts(columns: Index, azimuth_deg: float, step: float) -> range:
+    """Numbers the leftmost column may have: those with the middle of the lattice near the nominal azimuth."""
+    middle = (azimuth_deg % 360.0) / step + 1 - float(np.median(columns))
+    return range(math.floor(middle) - 3, math.ceil(middle) + 4)
+
+
+def _try(
+    px: Array, rows: Index, columns: Index, target: Target, azimuth_deg: float, tolerance: float
+) -> _Numbering | None:
+    """The camera of one numbering, or None where it is not one outside the target."""
+    step = math.degrees(target.column_angle)
+    whole = 360.0 - (target.columns - 1) * step < 1.6 * step  # the columns go all the way round
+    if whole:
+        columns = (columns - 1) % target.columns + 1
+    inside = (rows >= 1) & (rows <= target.rows) & (columns >= 1) & (columns <= target.columns)
+    if inside.sum() < DOTS_NEEDED or len(np.unique(columns[inside])) < COLUMNS_NEEDED:
+        return None
+    xyz = dot_points(target, rows[inside], columns[inside])
+    try:
+        L, _ = dlt.solve_dlt_robust(xyz, px[inside], sigmas=3.0, floor=tolerance)
+        centre = Camera("", dlt.to_projection(L), (1, 1)).centre
+    except (ComputationError, np.linalg.LinAlgError):
+        return None
+    if np.hypot(centre[0], centre[1]) <= target.radius_mm:
+        return None
+    off = np.linalg.norm(dlt.residuals(L, xyz, px[inside]), axis=1)
+    cost = float(np.sum(np.minimum(off, tolerance) ** 2)) + tolerance**2 * int((~inside).sum())
+    azimuth = math.degrees(math.atan2(centre[1], centre[0]))
+    return _Numbering(L, int((off < tolerance).sum()), cost, (azimuth - azimuth_deg + 180.0) % 360.0 - 180.0)
+
+
+def _match(dots: Dots, L: Array, target: Target, max_incidence_deg: float) -> tuple[Index, Index, Index]:
+    """Spots that are where dots must be and as large as they must be: their indices, rows and columns."""
+    camera = Camera("", dlt.to_projection(L), (1, 1))
+    rows, columns = (a.ravel() for a in np.mgrid[1 : target.rows + 1, 1 : target.columns + 1])
+    xyz = dot_points(target, rows, columns)
+    normals = xyz * np.array([1 / target.radius_mm, 1 / target.radius_mm, 0])
+    seen = camera.incidence_cosine(xyz, normals) > math.cos(math.radians(max_incidence_deg))
+    rows, columns, xyz = rows[seen], columns[seen], xyz[seen]
+    expected = camera.project_undistorted(xyz)
+    width, height = _projected_size(camera, xyz, target)
+
+    distance, nearest = cKDTree(dots.px).query(expected)
+    back = cKDTree(expected).query(dots.px)[1]
+    ok = back[nearest] == np.arange(len(expected))
+    ok &= distance < np.minimum(width, height)
+    ok &= np.abs(dots.width[nearest] - width) < 0.3 * width + 3
+    ok &= np.abs(dots.height[nearest] - height) < 0.3 * height + 3
+    if ok.any():
+        ok &= dots.contrast[nearest] > 0.4 * np.median(dots.contrast[nearest[ok]])
+    return nearest[ok], rows[ok], columns[ok]
+
+
+def _projected_size(camera: Camera, xyz: Array, target: Target) -> tuple[Array, Array]:
+    """Width and height of the upright boxes round the dots' images. (n,) each, px."""
+    half = target.dot_size_mm / 2
+    angle = np.arctan2(xyz[:, 1], xyz[:, 0])
+    turn = half / target.radius_mm
+    corners = [
+        camera.project_undistorted(
+            np.column_stack(
+                [target.radius_mm * np.cos(angle + a), target.radius_mm * np.sin(angle + a), xyz[:, 2] + dz]
+            )
+        )
+        for a in (-turn, turn)
+        for dz in (-half, half)
+    ]
+    extent = np.ptp(np.stack(corners), axis=0)
+    return extent[:, 0], extent[:, 1]
