@@ -1,0 +1,1 @@
+"""Cameras behind one small protocol: the Pi's, the simulated rig's, and a plain test pattern."""

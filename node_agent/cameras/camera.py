@@ -1,0 +1,105 @@
+"""What every camera of a node can do, and what a frame is.
+
+A camera is locked to settings before it captures, so that all frames of a session have the same exposure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+SETTINGS = ("exposure_us", "gain", "colour_gains", "period_us", "tolerance_us")
+
+
+class CameraError(RuntimeError):
+    """The camera cannot do what was asked; the text tells what and why."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """Which frame is wanted: the one nearest to `fire_at_ns`; kind and scene steer a simulated rig."""
+
+    fire_at_ns: int
+    kind: str
+    scene: int
+
+
+@dataclass(frozen=True)
+class Lock:
+    """What the camera holds after locking: metadata of its frames, sync state, frame grid if it runs freely."""
+
+    metadata: dict[str, Any] = field(default_factory=dict)
+    sync: str = "none"
+    frame_time_ns: int | None = None
+    frame_period_ns: int | None = None
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image.
+
+    Attributes
+    ----------
+    pixels : (height, width) uint8 or uint16
+        The luminance plane, or raw values.
+    time_ns : int
+        Measured wall-clock time of the frame, ns since the Unix epoch.
+    exposure_us : float or None
+    """
+
+    pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+    time_ns: int
+    exposure_us: float | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.pixels.ndim != 2 or 0 in self.pixels.shape:
+            raise CameraError(f"a frame must be a plane of pixels, not an array of shape {self.pixels.shape}")
+        if self.pixels.dtype not in (np.uint8, np.uint16):
+            raise CameraError(f"a frame must be 8 or 16 bit, not {self.pixels.dtype}")
+
+    @property
+    def width(self) -> int:
+        return int(self.pixels.shape[1])
+
+    @property
+    def height(self) -> int:
+        return int(self.pixels.shape[0])
+
+    def pgm(self) -> tuple[bytes, bytes]:
+        """The frame as a binary PGM file: header and pixels; 16 bit is big-endian as the format demands."""
+        deepest = 255 if self.pixels.dtype == np.uint8 else 65535
+        header = f"P5\n{self.width} {self.height}\n{deepest}\n".encode()
+        plane = self.pixels if deepest == 255 else self.pixels.astype(">u2")
+        return header, np.ascontiguousarray(plane).tobytes()
+
+
+class Camera(Protocol):
+    """A source of frames. Used from one thread."""
+
+    def lock(self, settings: Mapping[str, Any]) -> Lock:
+        """Hold these settings; return when consecutive frames show them. Raises CameraError."""
+        ...
+
+    def capture(self, shot: Shot) -> Frame:
+        """The frame nearest to the shot's moment. Raises CameraError, after a bounded wait."""
+        ...
+
+    def versions(self) -> dict[str, str]:
+        """Names and versions of what the camera runs on."""
+        ...
+
+    def close(self) -> None: ...
+
+
+def check_settings(settings: Mapping[str, Any]) -> None:
+    """Refuse settings that no camera knows, by name."""
+    for name, value in settings.items():
+        if name not in SETTINGS:
+            raise CameraError(f"unknown camera setting '{name}'; known are {', '.join(SETTINGS)}")
+        if name in ("exposure_us", "gain", "period_us") and not (isinstance(value, int | float) and value > 0):
+            raise CameraError(f"the camera setting '{name}' must be a positive number, not {value!r}")

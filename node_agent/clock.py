@@ -1,0 +1,70 @@
+"""Wall and monotonic time as an object, so that a test can hold the clock."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import time
+from dataclasses import dataclass
+from typing import Protocol
+
+
+@dataclass(frozen=True)
+class Instant:
+    """One moment on both clocks. Wall time is compared between machines, monotonic time measures waits."""
+
+    wall_ns: int
+    monotonic_ns: int
+
+
+class Clock(Protocol):
+    """Tells the moment and waits."""
+
+    def now(self) -> Instant: ...
+
+    def sleep(self, seconds: float) -> None: ...
+
+
+class SystemClock:
+    """The machine's clocks."""
+
+    def now(self) -> Instant:
+        return Instant(wall_ns=time.time_ns(), monotonic_ns=time.monotonic_ns())
+
+    def sleep(self, seconds: float) -> None:
+        time.sleep(max(seconds, 0.0))
+
+
+def sleep_until(clock: Clock, wall_ns: int) -> None:
+    """Return when the wall clock has reached `wall_ns`; in short waits, so a stepped clock cannot hang it."""
+    while (left := wall_ns - clock.now().wall_ns) > 0:
+        clock.sleep(min(left / 1e9, 0.05))
+
+
+def clock_offset() -> tuple[float, float] | None:
+    """Offset of this machine's clock from its server and the bound of its error, ms; None without chrony."""
+    command = shutil.which("chronyc")
+    if command is None:
+        return None
+    try:
+        answer = subprocess.run([command, "-c", "tracking"], capture_output=True, text=True, timeout=2.0, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return parse_tracking(answer.stdout)
+
+
+def parse_tracking(line: str) -> tuple[float, float] | None:
+    """Offset and error bound, ms, from the line of ``chronyc -c tracking``; None if unsynchronised.
+
+    Fields counted from 0: 4 offset of the system clock, 10 root delay, 11 root dispersion, all in seconds.
+    chrony bounds the error by |offset| + dispersion + delay / 2.
+    """
+    columns = line.strip().split(",")
+    try:
+        stratum = int(columns[2])
+        offset, delay, dispersion = (float(columns[i]) for i in (4, 10, 11))
+    except (IndexError, ValueError):
+        return None
+    if stratum == 0:
+        return None
+    return 1e3 * offset, 1e3 * (abs(offset) + dispersion + delay / 2)

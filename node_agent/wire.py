@@ -1,0 +1,419 @@
+"""The contract between node and controller: key expressions, messages, encoding.
+
+Both sides import this file and nothing else of each other. Standard library only.
+
+Keys
+----
+``rig/<rig>/node/<id>/arm``        query: Arm -> ArmReply
+``rig/<rig>/node/<id>/trigger``    query: Trigger -> TriggerReply
+``rig/<rig>/node/<id>/inventory``  query: (empty) -> Inventory
+``rig/<rig>/node/<id>/fetch``      query: Fetch -> image bytes, Manifest as attachment
+``rig/<rig>/node/<id>/preview``    query: (empty) -> a small PGM of the newest frame
+``rig/<rig>/node/<id>/ack``        put by the controller: Ack
+``rig/<rig>/node/<id>/status``     put by the node: Status or Failure; as a query: (empty) -> Status
+``rig/<rig>/img/<id>``             put by the node: image bytes, Manifest as attachment
+``rig/<rig>/alive/<id>``           liveliness token of the node
+
+Messages are JSON objects with ``schema`` and ``type``; image bytes travel raw. A message is checked when
+it is built, so an invalid one cannot exist on either side. All times are integers, ns since the Unix epoch.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+SCHEMA = 1
+
+CAPTURE_KINDS = ("board", "target", "specimen", "static")
+NODE_STATES = ("idle", "arming", "armed", "capturing")
+TRIGGER_VERDICTS = ("accepted", "late", "not armed")
+ACK_VERDICTS = ("archived", "unknown")
+
+# Zenoh's configuration where both sides must agree or profit alike. Shared memory drops messages silently and
+# is slower for images; waiting on a frozen receiver must end before the lease does, or images vanish unnoticed.
+NETWORK: dict[str, object] = {
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "transport/shared_memory/enabled": False,
+    "transport/link/rx/max_message_size": 64 << 20,
+    "transport/link/tx/lease": 10_000,
+    "transport/link/tx/queue/congestion_control/block/wait_before_close": 8_000_000,
+}
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_HASH = re.compile(r"[0-9a-f]{64}")
+
+
+class WireError(ValueError):
+    """A message that breaks the contract: the text says which field and why."""
+
+
+def checked_name(what: str, name: object) -> str:
+    """Return `name` if it may stand in a key and in a file name, else raise WireError."""
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
+        raise WireError(
+            f"{what} {name!r} is not a name: use 1 to 64 letters, digits, dots, dashes or underscores, "
+            "beginning with a letter or a digit"
+        )
+    return name
+
+
+@dataclass(frozen=True)
+class Keys:
+    """The key expressions of one rig. `node` may be ``*`` for all nodes."""
+
+    rig: str
+
+    def __post_init__(self) -> None:
+        checked_name("rig", self.rig)
+
+    def node(self, node: str, verb: str) -> str:
+        return f"rig/{self.rig}/node/{node}/{verb}"
+
+    def image(self, node: str) -> str:
+        return f"rig/{self.rig}/img/{node}"
+
+    def alive(self, node: str) -> str:
+        return f"rig/{self.rig}/alive/{node}"
+
+
+@dataclass(frozen=True, order=True)
+class CaptureKey:
+    """What makes a capture unique: the planned moment tells apart two sessions of the same name."""
+
+    session: str
+    capture_id: str
+    fire_at_ns: int
+
+    def __post_init__(self) -> None:
+        checked_name("session", self.session)
+        checked_name("capture_id", self.capture_id)
+        _require_int("fire_at_ns", self.fire_at_ns, at_least=0)
+
+    def __str__(self) -> str:
+        return f"{self.session}/{self.capture_id}"
+
+    @property
+    def stem(self) -> str:
+        """A file name without extension; ``~`` cannot occur in a name."""
+        return f"{self.session}~{self.capture_id}~{self.fire_at_ns}"
+
+
+def _require_int(what: str, value: object, *, at_least: int) -> None:
+    if not isinstance(value, int) or isinstance(value, bool) or value < at_least:
+        raise WireError(f"{what} must be an integer of at least {at_least}, not {value!r}")
+
+
+def _require_in(what: str, value: object, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise WireError(f"{what} {value!r} is none of {', '.join(allowed)}")
+
+
+def _require_hash(what: str, value: object) -> None:
+    if not isinstance(value, str) or not _HASH.fullmatch(value):
+        raise WireError(f"{what} must be 64 hexadecimal digits (SHA-256), not {value!r}")
+
+
+def _require_table(what: str, value: object) -> None:
+    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+        raise WireError(f"{what} must be a table with text keys, not {value!r}")
+    try:
+        json.dumps(value)
+    except (TypeError, ValueError) as error:
+        raise WireError(f"{what} cannot be written as JSON: {error}") from error
+
+
+class _Message:
+    """A message has a class variable `TYPE` and is a frozen dataclass."""
+
+    TYPE: ClassVar[str]
+
+
+@dataclass(frozen=True)
+class Arm(_Message):
+    """Lock the camera for a session. `settings_hash` is sha256 of the canonical JSON of `settings`."""
+
+    TYPE: ClassVar[str] = "arm"
+    session: str
+    kind: str
+    settings: dict[str, Any]
+    settings_hash: str
+    expected: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        checked_name("session", self.session)
+        _require_in("kind", self.kind, CAPTURE_KINDS)
+        _require_table("settings", self.settings)
+        _require_hash("settings_hash", self.settings_hash)
+        for node in self.expected:
+            checked_name("node", node)
+
+
+@dataclass(frozen=True)
+class ArmReply(_Message):
+    """What the node locked. `frame_time_ns` and `frame_period_ns` describe its frame grid, if it has one."""
+
+    TYPE: ClassVar[str] = "arm-reply"
+    node: str
+    armed: bool
+    settings_hash: str
+    reason: str = ""
+    locked: dict[str, Any] = field(default_factory=dict)
+    sync: str = "none"
+    clock_offset_ms: float | None = None
+    clock_error_ms: float | None = None
+    frame_time_ns: int | None = None
+    frame_period_ns: int | None = None
+    spool_free: int = 0
+    versions: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        checked_name("node", self.node)
+        _require_hash("settings_hash", self.settings_hash)
+        _require_table("locked", self.locked)
+        _require_table("versions", self.versions)
+        if not self.armed and not self.reason:
+            raise WireError("an ArmReply that is not armed must tell the reason")
+
+
+@dataclass(frozen=True)
+class Trigger(_Message):
+    """Keep the frame nearest to `key.fire_at_ns`. `scene` counts the captures of this kind, for simulated rigs."""
+
+    TYPE: ClassVar[str] = "trigger"
+    key: CaptureKey
+    kind: str
+    scene: int = 0
+
+    def __post_init__(self) -> None:
+        _require_in("kind", self.kind, CAPTURE_KINDS)
+        _require_int("scene", self.scene, at_least=0)
+
+
+@dataclass(frozen=True)
+class TriggerReply(_Message):
+    TYPE: ClassVar[str] = "trigger-reply"
+    node: str
+    key: CaptureKey
+    verdict: str
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        checked_name("node", self.node)
+        _require_in("verdict", self.verdict, TRIGGER_VERDICTS)
+
+
+@dataclass(frozen=True)
+class Manifest(_Message):
+    """The truth about one image file. `time_ns` is the measured wall-clock time of the frame."""
+
+    TYPE: ClassVar[str] = "manifest"
+    node: str
+    key: CaptureKey
+    kind: str
+    sha256: str
+    bytes: int
+    width: int
+    height: int
+    time_ns: int
+    exposure_us: float | None = None
+    format: str = "pgm"
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        checked_name("node", self.node)
+        _require_in("kind", self.kind, CAPTURE_KINDS)
+        _require_hash("sha256", self.sha256)
+        _require_int("bytes", self.bytes, at_least=1)
+        _require_int("width", self.width, at_least=1)
+        _require_int("height", self.height, at_least=1)
+        _require_int("time_ns", self.time_ns, at_least=0)
+        _require_in("format", self.format, ("pgm",))
+        _require_table("metadata", self.metadata)
+
+
+@dataclass(frozen=True)
+class Failure(_Message):
+    """A capture that this node was triggered for and has no image of."""
+
+    TYPE: ClassVar[str] = "failure"
+    node: str
+    key: CaptureKey
+    reason: str
+
+    def __post_init__(self) -> None:
+        checked_name("node", self.node)
+        if not self.reason:
+            raise WireError("a Failure must tell the reason")
+
+
+@dataclass(frozen=True)
+class Inventory(_Message):
+    """What the node holds: images in its spool, failures it remembers, the capture under way."""
+
+    TYPE: ClassVar[str] = "inventory"
+    node: str
+    manifests: tuple[Manifest, ...] = ()
+    failures: tuple[Failure, ...] = ()
+    capturing: CaptureKey | None = None
+
+    def __post_init__(self) -> None:
+        checked_name("node", self.node)
+
+
+@dataclass(frozen=True)
+class Fetch(_Message):
+    TYPE: ClassVar[str] = "fetch"
+    key: CaptureKey
+
+
+@dataclass(frozen=True)
+class Ack(_Message):
+    """``archived``: the image with this hash is safe, free it. ``unknown``: no such capture here, stop sending."""
+
+    TYPE: ClassVar[str] = "ack"
+    node: str
+    key: CaptureKey
+    sha256: str
+    verdict: str = "archived"
+
+    def __post_init__(self) -> None:
+        checked_name("node", self.node)
+        _require_hash("sha256", self.sha256)
+        _require_in("verdict", self.verdict, ACK_VERDICTS)
+
+
+@dataclass(frozen=True)
+class Status(_Message):
+    """The node's state, sent at an interval and on change. `time_ns` is the node's clock when it was sent."""
+
+    TYPE: ClassVar[str] = "status"
+    node: str
+    state: str
+    armed: bool
+    time_ns: int
+    spool_free: int
+    spool_images: int
+    versions: dict[str, str] = field(default_factory=dict)
+    clock_offset_ms: float | None = None
+    detail: str = ""
+
+    def __post_init__(self) -> None:
+        checked_name("node", self.node)
+        _require_in("state", self.state, NODE_STATES)
+        _require_int("time_ns", self.time_ns, at_least=0)
+        _require_int("spool_free", self.spool_free, at_least=0)
+        _require_int("spool_images", self.spool_images, at_least=0)
+        _require_table("versions", self.versions)
+
+
+Message = Arm | ArmReply | Trigger | TriggerReply | Manifest | Failure | Inventory | Fetch | Ack | Status
+_TYPES: dict[str, type[Any]] = {
+    cls.TYPE: cls for cls in (Arm, ArmReply, Trigger, TriggerReply, Manifest, Failure, Inventory, Fetch, Ack, Status)
+}
+# What a field holds, where JSON alone does not say: nested records and sequences of them.
+_NESTED: dict[tuple[str, str], type[Any]] = {
+    ("trigger", "key"): CaptureKey,
+    ("trigger-reply", "key"): CaptureKey,
+    ("manifest", "key"): CaptureKey,
+    ("failure", "key"): CaptureKey,
+    ("fetch", "key"): CaptureKey,
+    ("ack", "key"): CaptureKey,
+    ("inventory", "capturing"): CaptureKey,
+    ("inventory", "manifests"): Manifest,
+    ("inventory", "failures"): Failure,
+}
+_PLAIN: dict[str, type[Any] | tuple[type[Any], ...]] = {
+    "str": str,
+    "int": int,
+    "bool": bool,
+    "float | None": (int, float, type(None)),
+    "int | None": (int, type(None)),
+    "dict[str, Any]": dict,
+    "dict[str, str]": dict,
+}
+
+
+def encode(message: Message) -> bytes:
+    """Return the message as JSON bytes with its schema version and type."""
+    document = {"schema": SCHEMA, "type": message.TYPE, **dataclasses.asdict(message)}
+    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+
+
+def decode(payload: bytes) -> Message:
+    """Return the message in `payload`.
+
+    Raises
+    ------
+    WireError
+        Not JSON, an unknown schema or type, a missing, unknown or wrong field.
+    """
+    try:
+        document = json.loads(payload)
+    except ValueError as error:
+        raise WireError(f"the message is not JSON: {error}") from error
+    if not isinstance(document, dict):
+        raise WireError(f"the message is not a JSON object: {document!r}")
+    schema = document.pop("schema", None)
+    if schema != SCHEMA:
+        raise WireError(f"the message has schema {schema!r}; this side speaks schema {SCHEMA}: update the older side")
+    kind = document.pop("type", None)
+    if not isinstance(kind, str) or kind not in _TYPES:
+        raise WireError(f"the message type {kind!r} is none of {', '.join(_TYPES)}")
+    return _build(_TYPES[kind], kind, document)
+
+
+def decode_as(expected: type[Any], payload: bytes) -> Any:
+    """Return the message in `payload`, which must be of type `expected`; raises WireError."""
+    message = decode(payload)
+    if not isinstance(message, expected):
+        raise WireError(f"expected a message of type {expected.TYPE!r}, got {message.TYPE!r}")
+    return message
+
+
+def _build(cls: type[Any], kind: str, document: dict[str, Any]) -> Any:
+    fields = {f.name: f for f in dataclasses.fields(cls)}
+    for name in document:
+        if name not in fields:
+            raise WireError(f"{kind}: unknown field {name!r}")
+    values: dict[str, Any] = {}
+    for name, described in fields.items():
+        if name not in document:
+            if described.default is dataclasses.MISSING and described.default_factory is dataclasses.MISSING:
+                raise WireError(f"{kind}: field {name!r} is missing")
+            continue
+        values[name] = _field(kind, name, str(described.type), document[name])
+    return cls(**values)
+
+
+def _field(kind: str, name: str, annotation: str, value: Any) -> Any:
+    where = f"{kind}: field {name!r}"
+    nested = _NESTED.get((kind, name))
+    if nested is not None and value is None and annotation.endswith("| None"):
+        return None
+    if nested is not None and annotation.startswith("tuple"):
+        return tuple(_build_nested(where, nested, item) for item in _sequence(where, value))
+    if nested is not None:
+        return _build_nested(where, nested, value)
+    if annotation.startswith("tuple"):
+        return tuple(_sequence(where, value))
+    plain = _PLAIN[annotation]
+    if not isinstance(value, plain) or (isinstance(value, bool) and annotation != "bool"):
+        raise WireError(f"{where} must be {annotation}, not {value!r}")
+    return value
+
+
+def _sequence(where: str, value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        raise WireError(f"{where} must be a list, not {value!r}")
+    return value
+
+
+def _build_nested(where: str, cls: type[Any], value: Any) -> Any:
+    if not isinstance(value, dict):
+        raise WireError(f"{where} must be an object, not {value!r}")
+    return _build(cls, cls.TYPE if hasattr(cls, "TYPE") else "capture key", value)
