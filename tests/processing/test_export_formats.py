@@ -1,0 +1,181 @@
+"""Every export format, read back by a reader that is not the writer's, carries the same surface and fields."""
+
+import base64
+import csv
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from scipy.io import loadmat
+
+from processing.errors import InputError
+from processing.export import FORMATS, export
+from processing.results import Results, read_field, write_results
+
+LOST = 4
+STEPS = ("0003-specimen", "0004-specimen")
+
+
+def bent_sheet() -> Results:
+    """A cylindrical sheet of two camera pairs, stretched by 1.1 along z, with one point lost in the step."""
+    angle, z = np.meshgrid(np.linspace(-0.4, 0.4, 6), np.linspace(0, 30, 5), indexing="ij")
+    reference = np.column_stack([57 * np.cos(angle.ravel()), 57 * np.sin(angle.ravel()), z.ravel()])
+    i = np.arange(30).reshape(6, 5)
+    a, b, c, d = i[:-1, :-1].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel(), i[:-1, 1:].ravel()
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    vertices = np.stack([reference, reference * [1.0, 1.0, 1.1]])
+    vertices[1, LOST] = np.nan
+    rng = np.random.default_rng(4)
+    correlation, sigma = rng.uniform(0, 0.05, (2, 30)), rng.uniform(0, 0.01, (2, 30, 3))
+    correlation[1, LOST] = sigma[1, LOST] = np.nan
+    status = np.isnan(correlation).astype(np.int8)
+    return Results(
+        rig="two pairs", steps=STEPS, cameras=(), pairs=(("1", "2"), ("2", "3")), vertices_ref=reference,
+        vertices=vertices, faces=faces, pair=np.where(np.arange(40) < 20, 0, np.where(np.arange(40) < 36, 1, -1)),
+        vertex_pair=np.zeros(30, dtype=np.int64), correlation=correlation, sigma_xyz=sigma, status=status,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("export") / "session"
+    (path / "results" / "0001").mkdir(parents=True)
+    write_results(path / "results" / "0001" / "results.h5", bent_sheet())
+    return path
+
+
+def test_npz_has_exactly_the_agreed_arrays(session: Path) -> None:
+    result = bent_sheet()
+    path = export(session, "npz")
+    assert path == session / "results" / "0001" / "results.npz"
+    with np.load(path) as arrays:
+        shapes = {name: arrays[name].shape for name in arrays}
+        assert shapes == {
+            "vertices_ref": (30, 3), "vertices": (2, 30, 3), "faces": (40, 3), "lambda1": (2, 40), "lambda2": (2, 40),
+            "J": (2, 40), "E": (2, 40, 3, 3), "correlation": (2, 30), "sigma_xyz": (2, 30, 3), "pair": (40,),
+        }  # fmt: skip
+        np.testing.assert_array_equal(arrays["vertices"], result.vertices)
+        np.testing.assert_array_equal(arrays["faces"], result.faces)
+        np.testing.assert_array_equal(arrays["pair"], result.pair)
+        np.testing.assert_allclose(arrays["correlation"], result.correlation, rtol=1e-6)
+        np.testing.assert_allclose(arrays["E"][0], 0.0, atol=1e-12)  # the reference: identity
+        np.testing.assert_allclose(arrays["lambda1"][0], 1.0, atol=1e-12)
+        whole = ~(result.faces == LOST).any(axis=1)
+        np.testing.assert_allclose(arrays["lambda2"][1][whole], 1.1, atol=1e-12)
+        np.testing.assert_allclose(arrays["J"][1][whole], 1.1, atol=1e-12)
+        np.testing.assert_allclose(arrays["E"][1][whole][:, 2, 2], (1.1**2 - 1) / 2, atol=1e-12)
+        assert np.isnan(arrays["E"][1][~whole]).all()
+
+
+def test_mat_counts_from_one(session: Path, tmp_path: Path) -> None:
+    arrays = loadmat(export(session, "mat", tmp_path / "sheet.mat"))
+    np.testing.assert_array_equal(arrays["faces"], bent_sheet().faces + 1)
+    np.testing.assert_array_equal(arrays["vertices"], bent_sheet().vertices)
+    assert set(np.unique(arrays["pair"])) == {0, 1, 2}
+    assert [str(name[0]) for name in arrays["steps"].ravel()] == list(STEPS)
+
+
+def test_csv_has_a_row_for_every_point_and_face(session: Path, tmp_path: Path) -> None:
+    folder = export(session, "csv", tmp_path / "tables")
+    with (folder / f"{STEPS[1]}-points.csv").open(encoding="utf-8") as file:
+        points = list(csv.DictReader(file))
+    with (folder / f"{STEPS[1]}-faces.csv").open(encoding="utf-8") as file:
+        faces = list(csv.DictReader(file))
+    result = bent_sheet()
+    assert (len(points), len(faces)) == (30, 40)
+    assert points[LOST]["x [mm]"] == ""
+    assert float(points[LOST]["x_reference [mm]"]) == pytest.approx(result.vertices_ref[LOST, 0], abs=1e-6)
+    assert float(points[9]["displacement_z [mm]"]) == pytest.approx(0.1 * result.vertices_ref[9, 2], abs=1e-5)
+    last = faces[-1]
+    assert [int(last[f"vertex{i}"]) for i in (1, 2, 3)] == result.faces[-1].tolist()
+    assert float(last["lambda2"]) == pytest.approx(1.1, abs=1e-6)
+
+
+def test_ply_has_the_measured_surface_with_its_fields(session: Path, tmp_path: Path) -> None:
+    folder = export(session, "ply", tmp_path / "ply")
+    solid = trimesh.load(folder / f"{STEPS[1]}.ply", process=False)
+    result = bent_sheet()
+    whole = ~(result.faces == LOST).any(axis=1)
+    np.testing.assert_allclose(solid.triangles, result.vertices[1][result.faces[whole]], atol=1e-5)
+    stored = solid.metadata["_ply_raw"]["face"]["data"]["lambda2"]
+    np.testing.assert_allclose(np.ravel(stored), 1.1, atol=1e-6)
+
+
+def test_glb_is_in_metres_with_y_upwards_and_coloured(session: Path, tmp_path: Path) -> None:
+    folder = export(session, "glb", tmp_path / "glb")
+    scene = trimesh.load(folder / f"{STEPS[1]}.glb", process=False)
+    (solid,) = scene.geometry.values()
+    result = bent_sheet()
+    whole = ~(result.faces == LOST).any(axis=1)
+    x, y, z = np.moveaxis(result.vertices[1][result.faces[whole]], -1, 0) / 1000.0
+    np.testing.assert_allclose(solid.triangles, np.stack([x, z, -y], axis=-1), atol=1e-7)
+    assert (solid.face_normals[:, 0] > 0).all()  # outwards still
+    assert len(np.unique(solid.visual.vertex_colors, axis=0)) == 5  # displacement rises with the five levels of z
+
+
+def test_vtp_carries_points_and_fields_of_each_step(session: Path, tmp_path: Path) -> None:
+    folder = export(session, "vtp", tmp_path / "vtp")
+    series = ET.parse(folder / "series.pvd").getroot()
+    assert [entry.get("file") for entry in series.iter("DataSet")] == [f"{name}.vtp" for name in STEPS]
+    root = ET.parse(folder / f"{STEPS[1]}.vtp").getroot()
+    arrays = {}
+    for element in root.iter("DataArray"):
+        raw = base64.b64decode(element.text)
+        assert int.from_bytes(raw[:8], "little") == len(raw) - 8
+        kind = {"Float32": "<f4", "Float64": "<f8", "Int64": "<i8", "UInt8": "u1", "Int8": "i1"}[element.get("type")]
+        arrays[element.get("Name")] = np.frombuffer(raw[8:], kind)
+    result = bent_sheet()
+    np.testing.assert_array_equal(arrays["connectivity"], result.faces.ravel())
+    assert arrays["offsets"].tolist() == list(range(3, 121, 3))
+    measured = arrays["measured"].astype(bool)
+    np.testing.assert_array_equal(np.flatnonzero(~measured), [LOST])
+    points = arrays["Points"].reshape(-1, 3)
+    np.testing.assert_array_equal(points[measured], result.vertices[1][measured])
+    expected, _ = read_field(session / "results" / "0001" / "results.h5", "E2", 1)
+    np.testing.assert_array_equal(arrays["E2"], expected)
+
+
+def test_vtkhdf_is_the_moving_surface_alone(session: Path, tmp_path: Path) -> None:
+    path = export(session, "vtkhdf", tmp_path / "sheet.vtkhdf")
+    with h5py.File(path) as file:
+        assert list(file) == ["VTKHDF"]
+        assert file["VTKHDF"].attrs["Type"] == b"PolyData"
+        np.testing.assert_array_equal(file["VTKHDF/Points"][:30], bent_sheet().vertices_ref)
+
+
+@pytest.mark.parametrize("name", ["vtkhdf", "vtp"])
+def test_vtk_reads_what_is_exported(session: Path, tmp_path: Path, name: str) -> None:
+    pytest.importorskip("vtkmodules", reason="the vtk package is not installed")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOHDF import vtkHDFReader
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+
+    out = export(session, name, tmp_path / "sheet.vtkhdf")
+    reader = vtkHDFReader() if name == "vtkhdf" else vtkXMLPolyDataReader()
+    reader.SetFileName(str(out if name == "vtkhdf" else out / f"{STEPS[1]}.vtp"))
+    if name == "vtkhdf":
+        reader.SetStep(1)
+    reader.Update()
+    surface = reader.GetOutputDataObject(0)
+    assert (surface.GetNumberOfPoints(), surface.GetNumberOfCells()) == (30, 40)
+    expected, _ = read_field(session / "results" / "0001" / "results.h5", "lambda2", 1)
+    np.testing.assert_array_equal(vtk_to_numpy(surface.GetCellData().GetArray("lambda2")), expected)
+
+
+def test_bad_requests_are_refused_and_leave_nothing(session: Path, tmp_path: Path) -> None:
+    assert FORMATS == ("npz", "vtkhdf", "vtp", "mat", "csv", "ply", "glb")
+    with pytest.raises(InputError, match="no export format 'stl'; there are npz"):
+        export(session, "stl", tmp_path / "x.stl")
+    with pytest.raises(InputError, match="no such folder"):
+        export(session, "npz", tmp_path / "none" / "x.npz")
+    with pytest.raises(InputError, match="no results yet"):
+        export(tmp_path, "npz")
+    with pytest.raises(InputError, match="writes one file"):
+        export(session, "npz", tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="writes a folder"):
+        export(session, "ply", tmp_path / "file")
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
