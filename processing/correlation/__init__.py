@@ -1,0 +1,33 @@
+"""Digital image correlation of two images: where every point of the reference lies in the current image.
+
+``prepare_reference`` and ``prepare_current`` filter the images once, ``grid`` lays the points, ``correlate`` matches
+them. The room knows images, masks and points only: no camera, no calibration, no session.
+
+``kernels``      one subset by inverse-compositional Gauss-Newton, and many in parallel
+``spline``       B-spline coefficients and gradients
+``propagation``  from matched points to their neighbours, in waves
+``neighbours``   the neighbours' judgement: prediction, outliers, islands
+``seeds``        first matches in time; ``features`` first matches between cameras
+``hypotheses``   many given warps tried at each point, for start values that come from geometry
+``command``      the same for two files
+"""
+
+from processing.correlation.correlate import Correlation, correlate
+from processing.correlation.grid import grid
+from processing.correlation.hypotheses import search_hypotheses
+from processing.correlation.prepared import Current, Reference, prepare_current, prepare_reference
+from processing.correlation.settings import CorrelationSettings
+from processing.correlation.status import Status
+
+__all__ = [
+    "Correlation",
+    "CorrelationSettings",
+    "Current",
+    "Reference",
+    "Status",
+    "correlate",
+    "grid",
+    "prepare_current",
+    "prepare_reference",
+    "search_hypotheses",
+]

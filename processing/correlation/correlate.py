@@ -1,0 +1,215 @@
+"""Correlation of one pair of images: displacement, derivatives and their uncertainty at every point."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.correlation import kernels
+from processing.correlation.features import feature_starts
+from processing.correlation.prepared import Current, Reference
+from processing.correlation.propagation import Field, Progress, refine
+from processing.correlation.seeds import flow_starts, search_starts, spread
+from processing.correlation.settings import CorrelationSettings
+from processing.correlation.status import Status
+from processing.errors import InputError
+
+Array = NDArray[np.float64]
+StartValues = Callable[[Reference, Current, Array, int], Array]
+
+log = logging.getLogger(__name__)
+
+_METHODS: tuple[tuple[str, StartValues], ...] = (
+    ("optical flow", flow_starts),
+    ("template search", search_starts),
+    ("features", feature_starts),
+)
+_ENOUGH = 0.99  # share of the points that have a match before the next method is asked
+_SEED_ZNCC = 0.75
+_TRUSTED = 0.6  # share of a method's seeds that must hold
+# Columns of the 12 parameters of a kernel, in the order u v ux uy vx vy, then uxx uxy uyy vxx vxy vyy.
+_COLUMNS = [0, 6, 1, 2, 7, 8, 3, 4, 5, 9, 10, 11]
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Matches of n points; NaN where status is not 0.
+
+    xy : (n, 2) px on the reference. uv : (n, 2) px, current minus reference position.
+    gradient : (n, 2, 2), d u_i / d x_j. curvature : (n, 2, 3), second derivatives by xx, xy, yy, 1/px.
+    zncc, c_ls : (n,), c_ls = 2 (1 - zncc). iterations : (n,). status : (n,), see ``Status``.
+    sigma : (n, 2) px, standard uncertainty of uv, √2 σ √(H⁻¹) with the whole inverse.
+    seconds : by stage: prepare, start, refine.
+    """
+
+    xy: Array
+    uv: Array
+    gradient: Array
+    curvature: Array
+    zncc: Array
+    c_ls: Array
+    iterations: NDArray[np.int64]
+    status: NDArray[np.int64]
+    sigma: Array
+    seconds: dict[str, float]
+
+    @property
+    def good(self) -> NDArray[np.bool_]:
+        """Matched points. (n,) bool."""
+        return self.status == Status.GOOD
+
+
+def correlate(
+    reference: Reference,
+    current: Current,
+    xy: Array,
+    settings: CorrelationSettings,
+    *,
+    start: Array | None = None,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Correlation:
+    """Match points of the reference image in the current image.
+
+    xy : (n, 2) px, whole or fractional, inside the reference's mask. start : (n, 6) u v ux uy vx vy, or (n, 12) with
+    the second derivatives uxx uxy uyy vxx vxy vyy after them; NaN where unknown: the other points are reached by
+    propagation. Without start values they are found in the images. First order holds second derivatives as given.
+    threads : cores to use, all by default; the result does not depend on it. progress(done, total) is called after
+    every wave. Call it from one thread at a time: it is parallel inside.
+    """
+    xy = np.ascontiguousarray(xy, dtype=np.float64)
+    if current.degree != settings.degree:
+        raise InputError(f"the current image was prepared for degree {current.degree}, not {settings.interpolation}")
+    if xy.ndim != 2 or xy.shape[1] != 2 or not len(xy):
+        raise InputError("there is no point to correlate; check the mask and the step")
+    with _threads(threads):
+        load_kernels()
+        points = Field(reference, current, xy, settings, progress)
+        seconds = {"prepare": reference.seconds + current.seconds, "start": 0.0, "refine": 0.0}
+        if start is None:
+            _match_automatically(points, seconds)
+        else:
+            _match_from(points, _parameters(start, len(xy)), seconds)
+    return _result(points, seconds)
+
+
+def load_kernels() -> None:
+    """Compile or load the kernels, so that no timing contains it."""
+    tiny = np.zeros((8, 8))
+    image = Reference(tiny, np.zeros(2), tiny, tiny, tiny, np.zeros((14, 14)), np.ones((8, 8), bool), 255.0)
+    refine(image, Current(tiny, np.zeros(2), np.zeros((14, 14)), 5), np.full((1, 2), 4.0), np.zeros((1, 12)), _TINY)
+
+
+_TINY = CorrelationSettings(radius=2)
+
+
+def _match_automatically(points: Field, seconds: dict[str, float]) -> None:
+    """Seeds by one method after the other until nearly every point is matched, each carried on by propagation.
+
+    A method most of whose seeds hold suits the pair and is used at once. The few seeds that an unsuitable one gets
+    through may be false: they wait until the others have had their turn, and only serve points nobody reached.
+    """
+    doubtful = []
+    for name, method in _METHODS:
+        open_points = _open(points)
+        if len(open_points) <= (1.0 - _ENOUGH) * len(points.xy):
+            break
+        began = time.perf_counter()
+        seeds = open_points[spread(points.xy[open_points])]
+        trial = _try_seeds(points, seeds, method)
+        share = float(trial.good.mean())
+        log.debug("%s: %d of %d seeds hold", name, int(trial.good.sum()), len(seeds))
+        seconds["start"] += time.perf_counter() - began
+        if share < _TRUSTED:
+            doubtful.append((share, seeds, trial))
+            continue
+        points.adopt(seeds, trial)
+        _carry_on(points, seconds)
+    for _, seeds, trial in sorted(doubtful, key=lambda entry: -entry[0]):
+        if len(_open(points)) > (1.0 - _ENOUGH) * len(points.xy):
+            points.adopt(seeds, trial)
+            _carry_on(points, seconds)
+
+
+def _open(points: Field) -> NDArray[np.int64]:
+    return np.flatnonzero(~points.good & (points.status != Status.NO_TEXTURE))
+
+
+def _try_seeds(points: Field, seeds: NDArray[np.int64], method: StartValues) -> Field:
+    """The seeds (k,) refined from a method's start values, apart from the other points."""
+    trial = Field(points.reference, points.current, points.xy[seeds], points.settings)
+    start = method(points.reference, points.current, trial.xy, points.settings.radius)
+    found = np.flatnonzero(np.isfinite(start).all(axis=1))
+    trial.attempt(found, start[found], max(_SEED_ZNCC, points.settings.zncc_min))
+    return trial
+
+
+def _match_from(points: Field, start: Array, seconds: dict[str, float]) -> None:
+    began = time.perf_counter()
+    given = np.flatnonzero(np.isfinite(start).all(axis=1))
+    if not len(given):
+        raise InputError("no point has a start value; leave them out to have them found")
+    points.attempt(given, start[given])
+    seconds["refine"] += time.perf_counter() - began
+    _carry_on(points, seconds)
+
+
+def _carry_on(points: Field, seconds: dict[str, float]) -> None:
+    began = time.perf_counter()
+    points.propagate()
+    points.retry_from_fit()
+    points.reject_outliers()
+    points.retry_from_fit()
+    points.reject_outliers()
+    seconds["refine"] += time.perf_counter() - began
+
+
+def _parameters(start: Array, n: int) -> Array:
+    start = np.asarray(start, dtype=np.float64)
+    if start.shape not in ((n, 6), (n, 12)):
+        raise ValueError(f"start values must be ({n}, 6) or ({n}, 12), not {start.shape}")
+    out = np.zeros((n, kernels.N_PARAMETERS))
+    out[:, _COLUMNS[: start.shape[1]]] = start
+    return out
+
+
+def _result(points: Field, seconds: dict[str, float]) -> Correlation:
+    p = points.parameters.copy()
+    p[~points.good] = np.nan
+    return Correlation(
+        xy=points.xy,
+        uv=p[:, [0, 6]],
+        gradient=p[:, [1, 2, 7, 8]].reshape(-1, 2, 2),
+        curvature=p[:, [3, 4, 5, 9, 10, 11]].reshape(-1, 2, 3),
+        zncc=points.zncc,
+        c_ls=2.0 * (1.0 - points.zncc),
+        iterations=points.iterations,
+        status=points.status,
+        sigma=points.sigma,
+        seconds=seconds,
+    )
+
+
+def usable_threads(count: int | None) -> int:
+    """The number of threads a correlation runs on when ``count`` are asked for; all cores for None."""
+    cores = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    return min(count, cores) if count else cores
+
+
+@contextmanager
+def _threads(count: int | None) -> Iterator[None]:
+    before = numba.get_num_threads()
+    if count is not None and count < 1:
+        raise InputError(f"the number of threads must be at least 1, not {count}")
+    numba.set_num_threads(usable_threads(count))
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)

@@ -1,0 +1,103 @@
+"""Many affine warps tried at each point, for start values that a calibration and a proxy surface suggest."""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.correlation.prepared import Current, Reference
+
+Array = NDArray[np.float64]
+
+
+def search_hypotheses(
+    reference: Reference,
+    current: Current,
+    xy: Array,
+    warps: Array,
+    radius: int,
+    *,
+    stride: int = 2,
+    separation: float = 4.0,
+) -> tuple[Array, Array, Array]:
+    """The best of K affine warps at each of n points, by ZNCC over every second pixel of a circular subset.
+
+    xy : (n, 2) px on the reference; warps : (n, K, 6), u v ux uy vx vy at the point, NaN where not to be tried.
+    Returns best (n, 6), its zncc (n,), and second_peak (n,), the best ZNCC of a warp whose displacement differs by
+    more than ``separation`` px. NaN (zncc -1) where no warp stays inside the current image.
+    """
+    n, count = warps.shape[:2]
+    if warps.shape != (n, count, 6) or xy.shape != (n, 2):
+        raise ValueError(f"warps must be (n, K, 6) for xy (n, 2), not {warps.shape} for {xy.shape}")
+    score = np.empty((n, count))
+    _score(
+        reference.grey,
+        reference.mask,
+        np.ascontiguousarray(xy - reference.origin),
+        current.image,
+        np.ascontiguousarray(xy, dtype=np.float64),
+        np.ascontiguousarray(warps, dtype=np.float64),
+        radius,
+        stride,
+        score,
+    )
+    rows = np.arange(n)
+    at = np.argmax(score, axis=1)
+    zncc, best = score[rows, at], warps[rows, at].copy()
+    best[zncc <= -1.0] = np.nan
+    apart = np.hypot(*np.moveaxis(warps[:, :, :2] - best[:, None, :2], -1, 0)) > separation
+    return best, zncc, np.where(apart, score, -1.0).max(axis=1)
+
+
+@nb.njit(cache=True, nogil=True, parallel=True, fastmath={"contract", "reassoc", "arcp", "nsz"})
+def _score(grey, mask, at, image, xy, warps, radius, stride, score):  # type: ignore[no-untyped-def]
+    """ZNCC (n, K) of every warp; -1 where the subset leaves either image or the warp is NaN. Bilinear in the current.
+
+    at : (n, 2) the points in the crop ``grey``; xy : (n, 2) in the whole images.
+    """
+    height, width = image.shape
+    for k in nb.prange(at.shape[0]):
+        jx, iy = math.floor(at[k, 0] + 0.5), math.floor(at[k, 1] + 0.5)
+        off_x, off_y = jx - at[k, 0], iy - at[k, 1]
+        px = np.empty((3, (2 * (radius // stride) + 1) ** 2))
+        n = 0
+        for dy in range(-(radius // stride) * stride, radius + 1, stride):
+            for dx in range(-(radius // stride) * stride, radius + 1, stride):
+                i, j = iy + dy, jx + dx
+                if dx * dx + dy * dy > radius * radius or i < 0 or j < 0 or i >= grey.shape[0] or j >= grey.shape[1]:
+                    continue
+                if mask[i, j]:
+                    px[0, n], px[1, n], px[2, n] = dx + off_x, dy + off_y, grey[i, j]
+                    n += 1
+        mean = np.sum(px[2, :n]) / max(n, 1)
+        px[2, :n] -= mean
+        norm = math.sqrt(np.sum(px[2, :n] ** 2))
+        for h in range(warps.shape[1]):
+            u, v, ux, uy, vx, vy = warps[k, h]
+            score[k, h] = -1.0
+            if n < 8 or not norm > 0.0 or not math.isfinite(u + v + ux + uy + vx + vy):
+                continue
+            s_g = s_gg = s_fg = 0.0
+            inside = True
+            for m in range(n):
+                dx, dy = px[0, m], px[1, m]
+                x = xy[k, 0] + u + (1.0 + ux) * dx + uy * dy
+                y = xy[k, 1] + v + vx * dx + (1.0 + vy) * dy
+                if not (x >= 0.0 and y >= 0.0 and x < width - 1 and y < height - 1):
+                    inside = False
+                    break
+                left, top = np.uint64(x), np.uint64(y)
+                fx, fy = x - left, y - top
+                right, below = left + np.uint64(1), top + np.uint64(1)
+                g = (1.0 - fy) * ((1.0 - fx) * image[top, left] + fx * image[top, right]) + fy * (
+                    (1.0 - fx) * image[below, left] + fx * image[below, right]
+                )
+                s_g += g
+                s_gg += g * g
+                s_fg += g * px[2, m]
+            variance = s_gg - s_g * s_g / n
+            if inside and variance > 1e-9 * n:
+                score[k, h] = s_fg / (norm * math.sqrt(variance))

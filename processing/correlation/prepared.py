@@ -1,0 +1,135 @@
+"""Images made ready for correlation, once for all the pairs they take part in."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.correlation.settings import CorrelationSettings
+from processing.correlation.spline import coefficients, gradients
+from processing.errors import InputError
+
+Array = NDArray[np.float64]
+Box = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A reference image: grey levels, gradients and coefficients of the box around its region of interest.
+
+    origin : (x, y) px of the box in the image; grey, gx, gy, mask : (h, w); coef : padded coefficients.
+    image : the whole image as it came; shape : its (height, width); grey_range : 255 or 65535.
+    """
+
+    image: NDArray = field(repr=False)
+    origin: Array
+    grey: Array = field(repr=False)
+    gx: Array = field(repr=False)
+    gy: Array = field(repr=False)
+    coef: Array = field(repr=False)
+    mask: NDArray[np.bool_] = field(repr=False)
+    grey_range: float
+    seconds: float = 0.0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) of the whole image, px."""
+        return self.image.shape[0], self.image.shape[1]
+
+
+@dataclass(frozen=True)
+class Current:
+    """A current image: padded coefficients of a box of it, the box's origin (x, y), and the image as it came."""
+
+    image: NDArray = field(repr=False)
+    origin: Array
+    coef: Array = field(repr=False)
+    degree: int
+    seconds: float = 0.0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) of the whole image, px."""
+        return self.image.shape[0], self.image.shape[1]
+
+
+def prepare_reference(
+    image: NDArray, mask: NDArray[np.bool_] | None = None, settings: CorrelationSettings | None = None
+) -> Reference:
+    """Filter the reference image (h, w), 8 or 16 bits or float, inside the box of its mask (h, w) bool.
+
+    Without a mask all pixels take part. InputError for an empty mask or one of another size.
+    """
+    settings = settings or CorrelationSettings()
+    began = time.perf_counter()
+    _check_image(image, "reference")
+    mask = np.ones(image.shape, bool) if mask is None else np.asarray(mask, bool)
+    if mask.shape != image.shape:
+        raise InputError(
+            f"the mask is {mask.shape[1]} x {mask.shape[0]} px but the reference image is "
+            f"{image.shape[1]} x {image.shape[0]} px"
+        )
+    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
+    if not len(columns):
+        raise InputError("the mask marks no pixel; paint the region of interest white")
+    # The mirrored border is not the image: keep the reach of the filter around the mask.
+    margin = 2 + 32
+    box = _clip((columns[0] - margin, rows[0] - margin, columns[-1] + 1 + margin, rows[-1] + 1 + margin), image.shape)
+    grey = _crop(image, box)
+    gx, gy = gradients(grey, settings.degree)
+    return Reference(
+        image=image,
+        origin=np.array(box[:2], dtype=np.float64),
+        grey=grey,
+        gx=gx,
+        gy=gy,
+        coef=coefficients(grey, settings.degree),
+        mask=np.ascontiguousarray(mask[box[1] : box[3], box[0] : box[2]]),
+        grey_range=_grey_range(image),
+        seconds=time.perf_counter() - began,
+    )
+
+
+def prepare_current(image: NDArray, roi: Box | None = None, settings: CorrelationSettings | None = None) -> Current:
+    """Filter the current image (h, w), or a box (x0, y0, x1, y1; ends exclusive) of it where matches can lie.
+
+    A subset that leaves the box is lost as if it left the image.
+    """
+    settings = settings or CorrelationSettings()
+    began = time.perf_counter()
+    _check_image(image, "current")
+    box = _clip(roi or (0, 0, image.shape[1], image.shape[0]), image.shape)
+    if box[2] - box[0] < 8 or box[3] - box[1] < 8:
+        raise InputError(f"the box {roi} of the current image is empty or lies outside it")
+    coef = coefficients(_crop(image, box), settings.degree)
+    return Current(image, np.array(box[:2], dtype=np.float64), coef, settings.degree, time.perf_counter() - began)
+
+
+def as_8_bit(image: NDArray) -> NDArray[np.uint8]:
+    """The image stretched to 8 bits for the search of start values, between its 0.1 and 99.9 percentiles."""
+    if image.dtype == np.uint8:
+        return image
+    low, high = np.percentile(image[::4, ::4], [0.1, 99.9])
+    return np.clip((image - low) * (255.0 / max(high - low, 1e-9)), 0, 255).astype(np.uint8)
+
+
+def _grey_range(image: NDArray) -> float:
+    if image.dtype == np.uint16:
+        return max(float(image.max()), 255.0)  # 10 and 12 bits also come in 16
+    return 255.0
+
+
+def _clip(box: Box, shape: tuple[int, ...]) -> Box:
+    return max(int(box[0]), 0), max(int(box[1]), 0), min(int(box[2]), shape[1]), min(int(box[3]), shape[0])
+
+
+def _crop(image: NDArray, box: Box) -> Array:
+    return np.ascontiguousarray(image[box[1] : box[3], box[0] : box[2]], dtype=np.float64)
+
+
+def _check_image(image: NDArray, name: str) -> None:
+    if image.ndim != 2 or min(image.shape) < 8:
+        raise InputError(f"the {name} image must be grey and at least 8 px wide and high, not of shape {image.shape}")

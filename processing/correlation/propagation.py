@@ -1,0 +1,197 @@
+"""Reliability-guided propagation (Pan 2009) in waves: from the best matched points to their neighbours.
+
+Every wave refines, in parallel, all points that border on a reliable one, each from the best of its neighbours,
+displacement and derivatives carried across. Waves start at the most reliable level and sink to lower ones only when
+nothing else is left, so bad points are never a bridge while a better way exists. The result depends on nothing but
+the input: not on threads, not on timing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.correlation import kernels
+from processing.correlation.neighbours import COUNT, inconsistent, local_fit, neighbours, predicted
+from processing.correlation.prepared import Current, Reference
+from processing.correlation.settings import CorrelationSettings
+from processing.correlation.status import Status
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+_LEVELS = (0.9, 0.8, 0.6)  # reliability in steps, ZNCC; the last one is settings.zncc_min
+_RETRIES = 3
+_STRETCH = 4.0  # largest stretch and compression of a subset between two images
+
+
+@dataclass
+class Field:
+    """The state of all points while they are being matched; arrays over n points.
+
+    parameters (n, 12) as in ``kernels``; tried : (n, 8) bool, neighbours a start value was taken from.
+    """
+
+    reference: Reference
+    current: Current
+    xy: Array
+    settings: CorrelationSettings
+    progress: Progress | None = None
+    near: NDArray[np.int64] = field(init=False)
+    parameters: Array = field(init=False)
+    status: NDArray[np.int64] = field(init=False)
+    zncc: Array = field(init=False)
+    iterations: NDArray[np.int64] = field(init=False)
+    sigma: Array = field(init=False)
+    tried: NDArray[np.bool_] = field(init=False)
+
+    def __post_init__(self) -> None:
+        n = len(self.xy)
+        self.near = neighbours(self.xy, self.settings.step)
+        self.parameters = np.full((n, kernels.N_PARAMETERS), np.nan)
+        self.status = np.full(n, Status.NOT_REACHED, np.int64)
+        self.zncc = np.full(n, np.nan)
+        self.iterations = np.zeros(n, np.int64)
+        self.sigma = np.full((n, 2), np.nan)
+        self.tried = np.zeros((n, COUNT), bool)
+
+    @property
+    def good(self) -> NDArray[np.bool_]:
+        """Points matched so far. (n,) bool."""
+        return self.status == Status.GOOD
+
+    def attempt(self, index: NDArray[np.int64], start: Array, zncc_min: float | None = None) -> NDArray[np.bool_]:
+        """Refine points (k,) from start values (k, 12) and keep what is good; true where it was. (k,) bool.
+
+        A result must look alike (ZNCC) and lie within a step of its start value.
+        """
+        status, zncc, iterations, sigma, found = refine(
+            self.reference, self.current, self.xy[index], start, self.settings
+        )
+        limit = self.settings.zncc_min if zncc_min is None else zncc_min
+        jump = np.hypot(found[:, 0] - start[:, 0], found[:, 6] - start[:, 6])
+        settled = status == Status.GOOD
+        status = np.where(settled & ~(zncc >= limit), Status.LOW_ZNCC, status)
+        far = (status == Status.GOOD) & (jump > max(self.settings.step, 5))
+        status = np.where(far | ((status == Status.GOOD) & _degenerate(found)), Status.INCONSISTENT, status)
+        keep = status == Status.GOOD
+        self.status[index], self.iterations[index] = status, iterations
+        self.parameters[index] = np.where(keep[:, None], found, np.nan)
+        self.zncc[index] = np.where(keep, zncc, np.nan)
+        self.sigma[index] = np.where(keep[:, None], sigma, np.nan)
+        if self.progress is not None:
+            self.progress(int(self.good.sum()), len(self.xy))
+        return keep
+
+    def adopt(self, index: NDArray[np.int64], other: Field) -> None:
+        """Take over the good points of another field, whose points are ``index`` (k,) here, where still open."""
+        take = other.good & ~self.good[index]
+        to = index[take]
+        self.parameters[to], self.status[to], self.zncc[to] = (
+            other.parameters[take],
+            other.status[take],
+            other.zncc[take],
+        )
+        self.iterations[to], self.sigma[to] = other.iterations[take], other.sigma[take]
+
+    def propagate(self) -> None:
+        """Waves from the good points until no point has an untried good neighbour."""
+        levels = [level for level in _LEVELS if level > self.settings.zncc_min] + [-1.0]
+        while True:
+            for level in levels:
+                if self._wave(level):
+                    break
+            else:
+                return
+
+    def _wave(self, level: float) -> bool:
+        """One wave from neighbours at least this reliable; false if there was nothing to do."""
+        reliable = self.good & (np.nan_to_num(self.zncc, nan=-1.0) >= level)
+        open_points = ~self.good & (self.tried.sum(axis=1) < _RETRIES) & (self.status != Status.NO_TEXTURE)
+        offer = open_points[:, None] & (self.near >= 0) & reliable[self.near] & ~self.tried
+        index = np.flatnonzero(offer.any(axis=1))
+        if not len(index):
+            return False
+        worth = np.where(offer[index], self.zncc[self.near[index]], -np.inf)
+        slot = np.argmax(worth, axis=1)
+        self.tried[index, slot] = True
+        self.attempt(index, predicted(self.xy, self.parameters, self.near[index, slot], index))
+        return True
+
+    def retry_from_fit(self) -> None:
+        """Lost points once more, from an affine fit of the good points around them; then from their new neighbours."""
+        for _ in range(2):
+            index = np.flatnonzero(~self.good & (self.status != Status.NO_TEXTURE) & self._has_good_neighbour())
+            if not len(index):
+                return
+            start = local_fit(self.xy, self.parameters, self.good, index)
+            usable = np.isfinite(start).all(axis=1)
+            if not usable.any() or not self.attempt(index[usable], start[usable]).any():
+                return
+            self.propagate()
+
+    def reject_outliers(self) -> None:
+        """Points that contradict their neighbours become lost, until none does."""
+        for _ in range(5):
+            bad = inconsistent(self.xy, self.parameters, self.good, self.near)
+            if not bad.any():
+                return
+            self.status[bad] = Status.INCONSISTENT
+            self.parameters[bad], self.zncc[bad], self.sigma[bad] = np.nan, np.nan, np.nan
+
+    def _has_good_neighbour(self) -> NDArray[np.bool_]:
+        return np.asarray(((self.near >= 0) & self.good[self.near]).any(axis=1))
+
+
+def _degenerate(parameters: Array) -> NDArray[np.bool_]:
+    """Warps (n, 12) that fold, or stretch an axis beyond what a view of a surface does: never a true match. (n,)."""
+    a, b, c, d = 1.0 + parameters[:, 1], parameters[:, 2], parameters[:, 7], 1.0 + parameters[:, 8]
+    half, det = 0.5 * (a * a + b * b + c * c + d * d), a * d - b * c
+    largest = np.sqrt(half + np.sqrt(np.maximum(half * half - det * det, 0.0)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(~((det > 0) & (largest < _STRETCH) & (det / largest > 1.0 / _STRETCH)))
+
+
+def refine(
+    reference: Reference, current: Current, xy: Array, start: Array, settings: CorrelationSettings
+) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array, Array]:
+    """IC-GN of points xy (n, 2) from start values (n, 12), NaN rows left out.
+
+    Returns status (n,), ZNCC (n,), iterations (n,), sigma (n, 2) px and parameters (n, 12), all as the kernel left
+    them: nothing is judged here.
+    """
+    n = len(xy)
+    parameters = np.array(start, dtype=np.float64)
+    known = np.isfinite(parameters).all(axis=1)
+    status = np.full(n, Status.NOT_REACHED, np.int64)
+    zncc, sigma = np.full(n, np.nan), np.full((n, 2), np.nan)
+    iterations = np.zeros(n, np.int64)
+    kernels.refine(
+        reference.grey,
+        reference.gx,
+        reference.gy,
+        reference.coef,
+        reference.mask,
+        reference.origin,
+        current.coef,
+        current.origin,
+        np.ascontiguousarray(xy, dtype=np.float64),
+        parameters,
+        known,
+        settings.radius,
+        settings.subset == "circle",
+        3 if settings.order == 1 else 6,
+        settings.degree == 5,
+        settings.tolerance,
+        settings.max_iterations,
+        settings.texture_min * reference.grey_range / 255.0,
+        settings.noise or 0.0,
+        status,
+        zncc,
+        iterations,
+        sigma,
+    )
+    return status, zncc, iterations, sigma, parameters

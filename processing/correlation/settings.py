@@ -1,0 +1,61 @@
+"""What a correlation is told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from processing.errors import InputError
+
+SUBSETS = ("circle", "square")
+INTERPOLATIONS = {"cubic": 3, "quintic": 5}
+
+
+@dataclass(frozen=True)
+class CorrelationSettings:
+    """Settings of the correlation of one pair of images.
+
+    radius, step : px; subset radius (half the side of a square, less half a pixel) and spacing of the points.
+    order : 1 for affine shape functions, 2 for quadratic ones.
+    subset : "circle" or "square"; always cut by the mask.
+    interpolation : "quintic" or "cubic" B-spline of the current image.
+    tolerance : px; iteration stops when no pixel at the subset's rim moves by more, in the root mean square sense.
+    max_iterations : after so many the point is lost.
+    zncc_min : below this a point is lost.
+    texture_min : least root-mean-square gradient along the weakest direction, in 1/255 of the grey range a pixel.
+    noise : standard deviation of the grey levels; None takes it from the residual of each subset.
+    """
+
+    radius: int = 20
+    step: int = 10
+    order: int = 1
+    subset: str = "circle"
+    interpolation: str = "quintic"
+    tolerance: float = 1e-5
+    max_iterations: int = 50
+    zncc_min: float = 0.7
+    texture_min: float = 0.5
+    noise: float | None = None
+
+    def __post_init__(self) -> None:
+        _require(2 <= self.radius <= 500, f"the subset radius must be 2 to 500 px, not {self.radius}")
+        _require(self.step >= 1, f"the step must be at least 1 px, not {self.step}")
+        _require(self.order in (1, 2), f"the order of the subset must be 1 or 2, not {self.order}")
+        _require(self.subset in SUBSETS, f"the subset must be one of {', '.join(SUBSETS)}, not '{self.subset}'")
+        _require(
+            self.interpolation in INTERPOLATIONS,
+            f"the interpolation must be one of {', '.join(INTERPOLATIONS)}, not '{self.interpolation}'",
+        )
+        _require(self.tolerance > 0, f"the tolerance must be positive, not {self.tolerance}")
+        _require(self.max_iterations >= 1, f"max_iterations must be at least 1, not {self.max_iterations}")
+        _require(-1 <= self.zncc_min < 1, f"zncc_min must lie in [-1, 1), not {self.zncc_min}")
+        _require(self.noise is None or self.noise > 0, f"the noise must be positive, not {self.noise}")
+
+    @property
+    def degree(self) -> int:
+        """Degree of the B-spline."""
+        return INTERPOLATIONS[self.interpolation]
+
+
+def _require(condition: bool, sentence: str) -> None:
+    if not condition:
+        raise InputError(f"correlation: {sentence}")
