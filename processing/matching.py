@@ -29,6 +29,7 @@ from processing.correlation import (
 from processing.errors import ComputationError
 from processing.proxy import compose, stereo_hypotheses, sweep_radii
 from processing.region import coherent, lattice, paint, well_seen
+from processing.results import Matches
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8] | NDArray[np.uint16]
@@ -52,23 +53,10 @@ class Search:
 
 @dataclass(frozen=True)
 class PairMatches:
-    """The points of one camera pair in all images, F steps with the reference first.
+    """The matched points of one camera pair and the triangles between them, (m, 3), normals outwards."""
 
-    pair : ids, reference camera first. xy : (n, 2) px in the reference image. faces : (m, 3), outwards.
-    px : (F, 2, n, 2) positions in both cameras' images, NaN where lost.
-    c_ls : (F, n), the larger of the two images'. sigma : (F, 2, n, 2) px. status : (F, n).
-    seconds : (prepare, start, refine) spent. refined : matches made, for the rate.
-    """
-
-    pair: tuple[str, str]
-    xy: Array
+    matches: Matches
     faces: NDArray[np.int32]
-    px: Array
-    c_ls: Array
-    sigma: Array
-    status: NDArray[np.int8]
-    seconds: dict[str, float]
-    refined: int
 
 
 @dataclass(frozen=True)
@@ -83,7 +71,7 @@ class _Stereo:
 
 def match_pair(
     cameras: tuple[Camera, Camera],
-    image: Callable[[str, int], Image],
+    image: Callable[[str, int], Image | None],
     steps: int,
     mask: Mask | None,
     search: Search,
@@ -92,30 +80,35 @@ def match_pair(
 ) -> PairMatches:
     """Match all points of a pair in ``steps`` images (reference included) of both cameras.
 
-    image : gives the grey image of a camera id and a step. mask : a region drawn by the user, or None to find it.
+    image : gives the grey image of a camera id and a step; None where a later step has none: its points are lost.
+    mask : a region drawn by the user, or None to find it.
     Raises ComputationError where the cameras share no textured surface.
     """
     first, second = cameras
     stereo = _Stereo(cameras, search, settings, _radii(cameras, search))
-    reference_image = image(first.id, 0)
-    current = prepare_current(image(second.id, 0), settings)
+    reference_image, second_image = image(first.id, 0), image(second.id, 0)
+    if reference_image is None or second_image is None:
+        raise ComputationError(f"cameras {first.id} and {second.id}: the reference capture lacks an image")
+    current = prepare_current(second_image, settings=settings)
     region, seeds, warps = _find_region(stereo, reference_image, current, mask)
     xy, faces = grid(region, settings.step)
     reference = prepare_reference(reference_image, region, settings)
-    start = _start_at(xy, seeds, warps)
     images = 2 * steps - 1
-    matches: dict[tuple[int, int], Correlation] = {}
-    matches[0, 1] = correlate(reference, current, xy, settings, start=start)
+    found = {(0, 1): correlate(reference, current, xy, settings, start=_start_at(xy, seeds, warps))}
     progress(1 / images)
     for step in range(1, steps):
-        in_time = correlate(reference, prepare_current(image(first.id, step), settings), xy, settings)
-        matches[step, 0] = in_time
+        in_time = None
+        if (seen := image(first.id, step)) is not None:
+            in_time = correlate(reference, prepare_current(seen, settings=settings), xy, settings)
+            found[step, 0] = in_time
         progress((2 * step) / images)
-        current = prepare_current(image(second.id, step), settings)
-        start = _start_after_motion(stereo, reference, current, xy, in_time)
-        matches[step, 1] = correlate(reference, current, xy, settings, start=start)
+        if in_time is not None and (seen := image(second.id, step)) is not None:
+            current = prepare_current(seen, settings=settings)
+            start = _start_after_motion(stereo, reference, current, xy, in_time)
+            if np.isfinite(start).any():
+                found[step, 1] = correlate(reference, current, xy, settings, start=start)
         progress((2 * step + 1) / images)
-    return _collect((first.id, second.id), xy, faces, matches, steps)
+    return PairMatches(_collect((first.id, second.id), xy, found, steps), faces)
 
 
 def _radii(cameras: tuple[Camera, Camera], search: Search) -> Array:
@@ -199,27 +192,24 @@ def _start_after_motion(
     return start
 
 
-def _collect(
-    pair: tuple[str, str],
-    xy: Array,
-    faces: NDArray[np.int32],
-    matches: dict[tuple[int, int], Correlation],
-    steps: int,
-) -> PairMatches:
+def _collect(pair: tuple[str, str], xy: Array, found: dict[tuple[int, int], Correlation], steps: int) -> Matches:
     n = len(xy)
     px = np.full((steps, 2, n, 2), np.nan)
-    sigma = np.zeros((steps, 2, n, 2))
-    c_ls = np.zeros((steps, n))
+    sigma = np.full((steps, 2, n, 2), np.nan)
+    c_ls = np.full((steps, n), np.nan)
     status = np.zeros((steps, n), np.int8)
-    px[0, 0] = xy
-    for (step, camera), match in matches.items():
-        good = match.status == Status.GOOD
-        px[step, camera, good] = xy[good] + match.uv[good]
-        sigma[step, camera] = match.sigma
-        c_ls[step] = np.fmax(c_ls[step], match.c_ls)
-        status[step] = np.where(status[step] == Status.GOOD, match.status, status[step])
+    px[0, 0], sigma[0, 0] = xy, 0.0  # the grid itself is exact
+    for step in range(steps):
+        for camera in (1,) if step == 0 else (0, 1):
+            match = found.get((step, camera))
+            if match is None:
+                status[step] = np.where(status[step] == Status.GOOD, Status.NOT_REACHED, status[step])
+                continue
+            px[step, camera] = xy + match.uv
+            sigma[step, camera] = match.sigma
+            c_ls[step] = np.fmax(c_ls[step], match.c_ls)
+            status[step] = np.where(status[step] == Status.GOOD, match.status, status[step])
     seconds = {
-        name: float(sum(match.seconds.get(name, 0.0) for match in matches.values()))
-        for name in ("prepare", "start", "refine")
+        name: float(sum(match.seconds[name] for match in found.values())) for name in ("prepare", "start", "refine")
     }
-    return PairMatches(pair, xy, faces, px, c_ls, sigma, status, seconds, n * len(matches))
+    return Matches(pair, xy, px, c_ls, sigma, status, np.full(n, -1), seconds)

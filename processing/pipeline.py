@@ -1,0 +1,219 @@
+"""The straight line from a session folder to results: calibrate, correlate, triangulate, deform, keep.
+
+This is the only place where the stages meet.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing import summary
+from processing.calibration.quality import ReconstructionError
+from processing.camera import Camera
+from processing.correlation import CorrelationSettings
+from processing.correlation.correlate import load_kernels
+from processing.errors import ComputationError, InputError
+from processing.images import read_gray, read_mask
+from processing.matching import PairMatches, Search, match_pair
+from processing.progress import Report, Stages, silent
+from processing.results import Results, write_results
+from processing.ring import Ring, calibrate_ring, control_points
+from processing.session import Capture, Session, new_run, read_session
+from processing.settings import Settings
+from processing.surface import PairSurface, pair_surface
+
+log = logging.getLogger(__name__)
+
+_WEIGHTS = {"prepare": 0.03, "calibrate": 0.25, "correlate": 0.62, "triangulate": 0.04, "deform": 0.06}
+_IMAGES_KEPT = 4  # decoded images held at a time: a pair uses its own two reference images again
+
+
+def process_session(path: Path, settings: Settings, report: Report = silent) -> Path:
+    """Process a session and return the folder of the new run; earlier runs stay as they are.
+
+    path : the session folder. report : is told the stage, the share done, the rate and the time left.
+    Raises InputError or ComputationError with a sentence for the operator.
+    """
+    began = time.monotonic()
+    stages = Stages(_WEIGHTS, report)
+    session = read_session(path)
+    steps = _specimen_steps(session)
+    stages.at("prepare", 0.0, "loading the correlation kernels (compiled at the first use)")
+    load_kernels()
+    stages.at("calibrate", 0.0)
+    ring = calibrate_ring(session, settings.calibration, lambda done, who: stages.at("calibrate", done, who))
+    pairs, warnings = _usable_pairs(session, ring, steps)
+    errors = {pair: control_points(*(ring.cameras[id_] for id_ in pair)) for pair in pairs}
+    surfaces, more_warnings = _surfaces(session, ring, pairs, steps, settings, stages)
+    results = _join(session, ring, surfaces, steps, settings)
+    found = summary.summarise(results, ring, errors, surfaces, (*ring.warnings, *warnings, *more_warnings))
+    return _keep(session, results, found, ring, errors, settings, stages, began)
+
+
+def _specimen_steps(session: Session) -> tuple[Capture, ...]:
+    steps = session.of_kind("specimen")
+    if not steps:
+        raise InputError(f"{session.path}: no capture of the specimen; capture or import the reference and the steps")
+    return steps
+
+
+def _usable_pairs(
+    session: Session, ring: Ring, steps: tuple[Capture, ...]
+) -> tuple[tuple[tuple[str, str], ...], tuple[str, ...]]:
+    """Pairs of calibrated cameras with a reference image, and a sentence for each pair left out."""
+    usable, warnings = [], []
+    for pair in session.rig.pairs:
+        missing = [id_ for id_ in pair if id_ not in ring.cameras]
+        blind = [id_ for id_ in pair if id_ not in steps[0].images]
+        if missing:
+            warnings.append(f"pair {pair[0]}-{pair[1]} is left out: camera {' and '.join(missing)} is not calibrated")
+        elif blind:
+            warnings.append(
+                f"pair {pair[0]}-{pair[1]} is left out: camera {' and '.join(blind)} has no image in {steps[0].id}"
+            )
+        else:
+            usable.append(pair)
+    if not usable:
+        raise InputError(f"{session.path}: no camera pair can be used. {'; '.join(warnings)}")
+    return tuple(usable), tuple(warnings)
+
+
+def _surfaces(
+    session: Session,
+    ring: Ring,
+    pairs: tuple[tuple[str, str], ...],
+    steps: tuple[Capture, ...],
+    settings: Settings,
+    stages: Stages,
+) -> tuple[list[PairSurface], list[str]]:
+    """Every pair matched and triangulated, one after the other: the correlation itself uses all cores."""
+    search = Search(
+        radius=settings.surface.radius_mm or session.rig.target.radius_mm,
+        reach=settings.surface.reach_mm,
+        incidence=settings.surface.incidence_deg,
+    )
+    correlation = CorrelationSettings(**settings.correlation.keywords)
+    image = _image_source(session, ring, steps)
+    surfaces: list[PairSurface] = []
+    warnings: list[str] = []
+    refined, seconds = 0, 0.0
+    for k, pair in enumerate(pairs):
+        cameras = (ring.cameras[pair[0]].camera, ring.cameras[pair[1]].camera)
+
+        rate = f"{refined / seconds:,.0f} points/s" if seconds else ""
+
+        def progress(share: float, k: int = k, pair: tuple[str, str] = pair, rate: str = rate) -> None:
+            stages.at("correlate", (k + share) / len(pairs), f"pair {pair[0]}-{pair[1]}", rate)
+
+        progress(0.0)
+        try:
+            found = match_pair(cameras, image, len(steps), _mask(session, cameras[0]), search, correlation, progress)
+            surfaces.append(pair_surface(cameras, found, correlation.step))
+        except ComputationError as error:
+            log.warning("%s", error)
+            warnings.append(str(error))
+            continue
+        refined += _matches_made(found)
+        seconds += found.matches.seconds["refine"]
+    if not surfaces:
+        raise ComputationError(f"{session.path}: no camera pair gave a surface. {'; '.join(warnings)}")
+    stages.at("triangulate", 1.0)
+    return surfaces, warnings
+
+
+def _matches_made(found: PairMatches) -> int:
+    steps, n = found.matches.status.shape
+    return n * (2 * steps - 1)
+
+
+def _image_source(session: Session, ring: Ring, steps: tuple[Capture, ...]) -> Callable[[str, int], NDArray | None]:
+    @lru_cache(maxsize=_IMAGES_KEPT)
+    def image(camera_id: str, step: int) -> NDArray | None:
+        path = steps[step].images.get(camera_id)
+        if path is None:
+            return None
+        grey = read_gray(path)
+        width, height = ring.cameras[camera_id].camera.size
+        if grey.shape != (height, width):
+            raise InputError(
+                f"{path}: {grey.shape[1]} x {grey.shape[0]} px, but camera {camera_id} was calibrated at "
+                f"{width} x {height} px; capture board, target and specimen at one size"
+            )
+        return grey
+
+    return image
+
+
+def _mask(session: Session, camera: Camera) -> NDArray[np.bool_] | None:
+    path = session.mask(camera.id)
+    return None if path is None else read_mask(path, (camera.size[1], camera.size[0]))
+
+
+def _join(
+    session: Session, ring: Ring, surfaces: list[PairSurface], steps: tuple[Capture, ...], settings: Settings
+) -> Results:
+    """The surfaces of the pairs in one set of arrays."""
+    counts = [surface.vertices.shape[1] for surface in surfaces]
+    offsets = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int)
+    vertices = np.concatenate([surface.vertices for surface in surfaces], axis=1)
+    return Results(
+        rig=session.rig.name,
+        steps=tuple(step.id for step in steps),
+        cameras=tuple(calibration.camera for calibration in ring.cameras.values()),
+        pairs=tuple(surface.matches.pair for surface in surfaces),
+        vertices_ref=vertices[0],
+        vertices=vertices,
+        faces=np.concatenate([s.faces + offset for s, offset in zip(surfaces, offsets, strict=True)]),
+        pair=np.repeat(np.arange(len(surfaces)), [len(surface.faces) for surface in surfaces]),
+        vertex_pair=np.repeat(np.arange(len(surfaces)), counts),
+        correlation=np.concatenate([surface.correlation for surface in surfaces], axis=1),
+        sigma_xyz=np.concatenate([surface.sigma for surface in surfaces], axis=1),
+        status=np.concatenate([surface.status for surface in surfaces], axis=1),
+        matches=tuple(_with_offset(surface, int(offset)) for surface, offset in zip(surfaces, offsets, strict=True)),
+        settings=settings.to_toml(),
+    )
+
+
+def _with_offset(surface: PairSurface, offset: int) -> Any:
+    vertex = surface.matches.vertex
+    return replace(surface.matches, vertex=np.where(vertex >= 0, vertex + offset, -1))
+
+
+def _keep(
+    session: Session,
+    results: Results,
+    found: dict[str, Any],
+    ring: Ring,
+    errors: dict[tuple[str, str], ReconstructionError],
+    settings: Settings,
+    stages: Stages,
+    began: float,
+) -> Path:
+    """Write the run aside and give it its number."""
+    calibration = {
+        "cameras": [camera.to_dict() for camera in ring.cameras.values()],
+        "pairs": [
+            {"pair": list(pair), "mean_mm": error.mean, "rms_mm": error.rms, "points": error.points}
+            for pair, error in errors.items()
+        ],
+    }
+    stages.at("deform", 0.0)
+    with new_run(session.path) as run:
+        found["seconds"] = round(time.monotonic() - began, 2)
+        results = replace(results, calibration=calibration, summary=found)
+        write_results(run.folder / "results.h5", results, lambda done: stages.at("deform", done))
+        (run.folder / "settings.toml").write_text(settings.to_toml(), encoding="utf-8")
+        (run.folder / "calibration.json").write_text(json.dumps(calibration), encoding="utf-8")
+        (run.folder / "summary.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
+    assert run.final is not None
+    return run.final

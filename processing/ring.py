@@ -1,0 +1,117 @@
+"""All cameras of a session calibrated, and how well they agree on the control points.
+
+A calibration depends on the images of board and target, the rig and the settings alone. It is kept in the session
+under a key made of these, so that a later run, or a run after one more capture, need not repeat it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from processing.calibration.camera_calibration import CameraCalibration, calibrate_camera
+from processing.calibration.intrinsics import read_intrinsics
+from processing.calibration.quality import ReconstructionError, reconstruction_error
+from processing.errors import ComputationError, InputError
+from processing.images import read_gray
+from processing.session import Session
+from processing.settings import CalibrationGroup
+from processing.triangulation import triangulate
+
+log = logging.getLogger(__name__)
+
+_VERSION = 1  # of what a kept calibration means; raise it when the method changes
+
+
+@dataclass(frozen=True)
+class Ring:
+    """Calibrated cameras by id, and one sentence for each camera that could not take part."""
+
+    cameras: dict[str, CameraCalibration]
+    warnings: tuple[str, ...]
+
+
+def calibrate_ring(
+    session: Session, settings: CalibrationGroup, progress: Callable[[float, str], None] = lambda *_: None
+) -> Ring:
+    """Calibrate every camera that has an image of the target.
+
+    Raises InputError or ComputationError, naming the camera, for images that do not determine it.
+    """
+    targets = session.of_kind("target")
+    if not targets:
+        raise InputError(f"{session.path}: no capture of the calibration target; capture or import one")
+    target = targets[-1]
+    taking_part = [camera.id for camera in session.rig.cameras if camera.id in target.images]
+    warnings = tuple(
+        f"camera {camera.id} has no image of the target in {target.id} and takes no part"
+        for camera in session.rig.cameras
+        if camera.id not in target.images
+    )
+    done = 0
+    calibrated: dict[str, CameraCalibration] = {}
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        futures = {id_: pool.submit(_calibrated, session, id_, target.images[id_], settings) for id_ in taking_part}
+        for id_, future in futures.items():
+            calibrated[id_] = future.result()
+            done += 1
+            progress(done / len(taking_part), f"camera {id_}")
+    return Ring(calibrated, warnings)
+
+
+def control_points(first: CameraCalibration, second: CameraCalibration) -> ReconstructionError:
+    """Reconstruction error of the dots that two cameras both see (Solav et al. 2018, eq. 10-11)."""
+    seen = [
+        {(int(row), int(column)): i for i, (row, column) in enumerate(zip(dots.rows, dots.columns, strict=True))}
+        for dots in (first.dots, second.dots)
+    ]
+    common = sorted(seen[0].keys() & seen[1].keys())
+    if not common:
+        raise ComputationError(
+            f"cameras {first.camera.id} and {second.camera.id} have no dot of the target in common; "
+            "check their azimuths in rig.toml"
+        )
+    chosen = [[places[dot] for dot in common] for places in seen]
+    px = np.stack([first.dots.px[chosen[0]], second.dots.px[chosen[1]]])
+    return reconstruction_error(first.dots.xyz[chosen[0]], triangulate([first.camera, second.camera], px))
+
+
+def _calibrated(session: Session, camera_id: str, target: Path, settings: CalibrationGroup) -> CameraCalibration:
+    """One camera's calibration, from the session's folder if it is there, else made and kept."""
+    boards = [capture.images[camera_id] for capture in session.of_kind("board") if camera_id in capture.images]
+    lens_file = session.rig.camera(camera_id).intrinsics
+    key = _key(session, camera_id, [target, *boards], settings)
+    kept = session.path / "calibration" / f"{camera_id}-{key}.json"
+    if kept.is_file():
+        return CameraCalibration.from_dict(json.loads(kept.read_text(encoding="utf-8")))
+    calibration = calibrate_camera(
+        session.rig,
+        camera_id,
+        [read_gray(path) for path in boards] if settings.distortion and lens_file is None else [],
+        read_gray(target),
+        distortion=settings.distortion,
+        intrinsics=None if lens_file is None else read_intrinsics(session.path / lens_file),
+        drop_percentile=settings.drop_percentile,
+    )
+    kept.parent.mkdir(exist_ok=True)
+    aside = kept.with_suffix(".partial")
+    aside.write_text(json.dumps(calibration.to_dict()), encoding="utf-8")
+    aside.replace(kept)
+    return calibration
+
+
+def _key(session: Session, camera_id: str, images: list[Path], settings: CalibrationGroup) -> str:
+    digest = hashlib.sha256()
+    digest.update(f"{_VERSION} {camera_id} {session.rig.target} {session.rig.board} {settings}".encode())
+    digest.update(repr(session.rig.camera(camera_id)).encode())
+    for image in images:
+        digest.update(hashlib.sha256(image.read_bytes()).digest())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,111 @@
+"""The figures of a run that an operator reads first."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.calibration.quality import ReconstructionError, camera_quality
+from processing.mesh import Mesh
+from processing.results import Results
+from processing.ring import Ring
+from processing.surface import PairSurface
+
+Array = NDArray[np.float64]
+
+
+def summarise(
+    results: Results,
+    ring: Ring,
+    errors: dict[tuple[str, str], ReconstructionError],
+    surfaces: list[PairSurface],
+    warnings: tuple[str, ...],
+) -> dict[str, Any]:
+    """Counts, calibration quality and one row of figures a step, as JSON values; ``table`` is for the terminal."""
+    steps = [_step(results, k) for k in range(len(results.steps))]
+    control = {
+        "mean_mm": _mean([error.mean for error in errors.values()]),
+        "rms_mm": _mean([error.rms for error in errors.values()]),
+    }
+    figures = {
+        "points": len(results.vertices_ref),
+        "faces": len(results.faces),
+        "pairs": len(results.pairs),
+        "area_mm2": round(float(Mesh(results.vertices_ref, results.faces).areas.sum()), 1),
+        "control_points": control,
+        "cameras": [asdict(camera_quality(calibration)) for calibration in ring.cameras.values()],
+        "drift_px": {f"{s.matches.pair[0]}-{s.matches.pair[1]}": _finite(s.drift) for s in surfaces},
+        "steps": steps,
+        "warnings": list(warnings),
+    }
+    return {**figures, "table": _table(figures)}
+
+
+def _step(results: Results, step: int) -> dict[str, Any]:
+    measured = np.isfinite(results.vertices[step]).all(axis=1)
+    motion = results.motion(step)
+    current = results.vertices[step]
+    deformed = results.deformation(step)
+    residual = np.linalg.norm(motion.apply(current) - results.vertices_ref, axis=1)
+    return {
+        "step": results.steps[step],
+        "measured": int(measured.sum()),
+        "lost": int((~measured).sum()),
+        "c_ls_median": _median(results.correlation[step]),
+        "displacement_mm": _median(np.linalg.norm(current - results.vertices_ref, axis=1)),
+        "rigid_translation_mm": float(np.linalg.norm(np.nanmean(results.vertices_ref - current, axis=0)))
+        if measured.any()
+        else None,
+        "rigid_rotation_deg": float(np.degrees(motion.angle)),
+        "rigid_residual_rms_mm": _rms(residual),
+        "E_magnitude_median": _median(deformed.E_magnitude),
+        "lambda1_median": _median(deformed.lambda1),
+        "lambda2_median": _median(deformed.lambda2),
+    }
+
+
+def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
+    control = figures["control_points"]
+    rows = [
+        {
+            "figure": "camera pairs, points, triangles",
+            "value": f"{figures['pairs']}, {figures['points']:,}, {figures['faces']:,}",
+        },
+        {"figure": "measured area", "value": f"{figures['area_mm2'] / 100:,.1f} cm²"},
+        {
+            "figure": "control points: mean vector, RMS",
+            "value": f"{control['mean_mm']:.4f}, {control['rms_mm']:.4f} mm",
+        },
+    ]
+    for step in figures["steps"][1:]:
+        if step["measured"]:
+            rows.append(
+                {
+                    "figure": f"{step['step']}: displacement, λ1, λ2 (medians), lost",
+                    "value": f"{step['displacement_mm']:.3f} mm, {step['lambda1_median']:.4f}, "
+                    f"{step['lambda2_median']:.4f}, {step['lost']:,}",
+                }
+            )
+    rows += [{"figure": "warning", "value": sentence} for sentence in figures["warnings"]]
+    return rows
+
+
+def _median(values: Array) -> float | None:
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else None
+
+
+def _rms(values: Array) -> float | None:
+    finite = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(finite**2))) if len(finite) else None
+
+
+def _mean(values: list[float]) -> float:
+    return float(np.mean(values))
+
+
+def _finite(values: Array) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in values]
