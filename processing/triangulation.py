@@ -39,21 +39,29 @@ def triangulate(cameras: Sequence[Camera], px: Array) -> Array:
 
 def triangulate_undistorted(P: Array, px: Array) -> Array:
     """The same from projection matrices (C, 3, 4) and undistorted pixels (C, n, 2). (n, 3) mm, NaN as above."""
-    normal, right, seen = normal_equations(P, px)
-    solvable = (seen.sum(axis=0) >= 2) & (np.linalg.cond(normal) < 1e12)
+    A, b, seen = equations(P, px)
+    normal, right = np.einsum("cnri,cnrj->nij", A, A), np.einsum("cnri,cnr->ni", A, b)
+    solvable = determined(normal, seen)
     xyz = np.full((px.shape[1], 3), np.nan)
     xyz[solvable] = np.linalg.solve(normal[solvable], right[solvable][..., None])[..., 0]
     return xyz
 
 
-def normal_equations(P: Array, px: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """``A^T A`` (n, 3, 3), ``A^T b`` (n, 3) and which camera takes part (C, n) of eq. 7-9, summed over cameras."""
+def equations(P: Array, px: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """The equations ``A X = b`` of eq. 7-9, from matrices (C, 3, 4) and undistorted pixels (C, n, 2).
+
+    Returns A (C, n, 2, 3), b (C, n, 2), both zero for a camera that takes no part, and which take part, (C, n).
+    """
     P, px = np.asarray(P, dtype=float), np.asarray(px, dtype=float)
     seen: NDArray[np.bool_] = np.all(np.isfinite(px), axis=-1)
     rows = P[:, None, :2, :] - px[..., None] * P[:, None, 2:, :]  # (C, n, 2, 4)
     rows = np.where(seen[..., None, None], rows, 0.0)
-    A, b = rows[..., :3], -rows[..., 3]
-    return np.einsum("cnri,cnrj->nij", A, A), np.einsum("cnri,cnr->ni", A, b), seen
+    return rows[..., :3], -rows[..., 3], seen
+
+
+def determined(normal: Array, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which points (n,) have two cameras whose lines of sight cross. normal : ``AᵀA`` (n, 3, 3); seen : (C, n)."""
+    return np.asarray((seen.sum(axis=0) >= 2) & (np.linalg.cond(normal) < 1e12))
 
 
 def reprojection_residuals(cameras: Sequence[Camera], xyz: Array, px: Array) -> Array:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.camera import Camera
+from processing.triangulation import determined, equations
 
 Array = NDArray[np.float64]
 
@@ -31,16 +32,21 @@ def position_sigma(cameras: Sequence[Camera], px: Array, sigma: Array) -> Array:
     px = np.where(np.isfinite(sigma), np.asarray(px, dtype=float), np.nan)
     P = np.stack([camera.P for camera in cameras])
     undistorted = np.stack([camera.undistort(image) for camera, image in zip(cameras, px, strict=True)])
-    seen: NDArray[np.bool_] = np.all(np.isfinite(undistorted), axis=-1)
-    rows = np.where(seen[..., None, None], P[:, None, :2, :] - undistorted[..., None] * P[:, None, 2:, :], 0.0)
-    A, b = rows[..., :3], -rows[..., 3]
+    A, b, seen = equations(P, undistorted)
     normal = np.einsum("cnri,cnrj->nij", A, A)
-    solvable = (seen.sum(axis=0) >= 2) & (np.linalg.cond(normal) < 1e12)
+    solvable = determined(normal, seen)
     inverse = np.full_like(normal, np.nan)
     inverse[solvable] = np.linalg.inv(normal[solvable])
     xyz = np.einsum("nij,cnrj,cnr->ni", inverse, A, b)
     depth = np.einsum("ci,ni->cn", P[:, 2, :3], xyz) + P[:, None, 2, 3]
-    # Change of the point by each undistorted pixel coordinate: (C, n, 3, 2).
-    slope = np.einsum("nij,cnrj,cn->cnir", inverse, A, depth)
+    # Change of the point by each pixel coordinate of each image: (C, n, 3, 2).
+    lens = np.stack([_lens_slope(camera, image) for camera, image in zip(cameras, px, strict=True)])
+    slope = np.einsum("nij,cnrj,cn,cnrs->cnis", inverse, A, depth, np.nan_to_num(lens))
     variance = np.nan_to_num(np.asarray(sigma, dtype=float)) ** 2 * seen[..., None]
-    return np.sqrt(np.einsum("cnir,cnr->ni", slope**2, variance))
+    return np.sqrt(np.einsum("cnis,cns->ni", slope**2, variance))
+
+
+def _lens_slope(camera: Camera, px: Array, h: float = 0.5) -> Array:
+    """d(undistorted pixel)/d(image pixel), (n, 2, 2), by central differences over one pixel."""
+    columns = [(camera.undistort(px + d) - camera.undistort(px - d)) / (2 * h) for d in np.eye(2) * h]
+    return np.stack(columns, axis=-1)
