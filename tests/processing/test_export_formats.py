@@ -2,6 +2,7 @@
 
 import base64
 import csv
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -13,7 +14,7 @@ from scipy.io import loadmat
 
 from processing.errors import InputError
 from processing.export import FORMATS, export
-from processing.results import Results, read_field, write_results
+from processing.results import Results, read_field, read_summary, write_results
 
 LOST = 4
 STEPS = ("0003-specimen", "0004-specimen")
@@ -179,3 +180,20 @@ def test_bad_requests_are_refused_and_leave_nothing(session: Path, tmp_path: Pat
     with pytest.raises(InputError, match="writes a folder"):
         export(session, "ply", tmp_path / "file")
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_step_in_which_everything_was_lost_is_lost_and_no_error(tmp_path: Path) -> None:
+    sheet = bent_sheet()
+    vertices = sheet.vertices.copy()
+    vertices[1] = np.nan
+    run = tmp_path / "results" / "0001"
+    run.mkdir(parents=True)
+    write_results(run / "results.h5", replace(sheet, vertices=vertices))
+    for name in FORMATS:
+        assert export(tmp_path, name).exists()
+    with np.load(run / "results.npz") as arrays:
+        assert np.isnan(arrays["J"][1]).all()
+        np.testing.assert_allclose(arrays["J"][0], 1.0)
+    row = next(row for row in read_summary(run / "results.h5")["fields"] if row["name"] == "lambda2")
+    assert row["range"] is None
+    assert row["steps"][1] is None
