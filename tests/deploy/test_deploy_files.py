@@ -79,8 +79,6 @@ def test_first_boot_writes_a_configuration_that_the_node_accepts(tmp_path: Path)
     assert "\t" not in text  # YAML forbids tabs
     head = r"- path: /etc/ringdic/node\.toml\n(?: {4}permissions.*\n)? {4}content: \|\n"
     block = re.search(head + r"((?: {6}.*\n)+)", text)
-        r"- path: /etc/ringdic/node\.toml\n(?: {4}permissions.*\n)? {4}content: \|\n((?: {6}.*\n)+)", text
-    )
     assert block is not None
     path = tmp_path / "node.toml"
     path.write_text(re.sub(r"^ {6}", "", block[1], flags=re.MULTILINE), encoding="utf-8")
