@@ -1,0 +1,134 @@
+"""The messages between node and controller: round trips, and refusals that name the field."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from node_agent.wire import (
+    Ack,
+    Arm,
+    ArmReply,
+    CaptureKey,
+    Failure,
+    Fetch,
+    Inventory,
+    Keys,
+    Manifest,
+    Status,
+    Trigger,
+    TriggerReply,
+    WireError,
+    decode,
+    decode_as,
+    encode,
+)
+
+names = st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,20}\Z")
+hashes = st.from_regex(r"\A[0-9a-f]{64}\Z")
+texts = st.text(min_size=1, max_size=20)
+counts = st.integers(0, 2**62)
+tables = st.dictionaries(st.text(max_size=5), st.one_of(st.integers(), st.text(max_size=5), st.none()), max_size=3)
+keys = st.builds(CaptureKey, names, names, counts)
+kinds = st.sampled_from(["board", "target", "specimen", "static"])
+manifests = st.builds(
+    Manifest,
+    node=names,
+    key=keys,
+    kind=kinds,
+    sha256=hashes,
+    bytes=st.integers(1, 2**40),
+    width=st.integers(1, 9999),
+    height=st.integers(1, 9999),
+    time_ns=counts,
+    exposure_us=st.none() | st.floats(1, 1e6),
+    metadata=tables,
+)
+failures = st.builds(Failure, names, keys, texts)
+messages = st.one_of(
+    st.builds(Arm, names, kinds, tables, hashes, st.lists(names, max_size=3).map(tuple)),
+    st.builds(ArmReply, names, st.booleans(), hashes, texts, tables, clock_offset_ms=st.none() | st.floats(-9, 9)),
+    st.builds(Trigger, keys, kinds, counts),
+    st.builds(TriggerReply, names, keys, st.sampled_from(["accepted", "late", "not armed"]), texts),
+    manifests,
+    failures,
+    st.builds(
+        Inventory,
+        names,
+        st.lists(manifests, max_size=2).map(tuple),
+        st.lists(failures, max_size=2).map(tuple),
+        st.none() | keys,
+    ),
+    st.builds(Fetch, keys),
+    st.builds(Ack, names, keys, hashes, st.sampled_from(["archived", "unknown"])),
+    st.builds(Status, names, st.sampled_from(["idle", "armed"]), st.booleans(), counts, counts, counts),
+)
+
+KEY = CaptureKey("s", "0001-board", 17)
+
+
+@given(messages)
+def test_what_is_encoded_is_decoded(message):
+    assert decode(encode(message)) == message
+
+
+def test_a_key_becomes_a_file_name_and_keeps_apart_sessions_of_one_name():
+    again = CaptureKey("s", "0001-board", 18)
+    assert KEY.stem == "s~0001-board~17"
+    assert KEY.stem != again.stem
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "a~b", "*", "..", ".hidden", "a b", "x" * 65, 7, None])
+def test_a_name_that_could_leave_its_folder_or_key_is_refused(name):
+    with pytest.raises(WireError):
+        CaptureKey(name, "0001-board", 0)
+    with pytest.raises(WireError):
+        Keys(name)
+
+
+def damaged(change) -> bytes:
+    document = json.loads(encode(Trigger(KEY, "board")))
+    change(document)
+    return json.dumps(document).encode()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda d: d.update(schema=2), "schema 2"),
+        (lambda d: d.pop("schema"), "schema None"),
+        (lambda d: d.update(type="fire"), "'fire'"),
+        (lambda d: d.pop("kind"), "'kind' is missing"),
+        (lambda d: d.update(colour="red"), "unknown field 'colour'"),
+        (lambda d: d.update(kind="film"), "'film'"),
+        (lambda d: d.update(scene=True), "'scene'"),
+        (lambda d: d.update(scene=-1), "scene"),
+        (lambda d: d.update(key="s/0001"), "'key'"),
+        (lambda d: d["key"].pop("session"), "'session' is missing"),
+        (lambda d: d["key"].update(fire_at_ns="soon"), "'fire_at_ns'"),
+    ],
+)
+def test_a_broken_message_is_refused_with_the_field_named(change, told):
+    with pytest.raises(WireError, match=told):
+        decode(damaged(change))
+
+
+@pytest.mark.parametrize("payload", [b"", b"\xff\xfe", b"[]", b'"x"', b"{"])
+def test_what_is_no_message_is_refused(payload):
+    with pytest.raises(WireError):
+        decode(payload)
+
+
+def test_a_message_of_another_type_is_refused():
+    with pytest.raises(WireError, match="expected a message of type 'arm'"):
+        decode_as(Arm, encode(Fetch(KEY)))
+
+
+def test_a_refusal_without_a_reason_cannot_exist():
+    with pytest.raises(WireError, match="reason"):
+        ArmReply("n", armed=False, settings_hash="0" * 64)
+    with pytest.raises(WireError, match="reason"):
+        Failure("n", KEY, "")
