@@ -1,0 +1,20 @@
+"""Live state by server-sent events."""
+
+from collections.abc import AsyncIterable
+
+from fastapi import APIRouter
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+
+from controller.routes.desk import TheDesk
+
+router = APIRouter(tags=["live"])
+
+
+@router.get("/live", response_class=EventSourceResponse, summary="Live state")
+async def live(desk: TheDesk) -> AsyncIterable[ServerSentEvent]:
+    """First ``snapshot``, then ``rig``, ``sessions``, ``round``, ``capture``, ``job``, ``runs`` as they change.
+
+    Whoever reconnects gets a new snapshot.
+    """
+    async for name, payload in desk.live.follow():
+        yield ServerSentEvent(event=name, data=payload)

@@ -1,0 +1,107 @@
+"""The controller as a service: archive, router, jobs and the web server put together."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import uvicorn
+
+from controller.app import create_app
+from controller.archive import Archive
+from controller.capture import Timing
+from controller.config import ControllerConfig
+from controller.desk import Desk
+from controller.jobs import Command, processing_command
+from controller.rig import RigLink
+from processing.errors import InputError
+from processing.rig import parse_rig, read_rig
+
+logger = logging.getLogger(__name__)
+
+TOLERANCE_NS = 1_000_000  # skew that is not flagged, unless rig.toml says otherwise
+SHUTDOWN_LIMIT = 2  # seconds; an open event stream would keep the server alive for ever
+
+
+@contextmanager
+def open_desk(config: ControllerConfig, command: Command | None = None, timing: Timing | None = None) -> Iterator[Desk]:
+    """The desk with everything behind it: archive, router and nodes if the configuration names a rig, jobs.
+
+    ``command`` replaces the processing's command line, ``timing`` the waits of a capture round. Raises InputError
+    for a bad rig.toml.
+    """
+    text = None
+    if config.rig is not None:
+        read_rig(config.rig)  # its errors name the file
+        text = config.rig.read_text(encoding="utf-8")
+    if config.settings is not None and not config.settings.is_file():
+        raise InputError(f"{config.settings}: no such settings file")
+    desk = Desk(config.archive, command or processing_command(config.settings), text)
+    try:
+        archive = Archive(config.archive)
+        if text is None:
+            desk.connect(archive, None)
+            yield desk
+            return
+        rig = parse_rig(text)
+        tolerance_us = rig.capture.tolerance_us
+        tolerance_ns = TOLERANCE_NS if tolerance_us is None else round(tolerance_us * 1000)
+        cameras = [camera.id for camera in rig.cameras]
+        with RigLink(
+            rig.name, cameras, config.endpoint, archive, desk.on_event, timing=timing, tolerance_ns=tolerance_ns
+        ) as ring:
+            desk.connect(archive, ring)
+            yield desk
+    finally:
+        desk.close()
+
+
+def serve(desk: Desk, config: ControllerConfig, on_ready: Callable[[str], None] | None = None) -> None:
+    """Serve the page and the HTTP interface until SIGINT or SIGTERM; ``on_ready`` is told the address.
+
+    Raises InputError if the port is taken.
+    """
+    listener = _listen(config)
+    address = f"http://{config.host}:{listener.getsockname()[1]}"
+    server = uvicorn.Server(
+        uvicorn.Config(create_app(desk), log_level="warning", timeout_graceful_shutdown=SHUTDOWN_LIMIT)
+    )
+    logger.info("the page is at %s", address)
+    if on_ready:
+        on_ready(address)
+    with listener:
+        server.run([listener])
+
+
+def run_controller(config: ControllerConfig, on_ready: Callable[[str], None] | None = None) -> None:
+    """Run the controller until it is told to end. Without a rig it shows the archive's sessions."""
+    with open_desk(config) as desk:
+        serve(desk, config, on_ready)
+
+
+def free_endpoint(config: ControllerConfig) -> ControllerConfig:
+    """The same configuration with a Zenoh endpoint on loopback whose port is free at this moment."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return replace(config, endpoint=f"tcp/127.0.0.1:{probe.getsockname()[1]}")
+
+
+def _listen(config: ControllerConfig) -> socket.socket:
+    family = socket.AF_INET6 if ":" in config.host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        if os.name == "posix":  # elsewhere it would let two servers share the port
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((config.host, config.port))
+        listener.listen(128)
+    except OSError as error:
+        listener.close()
+        raise InputError(
+            f"http://{config.host}:{config.port} cannot be served ({error.strerror}); "
+            "choose another [http] port in the controller's configuration"
+        ) from error
+    return listener

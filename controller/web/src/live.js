@@ -1,0 +1,68 @@
+// The live state of the controller, kept up to date by its event stream.
+
+export const state = { rig: null, sessions: [], current: null, captures: [], runs: [], jobs: [], round: null, connected: false };
+
+const listeners = new Set();
+
+/** Call `listener(names)` now and whenever parts of the state, called by these names, have changed. */
+export function onChange(listener) {
+  listeners.add(listener);
+}
+
+function changed(...names) {
+  for (const listener of listeners) listener(new Set(names));
+}
+
+function replaceIn(list, key, item, atFront) {
+  const index = list.findIndex((other) => other[key] === item[key]);
+  if (index >= 0) return list.with(index, item);
+  return atFront ? [item, ...list] : [...list, item];
+}
+
+const apply = {
+  snapshot(snapshot) {
+    Object.assign(state, snapshot);
+    changed("rig", "sessions", "captures", "runs", "jobs", "round");
+  },
+  rig(rig) {
+    state.rig = rig;
+    changed("rig");
+  },
+  sessions({ sessions, current }) {
+    Object.assign(state, { sessions, current });
+    changed("sessions");
+  },
+  round(round) {
+    state.round = round;
+    changed("round");
+  },
+  capture({ session, record }) {
+    if (session !== state.current) return;
+    state.captures = replaceIn(state.captures, "capture_id", record, false);
+    changed("captures");
+  },
+  job(job) {
+    state.jobs = replaceIn(state.jobs, "id", job, true);
+    changed("jobs");
+  },
+  runs({ session, runs }) {
+    if (session !== state.current) return;
+    state.runs = runs;
+    changed("runs");
+  },
+};
+
+/** Follow the event stream for as long as the page is open; the browser reconnects by itself. */
+export function follow() {
+  const source = new EventSource("/api/v1/live");
+  const connected = (yes) => {
+    state.connected = yes;
+    changed("connected");
+  };
+  source.addEventListener("open", () => connected(true));
+  source.addEventListener("error", () => connected(false));
+  for (const [name, update] of Object.entries(apply)) {
+    source.addEventListener(name, (event) => update(JSON.parse(event.data)));
+  }
+  return source;
+}

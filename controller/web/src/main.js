@@ -1,0 +1,33 @@
+// The operator's page: follows the live state and draws each part when it changes.
+
+import { showCapture, showCaptures, wireCaptures } from "./captures.js";
+import { byId } from "./dom.js";
+import { showJobs, wireJobs } from "./jobs.js";
+import { follow, onChange, state } from "./live.js";
+import { showNodes } from "./nodes.js";
+import { showRuns, wireResults } from "./results.js";
+import { showSessions, wireSessions } from "./sessions.js";
+
+function showConnection() {
+  const live = byId("live");
+  live.textContent = state.connected ? "live" : "no answer from the controller, trying again …";
+  live.classList.toggle("on", state.connected);
+}
+
+wireSessions();
+wireCaptures();
+wireJobs();
+wireResults();
+
+onChange((parts) => {
+  const any = (...names) => names.some((name) => parts.has(name));
+  if (any("connected")) showConnection();
+  if (any("rig", "captures")) showNodes();
+  if (any("sessions", "rig")) showSessions();
+  if (any("rig", "round", "connected", "sessions")) showCapture();
+  if (any("captures")) showCaptures();
+  if (any("jobs", "sessions")) showJobs();
+  if (any("runs")) showRuns();
+});
+
+follow();

@@ -1,0 +1,257 @@
+// The results of a run: choice of run, field and step, limits of the colours, the legend, the figures.
+
+import { get, getBytes, url } from "./api.js";
+import { SCALES, cssGradient, ticks } from "./colours.js";
+import { byId, element, figure, notice, setOptions } from "./dom.js";
+import { state } from "./live.js";
+
+const GROUPS = [
+  ["Displacement", /^displacement/],
+  ["Stretch", /^(J|lambda\d)$/],
+  ["Strain", /^[Ee][\d_]/],
+  ["Quality", /./],
+];
+const FIRST_FIELD = "lambda2";
+const PLAY_EVERY = 900; // ms
+
+let surface = null; // the viewer, loaded when there is something to see
+let header = null;
+let newestShown = null;
+let limitsByHand = null; // [low, high] typed by the operator for the present field
+let playing = null;
+let wanted = 0; // the newest request to show; older ones give up when their numbers arrive
+const arrays = new Map(); // address -> promise of an ArrayBuffer
+
+const chosenField = () => header.fields.find((field) => field.name === byId("field").value) ?? header.fields[0];
+const removed = () => byId("rigid").checked;
+
+// Loading ----------------------------------------------------------------------------------------
+
+function bytes(...parts) {
+  const address = `${url("sessions", header.session, "results", header.run, ...parts)}?v=${header.version}&rigid_motion_removed=${removed()}`;
+  if (!arrays.has(address)) {
+    const loading = getBytes(address);
+    loading.catch(() => arrays.delete(address));
+    arrays.set(address, loading);
+    if (arrays.size > 120) arrays.delete(arrays.keys().next().value);
+  }
+  return arrays.get(address);
+}
+
+/** Show the runs of the present session; a run that has just been made is shown at once. */
+export async function showRuns() {
+  const runs = [...state.runs].reverse();
+  byId("results-empty").hidden = runs.length > 0;
+  byId("results").hidden = runs.length === 0;
+  setOptions(
+    byId("run"),
+    runs.map(({ run, finished_at }) => ({ value: run, label: `${run} of ${new Date(finished_at).toLocaleString([], { hour12: false })}` })),
+  );
+  if (!runs.length) {
+    header = null;
+    newestShown = null;
+    stop();
+    return;
+  }
+  const newest = `${state.current}/${runs[0].run}/${runs[0].finished_at}`;
+  if (newest === newestShown) return;
+  newestShown = newest;
+  byId("run").value = runs[0].run;
+  await attempt(openRun);
+}
+
+async function openRun() {
+  stop();
+  arrays.clear();
+  const opened = await get(url("sessions", state.current, "results", byId("run").value));
+  const sameSession = header?.session === opened.session;
+  header = opened;
+  limitsByHand = null;
+  if (!surface) {
+    const { Surface } = await import("./surface.js");
+    surface = new Surface(byId("surface"));
+    wirePicking();
+  }
+  const options = header.fields.map(({ name, label, unit }) => ({
+    value: name,
+    label: unit ? `${label} (${unit})` : label,
+    group: GROUPS.find(([, pattern]) => pattern.test(name))[0],
+  }));
+  options.sort((a, b) => GROUPS.findIndex(([g]) => g === a.group) - GROUPS.findIndex(([g]) => g === b.group));
+  const before = byId("field").value;
+  setOptions(byId("field"), options, options.some(({ value }) => value === before) ? before : FIRST_FIELD);
+  byId("step").max = String(header.steps.length - 1);
+  byId("step").value = String(header.steps.length - 1);
+  byId("download").href = url("sessions", header.session, "results", header.run, "file");
+  surface.setFaces(new Uint32Array(await bytes("faces")));
+  showFigures();
+  await show();
+  if (!sameSession) surface.resetView();
+}
+
+/** Load what the controls ask for, and draw it. */
+async function show() {
+  const field = chosenField();
+  const step = Number(byId("step").value);
+  const request = ++wanted;
+  const [points, values] = await Promise.all([bytes("positions", step), bytes("fields", field.name, step)]);
+  if (request !== wanted) return;
+  const scale = SCALES[field.centre === null ? "sequential" : "diverging"];
+  const [low, high] = limitsByHand ?? automaticLimits(field);
+  surface.setPositions(new Float32Array(points));
+  surface.setField(new Float32Array(values), field.location, scale, low, high);
+  showLegend(field, scale, low, high);
+  const name = step === 0 ? `${header.steps[0]} (reference)` : header.steps[step];
+  byId("step-name").textContent = `${step} of ${header.steps.length - 1}: ${name}`;
+  byId("step").setAttribute("aria-valuetext", name);
+  byId("rigid").title = field.rigid ? "" : "This field is the same with and without; the shape moves.";
+  byId("surface").dataset.shown = `${field.name}/${step}/${removed()}`;
+}
+
+// Colours ----------------------------------------------------------------------------------------
+
+/** Limits over all steps; even about the centre where the field has one. */
+function automaticLimits(field) {
+  const range = (removed() && field.range_without_rigid_motion) || field.range || [0, 1];
+  let [low, high] = range.map((value) => value ?? 0);
+  if (field.centre !== null) {
+    const reach = Math.max(Math.abs(low - field.centre), Math.abs(high - field.centre), 1e-6);
+    [low, high] = [field.centre - reach, field.centre + reach];
+  }
+  return high > low ? [low, high] : [low - 0.5, low + 0.5];
+}
+
+function showLegend(field, scale, low, high) {
+  const labels = ticks(low, high).map((value) =>
+    element("span", { class: "tick", style: `bottom: ${(100 * (value - low)) / (high - low)}%` }, figure(value)),
+  );
+  byId("legend").replaceChildren(
+    element("p", { class: "legend-title" }, field.label, field.unit ? ` (${field.unit})` : ""),
+    element(
+      "div",
+      { class: "legend-body" },
+      element("div", { class: "ramp", style: `background: ${cssGradient(scale)}` }),
+      element("div", { class: "ticks" }, ...labels),
+    ),
+    element("p", { class: "legend-none" }, element("i", {}), "not measured"),
+  );
+  for (const [id, value] of [["low", low], ["high", high]]) {
+    if (document.activeElement !== byId(id)) byId(id).value = figure(value);
+  }
+}
+
+function typedLimits() {
+  const [low, high] = [byId("low").valueAsNumber, byId("high").valueAsNumber];
+  if (Number.isFinite(low) && Number.isFinite(high) && high > low) {
+    limitsByHand = [low, high];
+    notice("");
+  } else {
+    notice("The limits of the colours must be two numbers, the first smaller than the second.");
+  }
+}
+
+// Figures, picking, playing ----------------------------------------------------------------------
+
+function showFigures() {
+  const { points, faces, pairs, cameras } = header;
+  byId("figures").textContent =
+    `${points.toLocaleString()} points, ${faces.toLocaleString()} triangles, ${cameras.length} cameras, ${pairs.length} pairs`;
+  const rows = header.summary?.table;
+  if (!Array.isArray(rows) || !rows.length) {
+    byId("table").replaceChildren();
+    return;
+  }
+  const names = Object.keys(rows[0]);
+  const cells = (row) => names.map((name) => element("td", {}, String(row[name] ?? "")));
+  byId("table").replaceChildren(
+    element(
+      "table",
+      {},
+      element("thead", {}, element("tr", {}, ...names.map((name) => element("th", { scope: "col" }, name)))),
+      element("tbody", {}, ...rows.map((row) => element("tr", {}, ...cells(row)))),
+    ),
+  );
+}
+
+function wirePicking() {
+  const canvas = byId("surface");
+  const output = byId("pick");
+  let due = null;
+  canvas.addEventListener("pointermove", (event) => {
+    if (event.buttons) {
+      output.hidden = true;
+      return;
+    }
+    cancelAnimationFrame(due);
+    due = requestAnimationFrame(() => {
+      const found = surface.pick(event.clientX, event.clientY);
+      output.hidden = !found;
+      if (!found) return;
+      const { x, y, z } = found.position;
+      const field = chosenField();
+      const value = Number.isFinite(found.value) ? `${figure(found.value)} ${field.unit}` : "not measured";
+      output.textContent = `${value}   at (${[x, y, z].map((mm) => mm.toFixed(1)).join(", ")}) mm`;
+    });
+  });
+  canvas.addEventListener("pointerleave", () => {
+    cancelAnimationFrame(due);
+    output.hidden = true;
+  });
+}
+
+function stop() {
+  clearInterval(playing);
+  playing = null;
+  byId("play").textContent = "▶ Play";
+  byId("play").setAttribute("aria-pressed", "false");
+}
+
+function play() {
+  if (playing) {
+    stop();
+    return;
+  }
+  byId("play").textContent = "❚❚ Pause";
+  byId("play").setAttribute("aria-pressed", "true");
+  const next = () => {
+    const slider = byId("step");
+    slider.value = String((Number(slider.value) + 1) % header.steps.length);
+    attempt(show);
+  };
+  next();
+  playing = setInterval(next, PLAY_EVERY);
+}
+
+async function attempt(action) {
+  try {
+    await action();
+  } catch (error) {
+    stop();
+    notice(error.message);
+  }
+}
+
+export function wireResults() {
+  byId("run").addEventListener("change", () => attempt(openRun));
+  byId("field").addEventListener("change", () => {
+    limitsByHand = null;
+    attempt(show);
+  });
+  byId("rigid").addEventListener("change", () => attempt(show));
+  byId("step").addEventListener("input", () => {
+    stop();
+    attempt(show);
+  });
+  for (const id of ["low", "high"]) {
+    byId(id).addEventListener("change", () => {
+      typedLimits();
+      attempt(show);
+    });
+  }
+  byId("auto").addEventListener("click", () => {
+    limitsByHand = null;
+    attempt(show);
+  });
+  byId("reset-view").addEventListener("click", () => surface?.resetView());
+  byId("play").addEventListener("click", play);
+}

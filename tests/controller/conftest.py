@@ -1,0 +1,108 @@
+"""A controller without a network: a real archive and desk over a ring of stand-in cameras."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+
+from controller.app import create_app
+from controller.archive import Archive, SessionWriter
+from controller.desk import Desk
+from node_agent.wire import CaptureKey, Manifest
+from processing.errors import ComputationError
+
+CAMERAS = ("01", "02", "03", "04")
+STAND_IN = [sys.executable, str(Path(__file__).with_name("stand_in_processing.py"))]
+RIG_TOML = """
+[rig]
+name = "test-ring"
+[target]
+kind = "dot-cylinder"
+radius_mm = 57.0
+rows = 20
+row_spacing_mm = 12.0
+first_row_z_mm = 10.0
+columns = 14
+column_spacing_mm = 12.0
+dot_size_mm = 4.0
+[board]
+kind = "checkerboard"
+squares = [15, 20]
+square_mm = 10.0
+""" + "".join(f'[[cameras]]\nid = "{name}"\nazimuth_deg = {90.0 * i}\n' for i, name in enumerate(CAMERAS))
+
+
+class StandInRing:
+    """Cameras that deliver small images at once. ``gate`` holds a capture up, ``absent`` nodes are not there."""
+
+    def __init__(self, on_event: Callable[[dict[str, Any]], None]) -> None:
+        self.absent: set[str] = set()
+        self.gate = threading.Event()
+        self.gate.set()
+        self.unarmed: str | None = None
+        self._on_event = on_event
+
+    def roster(self) -> list[dict[str, Any]]:
+        """The nodes."""
+        return [
+            {"id": name, "alive": name not in self.absent, "armed": False, "state": "idle", "spool_images": 0}
+            for name in CAMERAS
+        ]
+
+    def capture(self, session: SessionWriter, kind: str, *, override: bool = False) -> dict[str, Any]:
+        """One image a camera that is there, fired 10 µs after each other."""
+        if self.unarmed and not override:
+            raise ComputationError(f"not captured: camera {self.unarmed} is not armed")
+        writer = session.begin_capture(kind, CAMERAS, fire_at_ns=10**18, tolerance_ns=10**6, override=override)
+        self._tell(writer.record())
+        assert self.gate.wait(20)
+        for i, name in enumerate(CAMERAS):
+            if name not in self.absent:
+                writer.store(name, *image_of(session.name, writer.capture_id, name, kind, 10**18 + i * 10_000))
+                self._tell(writer.record())
+        record = writer.close(dict.fromkeys(self.absent, "the node is not there"))
+        self._tell(record)
+        return record
+
+    def _tell(self, record: dict[str, Any]) -> None:
+        names = ("session", "capture_id", "kind", "state")
+        self._on_event({"type": "capture", **{name: record[name] for name in names}})
+
+
+def image_of(session: str, capture_id: str, camera: str, kind: str, time_ns: int) -> tuple[Manifest, bytes]:
+    """A ramp of 40 × 30 px that begins with the camera's number."""
+    ramp = (np.arange(1200, dtype=np.uint32) + int(camera)).astype(np.uint8)
+    pgm = b"P5\n40 30\n255\n" + ramp.tobytes()
+    sha256 = hashlib.sha256(pgm).hexdigest()
+    return Manifest(camera, CaptureKey(session, capture_id, 10**18), kind, sha256, len(pgm), 40, 30, time_ns), pgm
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[Desk]:
+    """A desk whose processing is the stand-in."""
+    made = Desk(tmp_path / "archive", lambda session: [*STAND_IN, str(session)], RIG_TOML)
+    made.connect(Archive(tmp_path / "archive"), StandInRing(made.on_event))
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def ring(desk: Desk) -> StandInRing:
+    """The cameras of the desk."""
+    assert isinstance(desk._ring, StandInRing)
+    return desk._ring
+
+
+@pytest.fixture
+def client(desk: Desk) -> Iterator[TestClient]:
+    """The HTTP interface over the desk."""
+    with TestClient(create_app(desk)) as made:
+        yield made
