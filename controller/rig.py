@@ -42,7 +42,7 @@ from node_agent.wire import (
     decode_as,
     encode,
 )
-from processing.errors import ComputationError
+from processing.errors import ComputationError, InputError
 
 log = logging.getLogger(__name__)
 
@@ -116,7 +116,14 @@ class RigLink:
     def __enter__(self) -> RigLink:
         for name in self._archive.close_unfinished("the controller was restarted before the image arrived"):
             log.warning("capture %s was left open by an earlier run and is closed", name)
-        self._session = zenoh.open(_router_config(self._endpoint))
+        try:
+            self._session = zenoh.open(_router_config(self._endpoint))
+        except zenoh.ZError as error:
+            reason = str(error).split(" at /")[0].lstrip("[")
+            raise InputError(
+                f"the controller cannot listen on '{self._endpoint}' ({reason}); "
+                "choose another endpoint, or end the program that uses it"
+            ) from error
         keys = self._keys
         self._subscribers = [
             self._session.declare_subscriber(keys.image("*"), self._receive_image),

@@ -17,6 +17,7 @@ A relative spool folder is relative to the configuration file.
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -74,7 +75,7 @@ class NodeConfig:
             raise ConfigError(str(error)) from error
         if self.camera not in _CAMERA_KEYS:
             raise ConfigError(f"camera '{self.camera}' is none of {', '.join(_CAMERA_KEYS)}")
-        if "/" not in self.controller:
+        if not re.fullmatch(r"(tcp|tls|quic)/\S+:\d+(#\S*)?", self.controller):
             raise ConfigError(f"controller '{self.controller}' is no endpoint; write it like tcp/192.168.1.10:7447")
         if self.resend_s <= 0 or self.status_s <= 0 or self.spool_reserve_mb < 0:
             raise ConfigError("resend_s and status_s must be positive, spool_reserve_mb not negative")

@@ -12,6 +12,7 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ import pytest
 from controller.archive import Archive, SessionWriter, verify
 from controller.capture import MS, SECOND, Timing
 from controller.rig import RigLink
+from controller.rounds import CaptureRefusedError
+from processing.errors import InputError
 from processing.session import read_session
 
 WIDTH, HEIGHT = 640, 480
@@ -199,6 +202,7 @@ from pathlib import Path
 from controller.archive import Archive
 from controller.capture import MS, SECOND, Timing
 from controller.rig import RigLink
+from controller.rounds import CaptureRefusedError
 
 root, endpoint = Path(sys.argv[1]), sys.argv[2]
 archive = Archive(root)
@@ -239,3 +243,43 @@ def test_a_controller_and_a_node_killed_in_a_burst_lose_nothing(three: Ring, tmp
         for camera in three.cameras:
             assert_archived(session, record["capture_id"], camera, "specimen", record["number"] - 1)
     assert verify(session.path) == []
+
+
+def test_a_capture_is_refused_while_a_camera_is_absent_unless_the_operator_overrides(three: Ring, tmp_path: Path):
+    archive = Archive(tmp_path / "archive")
+    cameras = [*three.cameras, "ghost"]
+    timing = replace(TIMING, arm=5 * SECOND, arm_retry=1 * SECOND)
+    with RigLink("test-ring", cameras, three.endpoint, archive, lambda event: None, timing=timing) as rig:
+        assert rig.wait_for_nodes(0.1) != []
+        assert until(lambda: sum(node["alive"] for node in rig.roster()) == 3, 30)
+        session = archive.create_session("gap", rig_toml(cameras))
+        with pytest.raises(CaptureRefusedError, match="ghost: not armed: the node is not connected") as caught:
+            rig.capture(session, "board")
+        assert list(caught.value.reasons) == ["ghost"]
+        assert session.captures() == [], "a refused capture leaves no folder"
+
+        record = rig.capture(session, "board", override=True)
+        assert record["override"] is True
+        assert record["cameras"]["ghost"]["status"] == "failed"
+        assert "not connected" in record["cameras"]["ghost"]["reason"]
+        assert [record["cameras"][camera]["status"] for camera in three.cameras] == ["ok"] * 3
+
+        # Settings that no camera knows are refused by every node, with the name.
+        with pytest.raises(CaptureRefusedError, match="unknown camera setting 'iso'"):
+            rig.capture(session, "board", override=True, settings={"iso": 100})
+
+        assert rig.preview("a") is not None
+        assert rig.preview("ghost", timeout=0.5) is None
+    for camera in three.cameras:
+        three.processes[camera].terminate()
+        assert three.processes[camera].wait(10) == 0, three.log(camera)
+
+
+def test_an_endpoint_in_use_is_refused_by_name(tmp_path: Path):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        rig = RigLink("test-ring", ["a"], endpoint, Archive(tmp_path), lambda event: None)
+        with pytest.raises(InputError, match=f"cannot listen on '{endpoint}' .*in use"):
+            rig.__enter__()
