@@ -1,0 +1,98 @@
+"""The web server on a real socket: the event stream, a free port, and an end within the limit."""
+
+from __future__ import annotations
+
+import json
+import queue
+import socket
+import threading
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+import uvicorn
+
+from controller.app import create_app
+from controller.config import ControllerConfig
+from controller.desk import Desk
+from controller.service import SHUTDOWN_LIMIT, open_desk, serve
+from processing.errors import InputError
+
+
+@pytest.fixture
+def served(desk: Desk):
+    """The desk served on a free port, and the server."""
+    server = uvicorn.Server(
+        uvicorn.Config(create_app(desk), port=0, log_level="warning", timeout_graceful_shutdown=SHUTDOWN_LIMIT)
+    )
+    listener = socket.create_server(("127.0.0.1", 0))
+    thread = threading.Thread(target=server.run, args=([listener],))
+    thread.start()
+    yield f"http://127.0.0.1:{listener.getsockname()[1]}", server, thread
+    server.should_exit = True
+    thread.join(10)
+    listener.close()
+
+
+def read_events(stream: httpx.Response, into: queue.Queue) -> None:
+    """Put (event, payload) of a stream into a queue until it ends."""
+    name = ""
+    try:
+        for line in stream.iter_lines():
+            if line.startswith("event: "):
+                name = line.removeprefix("event: ")
+            elif line.startswith("data: "):
+                into.put((name, json.loads(line.removeprefix("data: "))))
+    except httpx.HTTPError:
+        return
+
+
+def test_the_event_stream_tells_a_capture_from_arming_to_the_close_and_does_not_hold_up_the_end(served) -> None:
+    address, server, thread = served
+    events: queue.Queue = queue.Queue()
+    with httpx.stream("GET", f"{address}/api/v1/live", timeout=20) as stream:
+        reader = threading.Thread(target=read_events, args=(stream, events))
+        reader.start()
+        name, snapshot = events.get(timeout=10)
+        assert name == "snapshot"
+        assert [node["id"] for node in snapshot["rig"]["nodes"]] == ["01", "02", "03", "04"]
+        httpx.post(f"{address}/api/v1/sessions", json={"name": "limb"})
+        httpx.post(f"{address}/api/v1/captures", json={"kind": "board"})
+        rounds, statuses = [], []
+        while "closed" not in rounds:
+            name, payload = events.get(timeout=10)
+            if name == "round":
+                rounds.append(payload["state"])
+            if name == "capture":
+                statuses.append(sorted(entry["status"] for entry in payload["record"]["cameras"].values()))
+        assert rounds[0] == "arming"
+        assert statuses[0] == ["pending"] * 4
+        assert statuses[-1] == ["ok"] * 4
+        started = time.monotonic()
+        server.should_exit = True
+        thread.join(SHUTDOWN_LIMIT + 5)
+        assert not thread.is_alive()
+        assert time.monotonic() - started < SHUTDOWN_LIMIT + 4
+    reader.join(10)
+
+
+def test_without_a_rig_the_controller_shows_and_captures_nothing(tmp_path: Path) -> None:
+    with open_desk(ControllerConfig(archive=tmp_path / "archive")) as desk:
+        assert desk.roster() == []
+        assert "without a rig" in (desk.why_no_capture() or "")
+        assert desk.snapshot()["sessions"] == []
+
+
+def test_a_port_that_is_taken_is_named(desk: Desk) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError, match=str(port)):
+            serve(desk, ControllerConfig(port=port))
+
+
+@pytest.mark.parametrize("name", ["rig", "settings"])
+def test_a_file_of_the_configuration_that_is_not_there_is_named(tmp_path: Path, name: str) -> None:
+    config = ControllerConfig(archive=tmp_path / "archive", **{name: tmp_path / "absent.toml"})
+    with pytest.raises(InputError, match=r"absent\.toml"), open_desk(config):
+        pass
