@@ -110,6 +110,7 @@ class SessionWriter:
         self.name: str = header["session"]
         rig = tomllib.loads((self.path / "rig.toml").read_text(encoding="utf-8"))
         self.cameras: tuple[str, ...] = tuple(str(camera["id"]) for camera in rig.get("cameras", []))
+        self.camera_settings: dict[str, Any] = dict(rig.get("capture", {}))
 
     @classmethod
     def create(

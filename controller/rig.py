@@ -322,7 +322,8 @@ class RigLink:
     ) -> dict[str, Any]:
         """Capture one image with every camera into `session`; return the closed record.
 
-        Blocks until the round closes, at most the sum of its waits.
+        Blocks until the round closes, at most the sum of its waits. The cameras are locked to `settings`, or else
+        to the ``[capture]`` table of the session's rig.toml.
 
         Raises
         ------
@@ -348,7 +349,7 @@ class RigLink:
                 timing=self._timing,
                 tolerance_ns=self._tolerance_ns,
                 override=override,
-                settings=settings or {},
+                settings=session.camera_settings if settings is None else settings,
                 on_event=self._on_event,
             )
         finally:

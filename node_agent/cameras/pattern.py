@@ -41,18 +41,20 @@ class PatternCamera:
         self._clock = clock
         self._size = width, height
         self._delay = delay
+        self._exposure_us = 5000.0
         self._jitter_us = jitter_us
         self._random = np.random.default_rng([seed, zlib.crc32(camera.encode())])
 
     def lock(self, settings: Mapping[str, Any]) -> Lock:
         check_settings(settings)
+        self._exposure_us = float(settings.get("exposure_us", self._exposure_us))
         return Lock(metadata=dict(settings), sync="simulated")
 
     def capture(self, shot: Shot) -> Frame:
         sleep_until(self._clock, shot.fire_at_ns)
         self._clock.sleep(self._delay)
         time_ns = shot.fire_at_ns + round(1000 * self._random.normal(0.0, self._jitter_us))
-        return Frame(pattern(self.camera, shot.kind, shot.scene, *self._size), time_ns, exposure_us=5000.0)
+        return Frame(pattern(self.camera, shot.kind, shot.scene, *self._size), time_ns, self._exposure_us)
 
     def versions(self) -> dict[str, str]:
         return {"camera": "pattern"}

@@ -49,6 +49,7 @@ kind = "checkerboard"
 squares = [15, 20]
 square_mm = 10.0
 """
+    head += "[capture]\nexposure_us = 4000\n"
     return head + "".join(
         f'[[cameras]]\nid = "{camera}"\nazimuth_deg = {360.0 * i / len(cameras)}\n' for i, camera in enumerate(cameras)
     )
@@ -138,6 +139,7 @@ def assert_archived(session: SessionWriter, capture_id: str, camera: str, kind: 
     entry = session.capture(capture_id).record()["cameras"][camera]
     assert entry["sha256"] == hashlib.sha256(content).hexdigest()
     assert (entry["bytes"], entry["width"], entry["height"]) == (len(content), WIDTH, HEIGHT)
+    assert entry["exposure_us"] == 4000.0, "the cameras hold what rig.toml asks for"
 
 
 def test_a_node_killed_in_the_middle_of_a_capture(twelve: Ring, tmp_path: Path):
