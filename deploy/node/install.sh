@@ -140,8 +140,13 @@ point() { # point LINK NAME: in one step, so that there is a current release at 
 
 named() { if [[ -L $prefix/$1 ]]; then basename "$(readlink "$prefix/$1")"; fi; }
 
-stop_service() {
-  if on_this_machine && systemctl is-active --quiet "$SERVICE"; then systemctl stop "$SERVICE"; fi
+stopped=no
+stop_service() { # whatever happens until the next start, the service does not stay stopped
+  if on_this_machine && systemctl is-active --quiet "$SERVICE"; then
+    stopped=yes
+    trap 'if [[ $stopped == yes ]]; then systemctl start "$SERVICE"; fi' EXIT
+    systemctl stop "$SERVICE"
+  fi
 }
 
 start_service() { # the unit of the current release; fails if the service does not stay up
@@ -150,6 +155,7 @@ start_service() { # the unit of the current release; fails if the service does n
   systemctl daemon-reload || return
   systemctl enable --quiet "$SERVICE" || return
   systemctl restart "$SERVICE" || return
+  stopped=no
   sleep 8
   systemctl is-active --quiet "$SERVICE" && [[ $(systemctl show -p NRestarts --value "$SERVICE") == 0 ]]
 }
@@ -203,7 +209,8 @@ install_release() {
     release=${release%%-*}
   fi
   [[ $release =~ ^[A-Za-z0-9][A-Za-z0-9._+-]*$ ]] || refuse "'$release' cannot be the name of a release"
-  local folder=$prefix/releases/$release address
+  local folder=$prefix/releases/$release address before
+  before=$(named current)
   [[ ! -f $folder/complete ]] ||
     refuse "release $release is installed already; give this one another name with --release, or go to it with --back"
 
@@ -222,8 +229,7 @@ install_release() {
     stop_service # the camera serves one process at a time
     if ! as_service_user "$folder/venv/bin/ringdic-node" check --config "$config"; then
       rm -rf "$folder"
-      if on_this_machine && [[ -n $(named current) ]]; then systemctl start "$SERVICE"; fi
-      give_up "release $release does not pass its check and is removed; current: $(named current || true)"
+      give_up "release $release does not pass its check and is removed; ${before:-no release} is current"
     fi
   fi
   switch_to "$release"
