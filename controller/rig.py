@@ -239,12 +239,15 @@ class RigLink:
 
     def _acknowledge(self, manifest: Manifest, verdict: str) -> None:
         ack = Ack(manifest.node, manifest.key, manifest.sha256, verdict)
-        self._session.put(
-            self._keys.node(manifest.node, "ack"),
-            encode(ack),
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            priority=zenoh.Priority.INTERACTIVE_HIGH,
-        )
+        try:
+            self._session.put(
+                self._keys.node(manifest.node, "ack"),
+                encode(ack),
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.INTERACTIVE_HIGH,
+            )
+        except zenoh.ZError as error:  # the node sends its image again, and is answered again
+            log.warning("an acknowledgement to %s could not be sent: %s", manifest.node, error)
 
     # Reconciliation
 
@@ -267,6 +270,13 @@ class RigLink:
                 self._visit(camera)
 
     def _visit(self, camera: str) -> None:
+        """Reconcile one node; trouble with it must not keep the others from their turn."""
+        try:
+            self._reconcile_node(camera)
+        except (OSError, ValueError, zenoh.ZError) as error:
+            log.error("node %s could not be reconciled: %s", camera, error)
+
+    def _reconcile_node(self, camera: str) -> None:
         """Ask one node for its status and its inventory; fetch what the archive lacks."""
         sent = time.time_ns()
         for status in self._answers(camera, "status", Status):
