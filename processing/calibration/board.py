@@ -10,7 +10,7 @@ from processing.rig import Board
 
 Array = NDArray[np.float64]
 
-#: Long sides of the reduced images in which the board is looked for, px: smallest first, because it is fastest.
+#: Long sides to which an image is brought to look for the board, px: smallest first, because it is fastest.
 _SEARCH_SIZES = (1000, 2000)
 
 
@@ -45,16 +45,12 @@ def find_corners(image: NDArray[np.generic], inner_corners: tuple[int, int]) -> 
 
 
 def _search(grey: NDArray[np.uint8], inner_corners: tuple[int, int]) -> Array | None:
-    """Corners good to a pixel or so, from the smallest reduced image that shows the board."""
+    """Corners good to a pixel or so, from the smallest version of the image that shows the board."""
     height, width = grey.shape
-    sizes = [size for size in _SEARCH_SIZES if size < max(height, width)] + [max(height, width)]
-    for size in sizes[: len(_SEARCH_SIZES)]:
-        scale = size / max(height, width)
-        small = grey
-        if scale < 1:
-            small = cv2.resize(
-                grey, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA
-            ).astype(np.uint8)
+    for size in _SEARCH_SIZES:
+        scale = min(size / max(height, width), 2.0)
+        method = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+        small = cv2.resize(grey, (round(width * scale), round(height * scale)), interpolation=method).astype(np.uint8)
         found, corners = cv2.findChessboardCornersSB(small, inner_corners, flags=0)
         if found:
             factor = np.array([width / small.shape[1], height / small.shape[0]])

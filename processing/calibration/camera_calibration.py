@@ -21,14 +21,16 @@ from processing.calibration.intrinsics import (
 )
 from processing.calibration.target import DotObservations, identify
 from processing.camera import Camera, Intrinsics
-from processing.errors import InputError
+from processing.errors import ComputationError, InputError
 from processing.rig import Rig
 
 Array = NDArray[np.float64]
 Image = NDArray[np.generic]
 
-#: Dots further than this from their projection can be gross errors, px.
-_OUTLIER_FLOOR = 1.5
+#: A focal length less certain than this part of itself is not one.
+_FOCAL_UNCERTAINTY = 0.03
+#: Dots nearer than this to their projection are never gross errors, px.
+_OUTLIER_FLOOR = 0.3
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ def calibrate_camera(
     tangential: bool = True,
     skew: bool = True,
     drop_percentile: float = 80.0,
-    max_incidence_deg: float = 60.0,
+    max_incidence_deg: float = 55.0,
     linear_light: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> CameraCalibration:
@@ -116,7 +118,8 @@ def calibrate_camera(
     linear_light : images are sRGB-coded.
     progress : called with (images done, images in all).
 
-    Raises InputError for images of different sizes, too few views of the board, a target that is not recognised.
+    Raises InputError for images of different sizes, too few views of the board, a target that is not recognised;
+    ComputationError where the views do not determine the lens.
     """
     height, width = target_image.shape
     size = (width, height)
@@ -146,6 +149,7 @@ def calibrate_camera(
             skew=skew,
             drop_percentile=drop_percentile,
         )
+        _require_focal_length(camera_id, fit)
         intrinsics = fit.intrinsics
     entry = rig.camera(camera_id)
     observed = identify(
@@ -180,6 +184,15 @@ def _find_views(
             "intrinsics file, or switch calibration.distortion off"
         )
     return views
+
+
+def _require_focal_length(camera_id: str, fit: IntrinsicsFit) -> None:
+    focal, uncertainty = fit.intrinsics.K[0, 0], fit.sigma[0]
+    if not uncertainty <= _FOCAL_UNCERTAINTY * focal:
+        raise ComputationError(
+            f"camera {camera_id}: the {len(fit.kept)} views of the checkerboard do not determine its focal length "
+            f"({focal:.0f} ± {uncertainty:.0f} px); tilt the board by 20° to 45° in several directions"
+        )
 
 
 def _place(

@@ -32,6 +32,7 @@ def solve_dlt(xyz: Array, px: Array) -> Array:
     A[:n, 8:] = -px[:, :1] * xyz
     A[n:, 8:] = -px[:, 1:] * xyz
     scale = np.linalg.norm(A, axis=0)
+    scale[scale == 0] = 1.0
     L, _, rank, _ = np.linalg.lstsq(A / scale, px.T.ravel(), rcond=None)
     if rank < 11:
         raise ComputationError("the control points lie in one plane or on one line and do not determine a camera")

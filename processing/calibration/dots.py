@@ -21,8 +21,10 @@ Grey = NDArray[np.float32]
 _SEARCH_SIZE = 1640
 #: Light missing in a dot, as a part of the white around it, to be looked at.
 _SEARCH_CONTRAST = 0.25
-#: Missing light that counts as none: noise and texture of the white.
-_NO_LIGHT_MISSING = 0.15
+#: Missing light that is certainly the dot's.
+_SPOT_CONTRAST = 0.2
+#: Missing light below so many standard deviations of the white, but no more than this, counts as none.
+_NOISE_SIGMAS, _LARGEST_NOISE = 2.5, 0.06
 
 
 @dataclass(frozen=True)
@@ -32,12 +34,14 @@ class Dots:
     px : (n, 2) centroids, px.
     width, height : (n,) of the upright box round each spot, px.
     contrast : (n,) median part of the light missing in it.
+    size : (width, height) of the image, px.
     """
 
     px: Array
     width: Array
     height: Array
     contrast: Array
+    size: tuple[int, int]
 
     def __post_init__(self) -> None:
         n = len(self.px)
@@ -48,7 +52,7 @@ class Dots:
         return len(self.px)
 
     def __getitem__(self, chosen: NDArray[np.generic]) -> Dots:
-        return Dots(self.px[chosen], self.width[chosen], self.height[chosen], self.contrast[chosen])
+        return Dots(self.px[chosen], self.width[chosen], self.height[chosen], self.contrast[chosen], self.size)
 
 
 def find_dots(image: NDArray[np.generic], target: Target, *, linear_light: bool = True) -> Dots:
@@ -63,11 +67,12 @@ def find_dots(image: NDArray[np.generic], target: Target, *, linear_light: bool 
     grey = _as_unit(image)
     boxes = _candidate_boxes(grey, target)
     light = _to_linear(grey) if linear_light else grey
+    size = (grey.shape[1], grey.shape[0])
     measured = [m for box in boxes if (m := _measure(light, box)) is not None]
     if not measured:
-        return Dots(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0))
+        return Dots(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0), size)
     table = np.array(measured)
-    return Dots(table[:, :2], table[:, 2], table[:, 3], table[:, 4])
+    return Dots(table[:, :2], table[:, 2], table[:, 3], table[:, 4], size)
 
 
 def _as_unit(image: NDArray[np.generic]) -> Grey:
@@ -107,12 +112,12 @@ def _candidate_boxes(grey: Grey, target: Target) -> NDArray[np.intp]:
 def _measure(light: Grey, box: NDArray[np.intp]) -> tuple[float, float, float, float, float] | None:
     """Centroid x, y, width, height and contrast of the spot in a box; None where it is not a spot on white."""
     x, y, w, h = (int(value) for value in box)
-    mx, my = max(4, w // 2), max(4, h // 2)
+    # Blur carries a dot's edge a few pixels outwards.
+    edge = 2 if h < 12 else 3
+    mx, my = max(edge + 3, w // 2), max(edge + 3, h // 2)
     x0, y0 = max(x - mx, 0), max(y - my, 0)
     window = light[y0 : y + h + my, x0 : x + w + mx].astype(float)
     rows, columns = np.mgrid[: window.shape[0], : window.shape[1]]
-    # Blur carries a dot's edge about two pixels outwards.
-    edge = 2
     near = (
         (columns >= x - x0 - edge)
         & (columns < x - x0 + w + edge)
@@ -126,15 +131,16 @@ def _measure(light: Grey, box: NDArray[np.intp]) -> tuple[float, float, float, f
         return None
     plane = _fit_plane(columns, rows, window, white)
     missing = 1.0 - window / np.maximum(plane, 1e-6)
-    spot = missing > _NO_LIGHT_MISSING
-    labels = cv2.connectedComponents(spot.astype(np.uint8), connectivity=8)[1]
-    centre = labels[y - y0 : y - y0 + h, x - x0 : x - x0 + w]
-    counts = np.bincount(centre.ravel())
+    labels = cv2.connectedComponents((near & (missing > _SPOT_CONTRAST)).astype(np.uint8), connectivity=8)[1]
+    counts = np.bincount(labels[y - y0 : y - y0 + h, x - x0 : x - x0 + w].ravel())
     counts[0] = 0
-    spot = labels == counts.argmax() if counts.size > 1 else spot & near
-    if spot.sum() < 4:
+    if counts.max() < 4:
         return None
-    q = np.where(spot, missing, 0.0)
+    spot = labels == counts.argmax()
+    # The blurred edge belongs to the dot: leaving out its faint pixels would draw the centroid to the full ones.
+    reach = cv2.dilate(spot.astype(np.uint8), np.ones((2 * edge + 1,) * 2, np.uint8)).astype(bool)
+    noise = min(_NOISE_SIGMAS * float(np.std(missing[white])), _LARGEST_NOISE)
+    q = np.where(reach & (missing > noise), missing, 0.0)
     total = q.sum()
     return (
         x0 + float((q * columns).sum() / total),

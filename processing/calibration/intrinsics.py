@@ -186,6 +186,15 @@ def _project(state: State, board: Array) -> tuple[Array, Array, Array, Array]:
     return distorted @ lens.K[:2, :2].T + lens.K[:2, 2], rotated, camera, xy
 
 
+def _cost(state: State, px: Array, board: Array) -> float:
+    """Sum of squared residuals; infinite where the state is not a camera."""
+    if min(state[0][:2]) <= 0:
+        return float("inf")
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        cost = float(np.sum((px - _project(state, board)[0]) ** 2))
+    return cost if np.isfinite(cost) else float("inf")
+
+
 def _view_errors(state: State, px: Array, board: Array) -> Array:
     difference = px - _project(state, board)[0]
     return np.sqrt(np.mean(np.sum(difference**2, axis=-1), axis=-1))
@@ -242,13 +251,12 @@ def _refine(state: State, px: Array, board: Array, free: NDArray[np.bool_]) -> t
         while True:
             step_inner, step_pose = _solve(A, B, C, a, c, damping)
             trial = _moved(state, free, step_inner, step_pose)
-            with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-                trial_cost = float(np.sum((px - _project(trial, board)[0]) ** 2))
+            trial_cost = _cost(trial, px, board)
             if trial_cost <= cost or damping > 1e12:
                 break
             damping *= 10
         if not trial_cost <= cost:
-            break
+            break  # round-off: no step lowers the cost any more
         converged = cost - trial_cost <= 1e-12 * cost
         state, cost, damping = trial, trial_cost, max(damping / 10, 1e-12)
         projected, by_inner, by_pose = _jacobians(state, board)

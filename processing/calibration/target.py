@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
 
 from processing.calibration import dlt, lattice
@@ -33,8 +34,9 @@ DOTS_NEEDED, COLUMNS_NEEDED = 24, 3
 _AZIMUTH_LIMIT = 12.0
 #: Numberings whose distances from the nominal azimuth differ by less than this cannot be told apart, degrees.
 _AZIMUTH_MARGIN = 1.0
-#: A dot belongs to the lattice if it lies within this part of the row spacing of its place.
-_PLACE = 0.06
+#: A dot is one of the target's if it lies within this part of its own size of its place. Printed numbers above the
+#: top row, some 2 mm off the place of one more row of 4 mm dots, are not.
+_PLACE = 0.35
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ def identify(
     camera: str = "",
     intrinsics: Intrinsics | None = None,
     rotation_deg: float = 0.0,
-    max_incidence_deg: float = 60.0,
+    max_incidence_deg: float = 55.0,
 ) -> DotObservations:
     """Row, column and point of every dot seen under less than ``max_incidence_deg``.
 
@@ -129,26 +131,24 @@ def identify(
 
     Raises InputError, with the camera's name and what was found, where the dots do not make a camera.
     """
-    px = dots.px if intrinsics is None else intrinsics.to_undistorted(dots.px)
-    upright = _upright(Dots(px, dots.width, dots.height, dots.contrast), rotation_deg)
-    upright = upright[np.flatnonzero(np.isfinite(px).all(axis=1))]
-    spots, rows, columns = lattice.walk(upright, target)
-    _require_dots(camera, len(spots), len(set(columns.tolist())))
-    if rows.max() + 1 < target.rows:
-        raise InputError(
-            f"camera {camera}: {rows.max() + 1} rows of dots hang together in the target image, the target has "
-            f"{target.rows}; all rows must be in view and unobstructed near the middle, and [target] rows must be right"
-        )
-    numbering = _number(upright.px[spots], rows, columns, target, azimuth_deg, camera)
+    if intrinsics is None:
+        upright = _upright(dots, rotation_deg)
+    else:
+        px = intrinsics.to_undistorted(dots.px)
+        usable = np.flatnonzero(np.isfinite(px).all(axis=1))
+        dots = dots[usable]
+        upright = _upright(replace(dots, px=px[usable]), rotation_deg)
+    numbering = _number(upright, target, azimuth_deg, camera, lens_known=intrinsics is not None)
+    upright = _straightened(upright, numbering.bend)
     L = numbering.L
+    all_rows = range(1, target.rows + 1)
     for _ in range(3):
-        found, rows, columns = _match(upright, L, target, max_incidence_deg)
+        found, rows, columns = _match(upright, L, target, all_rows, max_incidence_deg)
         _require_dots(camera, len(found), len(set(columns.tolist())))
         xyz = dot_points(target, rows, columns)
-        L, kept = dlt.solve_dlt_robust(xyz, upright.px[found], sigmas=8.0, floor=2.0)
+        L, kept = dlt.solve_dlt_robust(xyz, upright.px[found], sigmas=8.0, floor=1.0)
     found, rows, columns, xyz = found[kept], rows[kept], columns[kept], xyz[kept]
     _require_dots(camera, len(found), len(set(columns.tolist())))
-    observed = dots.px[np.flatnonzero(np.isfinite(px).all(axis=1))][found]
     centre = Camera(camera, dlt.to_projection(L), (1, 1)).centre
     azimuth = math.degrees(math.atan2(centre[1], centre[0])) % 360.0
     log.info(
@@ -159,16 +159,31 @@ def identify(
         azimuth,
         azimuth_deg,
     )
-    return DotObservations(camera, rows, columns, observed, xyz, azimuth, numbering.margin)
+    return DotObservations(camera, rows, columns, dots.px[found], xyz, azimuth, numbering.margin)
 
 
 def _upright(dots: Dots, rotation_deg: float) -> Dots:
-    """Dots of an image turned back to upright; positions are turned about the origin."""
+    """Dots of an image turned back to upright, about the middle of the image."""
     quarters = round(rotation_deg / 90.0) % 4
-    x, y = dots.px.T
+    width, height = dots.size
+    x, y = (dots.px - _middle(dots.size)).T
     turned = {0: (x, y), 1: (y, -x), 2: (-x, -y), 3: (-y, x)}[quarters]
-    width, height = (dots.width, dots.height) if quarters % 2 == 0 else (dots.height, dots.width)
-    return Dots(np.column_stack(turned), width, height, dots.contrast)
+    if quarters % 2:
+        width, height = height, width
+        dots = replace(dots, width=dots.height, height=dots.width)
+    return replace(dots, px=np.column_stack(turned) + _middle((width, height)), size=(width, height))
+
+
+def _straightened(dots: Dots, bend: float) -> Dots:
+    """Dots moved from the middle of the image by ``bend`` r³: a lens of one parameter, for lack of a better."""
+    middle = _middle(dots.size)
+    offset = dots.px - middle
+    r2 = np.sum(offset**2, axis=1, keepdims=True) / np.sum(middle**2)
+    return replace(dots, px=middle + offset * (1 + bend * r2))
+
+
+def _middle(size: tuple[int, int]) -> Array:
+    return (np.array(size, dtype=float) - 1) / 2
 
 
 def _require_dots(camera: str, dots: int, columns: int) -> None:
@@ -182,39 +197,42 @@ def _require_dots(camera: str, dots: int, columns: int) -> None:
 
 @dataclass(frozen=True)
 class _Numbering:
-    """One way of numbering rows and columns, and the camera it means."""
+    """One way of numbering rows and columns, and the camera it means.
+
+    L : (11,) DLT parameters.
+    agreeing : dots that are where this camera sees dots.
+    deviation : azimuth of the camera minus the nominal one, degrees.
+    rows : how many rows of dots are seen; the lowest has number 1.
+    bend : see ``_straightened``; 0 where the lens is known.
+    margin : see ``DotObservations.margin_deg``.
+    """
 
     L: Array
     agreeing: int
-    cost: float
     deviation: float
+    rows: int
+    bend: float
     margin: float = math.inf
 
 
-def _number(px: Array, rows: Index, columns: Index, target: Target, azimuth_deg: float, camera: str) -> _Numbering:
+def _number(dots: Dots, target: Target, azimuth_deg: float, camera: str, *, lens_known: bool) -> _Numbering:
     """The numbering that puts the camera where the rig says it is."""
-    step = math.degrees(target.column_angle)
-    spacing = float(np.median(np.abs(px[:, 1] - np.mean(px[:, 1])))) * 4 / target.rows
-    possible = []
-    for shift in _shifts(columns, azimuth_deg, step):
-        # Signs above the dots may look like one more row; the row that fits worse is theirs.
-        tried = [
-            _try(px, rows - first_row + 1, columns + shift, target, azimuth_deg, _PLACE * spacing)
-            for first_row in range(int(rows.max()) + 2 - target.rows)
-        ]
-        best = min((t for t in tried if t is not None), key=lambda numbering: numbering.cost, default=None)
-        if best is not None and abs(best.deviation) <= _AZIMUTH_LIMIT:
-            possible.append(best)
+    spots, rows, columns = lattice.walk(dots, target)
+    _require_dots(camera, len(spots), len(set(columns.tolist())))
+    # The lattice faces the camera: its middle column has a number near that of the nominal azimuth.
+    middle = (azimuth_deg % 360.0) / math.degrees(target.column_angle) + 1 - float(np.median(columns))
+    tried = [
+        _try(dots, spots, rows, columns + shift, target, azimuth_deg, lens_known)
+        for shift in range(math.floor(middle) - 3, math.ceil(middle) + 4)
+    ]
+    possible = [n for n in tried if n is not None and abs(n.deviation) <= _AZIMUTH_LIMIT]
     if not possible:
         raise InputError(
             f"camera {camera}: no numbering of the target's columns puts the camera within {_AZIMUTH_LIMIT:.0f}° of "
             f"its nominal azimuth {azimuth_deg:.1f}°; check azimuth_deg, and [target] columns and spacings, in rig.toml"
         )
     most = max(numbering.agreeing for numbering in possible)
-    good = sorted(
-        (numbering for numbering in possible if numbering.agreeing >= 0.97 * most),
-        key=lambda numbering: abs(numbering.deviation),
-    )
+    good = sorted((n for n in possible if n.agreeing >= 0.97 * most), key=lambda n: abs(n.deviation))
     margin = abs(good[1].deviation) - abs(good[0].deviation) if len(good) > 1 else math.inf
     if margin < _AZIMUTH_MARGIN:
         raise InputError(
@@ -222,55 +240,92 @@ def _number(px: Array, rows: Index, columns: Index, target: Target, azimuth_deg:
             f"target's columns (the camera stands at {azimuth_deg + good[0].deviation:.1f}° or "
             f"{azimuth_deg + good[1].deviation:.1f}°); give azimuth_deg to within 5°"
         )
+    if good[0].rows != target.rows:
+        raise InputError(
+            f"camera {camera}: {good[0].rows} rows of dots are seen in the target image, [target] in rig.toml says "
+            f"{target.rows}; all rows must be in view, not hidden over the whole width, and [target] rows must be right"
+        )
     return replace(good[0], margin=margin)
 
 
-def _shifts(columns: Index, azimuth_deg: float, step: float) -> range:
-    """Numbers the leftmost column may have: those with the middle of the lattice near the nominal azimuth."""
-    middle = (azimuth_deg % 360.0) / step + 1 - float(np.median(columns))
-    return range(math.floor(middle) - 3, math.ceil(middle) + 4)
-
-
 def _try(
-    px: Array, rows: Index, columns: Index, target: Target, azimuth_deg: float, tolerance: float
+    dots: Dots, spots: Index, rows: Index, columns: Index, target: Target, azimuth_deg: float, lens_known: bool
 ) -> _Numbering | None:
-    """The camera of one numbering, or None where it is not one outside the target."""
+    """The camera of one numbering of the columns, or None where it is not one outside the target.
+
+    The rows are counted from any row at first: a target shifted by a row is the same camera shifted in height. That
+    camera says where further rows must be, whether or not the lattice reached them.
+    """
     step = math.degrees(target.column_angle)
-    whole = 360.0 - (target.columns - 1) * step < 1.6 * step  # the columns go all the way round
-    if whole:
+    if 360.0 - (target.columns - 1) * step < 1.6 * step:  # the columns go all the way round
         columns = (columns - 1) % target.columns + 1
-    inside = (rows >= 1) & (rows <= target.rows) & (columns >= 1) & (columns <= target.columns)
-    if inside.sum() < DOTS_NEEDED or len(np.unique(columns[inside])) < COLUMNS_NEEDED:
+    inside = (columns >= 1) & (columns <= target.columns)
+    spots, rows, columns = spots[inside], rows[inside], columns[inside]
+    if len(spots) < DOTS_NEEDED or len(np.unique(columns)) < COLUMNS_NEEDED:
         return None
-    xyz = dot_points(target, rows[inside], columns[inside])
+    floor = 0.25 * float(np.median(dots.height[spots]))
+    span = range(-target.rows, 2 * target.rows)
+    bend = 0.0
     try:
-        L, _ = dlt.solve_dlt_robust(xyz, px[inside], sigmas=3.0, floor=tolerance)
+        if not lens_known:
+            bend = _find_bend(dots[spots], dot_points(target, rows, columns))
+            dots = _straightened(dots, bend)
+        L, _ = dlt.solve_dlt_robust(dot_points(target, rows, columns), dots.px[spots], sigmas=3.0, floor=floor)
+        for _ in range(2):
+            spots, rows, columns = _match(dots, L, target, span, 60.0)
+            L, _ = dlt.solve_dlt_robust(dot_points(target, rows, columns), dots.px[spots], sigmas=3.0, floor=floor)
+        occupied = _occupied_rows(rows, columns)
+        if not occupied.size:
+            return None
+        L, _ = dlt.solve_dlt_robust(
+            dot_points(target, rows - occupied.min() + 1, columns), dots.px[spots], sigmas=3.0, floor=floor
+        )
         centre = Camera("", dlt.to_projection(L), (1, 1)).centre
     except (ComputationError, np.linalg.LinAlgError):
         return None
     if np.hypot(centre[0], centre[1]) <= target.radius_mm:
         return None
-    off = np.linalg.norm(dlt.residuals(L, xyz, px[inside]), axis=1)
-    cost = float(np.sum(np.minimum(off, tolerance) ** 2)) + tolerance**2 * int((~inside).sum())
     azimuth = math.degrees(math.atan2(centre[1], centre[0]))
-    return _Numbering(L, int((off < tolerance).sum()), cost, (azimuth - azimuth_deg + 180.0) % 360.0 - 180.0)
+    deviation = (azimuth - azimuth_deg + 180.0) % 360.0 - 180.0
+    return _Numbering(L, len(spots), deviation, int(np.ptp(occupied)) + 1, bend)
 
 
-def _match(dots: Dots, L: Array, target: Target, max_incidence_deg: float) -> tuple[Index, Index, Index]:
+def _find_bend(dots: Dots, xyz: Array) -> float:
+    """The bend after which a camera without distortion agrees best with the dots."""
+
+    def misfit(bend: float) -> float:
+        px = _straightened(dots, bend).px
+        return float(np.median(np.linalg.norm(dlt.residuals(dlt.solve_dlt(xyz, px), xyz, px), axis=1)))
+
+    return float(minimize_scalar(misfit, bounds=(-0.4, 0.4), method="bounded", options={"xatol": 1e-3}).x)
+
+
+def _occupied_rows(rows: Index, columns: Index) -> Index:
+    """Rows that hold dots in at least a third of the columns: a smudge above the target is not a row."""
+    number, count = np.unique(rows, return_counts=True)
+    return number[count >= max(2, len(np.unique(columns)) / 3)]
+
+
+def _match(
+    dots: Dots, L: Array, target: Target, all_rows: range, max_incidence_deg: float
+) -> tuple[Index, Index, Index]:
     """Spots that are where dots must be and as large as they must be: their indices, rows and columns."""
     camera = Camera("", dlt.to_projection(L), (1, 1))
-    rows, columns = (a.ravel() for a in np.mgrid[1 : target.rows + 1, 1 : target.columns + 1])
+    grid = np.mgrid[all_rows.start : all_rows.stop, 1 : target.columns + 1]
+    rows, columns = (axis.ravel() for axis in grid)
     xyz = dot_points(target, rows, columns)
     normals = xyz * np.array([1 / target.radius_mm, 1 / target.radius_mm, 0])
     seen = camera.incidence_cosine(xyz, normals) > math.cos(math.radians(max_incidence_deg))
     rows, columns, xyz = rows[seen], columns[seen], xyz[seen]
+    if not len(rows):
+        return (np.zeros(0, dtype=np.intp),) * 3
     expected = camera.project_undistorted(xyz)
     width, height = _projected_size(camera, xyz, target)
 
     distance, nearest = cKDTree(dots.px).query(expected)
     back = cKDTree(expected).query(dots.px)[1]
     ok = back[nearest] == np.arange(len(expected))
-    ok &= distance < np.minimum(width, height)
+    ok &= distance < np.maximum(_PLACE * np.minimum(width, height), 1.5)
     ok &= np.abs(dots.width[nearest] - width) < 0.3 * width + 3
     ok &= np.abs(dots.height[nearest] - height) < 0.3 * height + 3
     if ok.any():

@@ -1,0 +1,172 @@
+"""Every dot gets its own row and column: rendered cameras against truth, the real pair against MultiDIC's centroids."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from processing.calibration.dots import Dots, find_dots
+from processing.calibration.target import DotObservations, dot_points, identify
+from processing.errors import InputError
+from processing.rig import RigCamera, Target, read_rig
+
+REAL_TARGET = Target("dot-cylinder", 57.0, 20, 12.0, 10.0, 14, 12.0, 4.0)
+
+
+def grey(path: Path) -> np.ndarray:
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    return image
+
+
+@pytest.fixture(scope="module")
+def ring(shared_data):
+    """Target, cameras, their images, and true projections (12, 20, 30, 2) of the dots' centres."""
+    folder = shared_data / "rendered_ring" / "limb"
+    rig = read_rig(folder / "rig.toml")
+    images = {camera.id: grey(folder / "target" / f"{camera.id}.jpg") for camera in rig.cameras}
+    truth = np.load(folder / "target_truth.npz")["projected_px"]
+    return rig.target, rig.cameras, images, dict(zip(images, truth, strict=True))
+
+
+def distances(found: DotObservations, truth: np.ndarray) -> np.ndarray:
+    """From each dot to the true projection of the dot it is said to be, px."""
+    return np.linalg.norm(found.px - truth[found.rows - 1, found.columns - 1], axis=1)
+
+
+def test_points_of_the_target_follow_the_convention_of_the_world(shared_data):
+    reference = np.load(shared_data / "multidic_rig" / "reference.npz")["calib_object_xyz"]
+    rows, columns = np.mgrid[1:21, 1:15]
+    assert np.allclose(dot_points(REAL_TARGET, rows.ravel(), columns.ravel()).reshape(20, 14, 3), reference, atol=1e-9)
+
+
+def test_all_twelve_rendered_cameras_number_their_dots_rightly(ring):
+    target, cameras, images, truth = ring
+    for camera in cameras:
+        found = identify(find_dots(images[camera.id], target), target, camera.azimuth_deg, camera=camera.id)
+        assert len(found) >= 140
+        assert set(found.rows.tolist()) == set(range(1, 21))
+        # Neighbouring dots are 20 px and more apart; the centroid is not quite the centre's projection.
+        assert distances(found, truth[camera.id]).max() < 0.5
+        assert np.array_equal(found.xyz, dot_points(target, found.rows, found.columns))
+        assert abs(found.azimuth_deg - camera.azimuth_deg + 180) % 360 - 180 < 1.5
+
+
+@pytest.mark.parametrize("camera_index", [0, 3])  # the seam in view, and far from it
+def test_a_nominal_azimuth_is_enough_to_five_degrees(ring, camera_index):
+    target, cameras, images, truth = ring
+    camera: RigCamera = cameras[camera_index]
+    dots = find_dots(images[camera.id], target)
+    for offset in (-5.0, 5.0):
+        found = identify(dots, target, camera.azimuth_deg + offset, camera=camera.id)
+        assert distances(found, truth[camera.id]).max() < 0.5
+
+
+def test_an_azimuth_half_way_between_columns_is_refused_where_nothing_else_tells(ring):
+    target, _, images, _ = ring
+    dots = find_dots(images["cam_05"], target)
+    found = identify(dots, target, 120.0)
+    half_way = found.azimuth_deg + math.degrees(target.column_angle) / 2
+    with pytest.raises(InputError, match=r"camera x: its nominal azimuth .* half-way between two numberings"):
+        identify(dots, target, half_way, camera="x")
+
+
+def test_turned_images_give_the_same_dots(ring):
+    target, _, images, truth = ring
+    image, wanted = images["cam_02"], truth["cam_02"]
+    height, width = image.shape
+    turned = {
+        90: np.stack([height - 1 - wanted[..., 1], wanted[..., 0]], axis=-1),
+        180: np.array([width - 1, height - 1]) - wanted,
+        270: np.stack([wanted[..., 1], width - 1 - wanted[..., 0]], axis=-1),
+    }
+    for degrees, places in turned.items():
+        dots = find_dots(np.ascontiguousarray(np.rot90(image, -degrees // 90)), target)
+        found = identify(dots, target, 30.0, rotation_deg=degrees)
+        assert len(found) >= 140
+        assert distances(found, places).max() < 0.5
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.35])
+def test_small_images_serve(ring, scale):
+    target, _, images, truth = ring
+    small = cv2.resize(images["cam_05"], None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    factor = np.array(small.shape[::-1]) / np.array(images["cam_05"].shape[::-1])
+    found = identify(find_dots(small, target), target, 120.0)
+    assert len(found) >= 140
+    assert distances(found, (truth["cam_05"] + 0.5) * factor - 0.5).max() < 0.3
+
+
+def test_missing_dots_and_an_occluder_shift_no_number(ring):
+    target, _, images, truth = ring
+    dots = find_dots(images["cam_11"], target)
+    rng = np.random.default_rng(1)
+    left = dots[np.flatnonzero(rng.random(len(dots)) > 0.12)]
+    behind = np.abs(left.px - [690, 700]).max(axis=1) < 90
+    left = left[np.flatnonzero(~behind)]
+    found = identify(left, target, 300.0)
+    assert 90 < len(found) < 140
+    assert distances(found, truth["cam_11"]).max() < 0.5
+
+
+def test_stray_spots_are_no_dots(ring):
+    target, _, images, truth = ring
+    dots = find_dots(images["cam_08"], target)
+    rng = np.random.default_rng(4)
+    stray = Dots(
+        np.vstack([dots.px, rng.uniform([0, 0], dots.size, (300, 2))]),
+        np.append(dots.width, rng.uniform(8, 20, 300)),
+        np.append(dots.height, rng.uniform(8, 20, 300)),
+        np.append(dots.contrast, np.full(300, 0.9)),
+        dots.size,
+    )
+    found = identify(stray, target, 210.0)
+    assert len(found) >= 120
+    assert np.median(distances(found, truth["cam_08"])) < 0.2
+    assert np.mean(distances(found, truth["cam_08"]) < 0.5) > 0.97
+
+
+def test_a_hidden_or_miscounted_row_is_refused(ring):
+    target, _, images, _ = ring
+    image = images["cam_05"].copy()
+    image[:330] = 20
+    with pytest.raises(InputError, match=r"camera c: 19 rows of dots are seen .* says 20"):
+        identify(find_dots(image, target), target, 120.0, camera="c")
+    fewer = replace(target, rows=19)
+    with pytest.raises(InputError, match="20 rows of dots are seen"):
+        identify(find_dots(images["cam_05"], fewer), fewer, 120.0)
+
+
+def test_too_few_dots_are_counted_for_the_operator(ring, shared_data):
+    target, _, images, _ = ring
+    dots = find_dots(images["cam_05"], target)
+    with pytest.raises(InputError, match=r"camera 7: \d+ dots in \d+ columns .* at least 24 in 3 columns"):
+        identify(dots[np.arange(12)], target, 120.0, camera="7")
+    board = grey(shared_data / "rendered_ring/limb/board/cam_05/000.jpg")
+    with pytest.raises(InputError, match="0 dots in 0 columns"):
+        identify(find_dots(board, target), target, 120.0)
+
+
+@pytest.mark.parametrize(("camera", "azimuth"), [("201", 61.0), ("202", 92.0)])
+def test_the_real_pair_agrees_with_multidic_but_for_its_bias(shared_data, camera, azimuth):
+    folder = shared_data / "multidic_rig"
+    reference = np.load(folder / "reference.npz")
+    found = identify(find_dots(grey(folder / "calibration" / f"{camera}.jpg"), REAL_TARGET), REAL_TARGET, azimuth)
+    assert set(reference[f"calib_columns_{camera}"].tolist()) <= set(found.columns.tolist())
+    xyz = reference[f"calib_points_xyz_{camera}"]
+    same = np.linalg.norm(found.xyz[:, None] - xyz, axis=-1) < 1e-6
+    assert same.any(axis=0).mean() > 0.98
+    ours, theirs = np.nonzero(same)
+    # MultiDIC's centroids are a third of a pixel too small.
+    difference = found.px[ours] - (reference[f"calib_centroids_{camera}"][theirs] + 1 / 3)
+    assert np.abs(np.median(difference, axis=0)).max() < 0.04
+    assert np.abs(difference).max() < 0.4
+
+
+def test_observations_survive_json(ring):
+    target, _, images, _ = ring
+    found = identify(find_dots(images["cam_01"], target), target, 0.0, camera="cam_01")
+    assert DotObservations.from_dict(found.to_dict()).to_dict() == found.to_dict()
