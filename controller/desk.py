@@ -281,10 +281,10 @@ class Desk:
             self._end_round(started, state="refused", error=f"The capture failed: {error!r}; see the controller's log.")
             raise
         self._publish_capture(started.session, record["capture_id"])
-        self._end_round(started, state="closed", capture_id=record["capture_id"])
         if started.kind == "specimen" and not self._lacking(started.session):
             path = self.catalogue.path(started.session)
             self.jobs.submit(started.session, path, reason=record["capture_id"], automatic=True)
+        self._end_round(started, state="closed", capture_id=record["capture_id"])
 
     def _lacking(self, session: str) -> str | None:
         """What a session still needs to be processed, in words."""

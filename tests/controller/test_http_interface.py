@@ -135,8 +135,9 @@ def test_processing_starts_by_itself_after_the_first_step_and_not_before(client)
 
 def test_the_surface_has_the_stretch_that_was_put_in(processed) -> None:
     results = f"{API}/sessions/limb/results"
-    assert [run["run"] for run in processed.get(results).json()][0] == "0001"
-    run = processed.get(results).json()[-1]["run"]
+    runs = [run["run"] for run in processed.get(results).json()]
+    assert runs[0] == "0001"
+    run = runs[-1]
     header = processed.get(f"{results}/{run}").json()
     assert header["points"] == AROUND * ALONG
     assert header["steps"] == ["0003-specimen", "0004-specimen", "0005-specimen"]

@@ -1,0 +1,368 @@
+"""The operator's page in a real browser, over a real controller and real node processes on loopback."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+import uvicorn
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from controller.app import STATIC, create_app
+from controller.config import ControllerConfig
+from controller.desk import Desk
+from controller.service import SHUTDOWN_LIMIT, free_endpoint, open_desk
+
+pytestmark = pytest.mark.browser
+
+CAMERAS = ("01", "02", "03", "04")
+STAND_IN = Path(__file__).parents[1] / "controller" / "stand_in_processing.py"
+PACE = 1.0  # seconds that the stand-in's processing takes
+WAIT = 30_000  # ms; a loaded machine is slow
+ARGUMENTS = [
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+RIG_TOML = """
+[rig]
+name = "page-ring"
+[target]
+kind = "dot-cylinder"
+radius_mm = 57.0
+rows = 20
+row_spacing_mm = 12.0
+first_row_z_mm = 10.0
+columns = 14
+column_spacing_mm = 12.0
+dot_size_mm = 4.0
+[board]
+kind = "checkerboard"
+squares = [15, 20]
+square_mm = 10.0
+""" + "".join(f'[[cameras]]\nid = "{name}"\nazimuth_deg = {90.0 * i}\n' for i, name in enumerate(CAMERAS))
+
+
+@dataclass
+class Station:
+    """A running controller with its nodes."""
+
+    address: str
+    desk: Desk
+    folder: Path
+    config: ControllerConfig
+    nodes: dict[str, subprocess.Popen[bytes]]
+
+    def start_node(self, camera: str) -> None:
+        """Start the node process of a camera."""
+        config = self.folder / f"node-{camera}.toml"
+        config.write_text(
+            f'rig = "page-ring"\nid = "{camera}"\ncontroller = "{self.config.endpoint}"\n'
+            f'spool = "spool-{camera}"\ncamera = "pattern"\nstatus_s = 0.5\n[pattern]\nwidth = 120\nheight = 160\n'
+        )
+        command = [sys.executable, "-m", "node_agent.cli", "run", "--config", str(config)]
+        with (self.folder / f"node-{camera}.log").open("ab") as log:
+            self.nodes[camera] = subprocess.Popen(command, stdout=log, stderr=log)
+
+    def kill_node(self, camera: str) -> None:
+        """Kill the node process of a camera."""
+        self.nodes[camera].kill()
+        self.nodes[camera].wait(10)
+
+    def post(self, path: str, body: dict[str, Any]) -> Any:
+        """Ask the controller by HTTP."""
+        answer = httpx.post(f"{self.address}/api/v1/{path}", json=body, timeout=20)
+        answer.raise_for_status()
+        return answer.json()
+
+    def until(self, condition: Callable[[], object], what: str) -> None:
+        """Wait until a condition holds."""
+        deadline = time.monotonic() + WAIT / 1000
+        while not condition():
+            assert time.monotonic() < deadline, f"{what} never came about"
+            time.sleep(0.05)
+
+    def processed_session(self, name: str, steps: int = 3) -> None:
+        """A session of its own with results, made without the page."""
+        self.post("sessions", {"name": name})
+        for kind in ("board", "target", *["specimen"] * steps):
+            begun = self.post("captures", {"kind": kind})["id"]
+            self.until(lambda begun=begun: self.desk.round(begun).state == "closed", f"the {kind} capture")
+            self.until(lambda: all(job.finished for job in self.desk.jobs.list()), "the end of the jobs")
+
+
+@pytest.fixture(scope="module")
+def station(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Station]:
+    if not (STATIC / "index.html").is_file():
+        _skip_or_fail("the page is not bundled: install again without RINGDIC_SKIP_PAGE")
+    folder = tmp_path_factory.mktemp("station")
+    (folder / "rig.toml").write_text(RIG_TOML)
+    config = free_endpoint(ControllerConfig(archive=folder / "archive", rig=folder / "rig.toml"))
+
+    def command(session: Path) -> list[str]:
+        return [sys.executable, str(STAND_IN), str(session), "--seconds", str(PACE)]
+
+    with open_desk(config, command) as desk, socket.create_server(("127.0.0.1", 0)) as listener:
+        server = uvicorn.Server(
+            uvicorn.Config(create_app(desk), log_level="warning", timeout_graceful_shutdown=SHUTDOWN_LIMIT)
+        )
+        thread = threading.Thread(target=server.run, args=([listener],))
+        thread.start()
+        made = Station(f"http://127.0.0.1:{listener.getsockname()[1]}", desk, folder, config, {})
+        try:
+            for camera in CAMERAS:
+                made.start_node(camera)
+            made.until(lambda: not desk.missing_nodes(), "every node's appearance")
+            yield made
+        finally:
+            server.should_exit = True
+            thread.join(10)
+            for process in made.nodes.values():
+                process.terminate()
+            for process in made.nodes.values():
+                try:
+                    process.wait(10)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Browser]:
+    path = shutil.which("chromium") or shutil.which("chromium-browser")
+    if path is None:
+        _skip_or_fail("no Chromium on this machine: install the package 'chromium'")
+    as_root = hasattr(os, "geteuid") and os.geteuid() == 0
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=path, args=ARGUMENTS + ["--no-sandbox"] * as_root, timeout=60_000
+        )
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def page(chromium: Browser, station: Station) -> Iterator[Page]:
+    """The page, opened; whatever the browser complains about fails the test."""
+    complaints: list[str] = []
+    context = chromium.new_context(viewport={"width": 1440, "height": 900})
+    context.set_default_timeout(WAIT)
+    opened = context.new_page()
+    opened.on("pageerror", lambda error: complaints.append(str(error)))
+    opened.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+    opened.goto(station.address)
+    expect(opened.locator("#live")).to_have_text("live", timeout=WAIT)
+    yield opened
+    context.close()
+    unexpected = [text for text in complaints if "409" not in text and "422" not in text]
+    assert not unexpected, unexpected
+
+
+def _skip_or_fail(reason: str) -> None:
+    if os.environ.get("RINGDIC_REQUIRE_DATA"):
+        pytest.fail(reason)
+    pytest.skip(reason)
+
+
+def drawn(page: Page) -> np.ndarray:
+    """The pixels of the surface, (h, w, 4) blue, green, red, opacity."""
+    address = page.evaluate("document.getElementById('surface').toDataURL('image/png')")
+    png = np.frombuffer(base64.b64decode(address.split(",")[1]), np.uint8)
+    return cv2.imdecode(png, cv2.IMREAD_UNCHANGED)
+
+
+def opaque(pixels: np.ndarray) -> np.ndarray:
+    """(n, 3) blue, green, red of the pixels where something is drawn."""
+    return pixels[pixels[..., 3] > 0][:, :3].astype(int)
+
+
+def shown(page: Page, what: str) -> np.ndarray:
+    """The pixels once the page shows ``field/step/removed``."""
+    expect(page.locator("#surface")).to_have_attribute("data-shown", what, timeout=WAIT)
+    return drawn(page)
+
+
+def ticks(page: Page) -> list[float]:
+    return [float(text) for text in page.locator("#legend .tick").all_text_contents()]
+
+
+def test_an_operator_presses_the_buttons_and_sees_the_strain(page: Page, station: Station) -> None:
+    """From no session to the surface in colour, by buttons alone."""
+    expect(page.locator("#capture-board")).to_be_disabled()
+    expect(page.locator("#capture-status")).to_contain_text("no session yet")
+    page.fill("#session-name", "by-hand")
+    page.click("#session-create")
+    expect(page.locator("#session-select")).to_have_value("by-hand", timeout=WAIT)
+    expect(page.locator("#nodes .node.gone")).to_have_count(0)
+    expect(page.locator("#nodes .node")).to_have_count(len(CAMERAS))
+    for name in ("0001-board", "0002-target", "0003-specimen", "0004-specimen"):
+        button = page.locator(f"#capture-{name[5:]}")
+        expect(button).to_be_enabled(timeout=WAIT)
+        button.click()
+        listed = page.locator(f"[data-capture='{name}'][data-state='closed']")
+        expect(listed).to_contain_text(f"{len(CAMERAS)} ok", timeout=WAIT)
+        expect(listed).to_contain_text("skew")
+    expect(page.locator("#job .job-state")).to_have_text("running", timeout=WAIT)
+    expect(page.locator("#job .job-pace")).to_contain_text("1000 points/s")
+    expect(page.locator("#job .job-state")).to_have_text("done", timeout=WAIT)
+    pixels = opaque(shown(page, "lambda2/1/false"))
+    assert len(pixels) > 10_000
+    blue, _, red = np.median(pixels, axis=0)
+    assert red > 2 * blue  # the tube is stretched by 10 %, and red is more than 1
+    expect(page.locator("#legend .legend-title")).to_contain_text("λ2")
+    assert min(ticks(page)) == pytest.approx(0.9)
+    assert max(ticks(page)) == pytest.approx(1.1)
+    expect(page.locator("#table")).to_contain_text("larger stretch")
+
+
+def test_the_images_of_a_capture_can_be_looked_at_and_had(page: Page, station: Station) -> None:
+    station.post("sessions", {"name": "pictures"})
+    expect(page.locator("#session-select")).to_have_value("pictures", timeout=WAIT)
+    page.locator("#capture-board").click()
+    capture = page.locator("[data-capture='0001-board'][data-state='closed']")
+    expect(capture).to_be_visible(timeout=WAIT)
+    capture.locator("summary").click()
+    images = capture.locator(".thumb img")
+    expect(images).to_have_count(len(CAMERAS))
+    page.wait_for_function("[...document.querySelectorAll('.thumb img')].every((image) => image.naturalWidth > 0)")
+    capture.get_by_role("button", name="Show camera 02").click()
+    expect(page.locator("#picture")).to_be_visible()
+    expect(page.locator("#picture-title")).to_have_text("0001-board, camera 02")
+    with page.expect_download() as download:
+        page.click("#picture-original")
+    record = station.desk.catalogue.capture("pictures", "0001-board")["cameras"]["02"]
+    assert hashlib.sha256(Path(download.value.path()).read_bytes()).hexdigest() == record["sha256"]
+    page.click("#picture-close")
+    expect(page.locator("#picture")).to_be_hidden()
+
+
+def test_every_control_of_the_results_does_what_it_says(page: Page, station: Station) -> None:
+    station.processed_session("controls")
+    page.select_option("#session-select", "controls")
+    at_2 = shown(page, "lambda2/2/false")
+    assert max(ticks(page)) == pytest.approx(1.2)
+
+    page.locator("#step").fill("0")
+    at_0 = opaque(shown(page, "lambda2/0/false"))
+    assert (np.ptp(np.median(at_0, axis=0))) < 12  # no stretch: neither red nor blue
+    expect(page.locator("#step-name")).to_contain_text("reference")
+
+    page.locator("#step").fill("2")
+    page.select_option("#field", "displacement_z")
+    height = shown(page, "displacement_z/2/false")
+    assert (height != at_2).any()
+    expect(page.locator("#legend .legend-title")).to_contain_text("mm")
+    rows = np.flatnonzero((height[..., 3] > 0).any(axis=1))
+    top, bottom = (opaque(height[rows[k] : rows[k] + 5]) for k in (len(rows) // 6, 5 * len(rows) // 6))
+    assert (top[:, 2] - top[:, 0]).mean() > (bottom[:, 2] - bottom[:, 0]).mean() + 40  # redder where it moved more
+
+    page.select_option("#field", "displacement_x")
+    turned = shown(page, "displacement_x/2/false")
+    page.check("#rigid")
+    assert np.ptp(opaque(turned)[:, 2]) > 100  # one side moves towards, the other away
+    shown(page, "displacement_x/2/true")
+    page.fill("#low", "-10")
+    page.fill("#high", "10")
+    page.press("#high", "Enter")
+    expect(page.locator("#legend .tick").last).to_have_text("10")
+    assert np.ptp(np.median(opaque(drawn(page)), axis=0)) < 12  # nothing is left of the turn
+    page.fill("#high", "-11")
+    page.press("#high", "Enter")
+    expect(page.locator("#notice")).to_contain_text("limits")
+    page.click("#auto")
+    assert max(ticks(page)) < 1
+    page.uncheck("#rigid")
+
+    page.click("#reset-view")  # the view was made for the first run
+    page.select_option("#field", "correlation")
+    before = shown(page, "correlation/2/false")
+    box = page.locator("#surface").bounding_box()
+    assert box is not None
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(*middle)
+    expect(page.locator("#pick")).to_contain_text("0.02", timeout=WAIT)
+    page.mouse.down()
+    page.mouse.move(middle[0] + 150, middle[1] + 120, steps=4)
+    page.mouse.up()
+    page.wait_for_timeout(200)
+    assert (drawn(page) != before).any()
+    page.click("#reset-view")
+    page.wait_for_timeout(200)
+    assert (drawn(page) != before).any(axis=-1).mean() < 0.002
+
+    page.click("#play")
+    expect(page.locator("#step")).to_have_value("1", timeout=WAIT)
+    page.click("#play")
+    expect(page.locator("#play")).to_have_attribute("aria-pressed", "false")
+
+    runs = page.locator("#run option")
+    last = runs.first.get_attribute("value")
+    assert runs.count() == 2  # after the first step and after the second
+    page.select_option("#run", "0001")
+    expect(page.locator("#step")).to_have_attribute("max", "1", timeout=WAIT)
+    page.select_option("#run", last)
+    expect(page.locator("#step")).to_have_attribute("max", "2", timeout=WAIT)
+    with page.expect_download() as download:
+        page.click("#download")
+    assert Path(download.value.path()).read_bytes()[1:4] == b"HDF"
+
+
+def test_processing_is_started_watched_and_cancelled(page: Page, station: Station) -> None:
+    station.processed_session("again", steps=2)
+    expect(page.locator("#session-select")).to_have_value("again", timeout=WAIT)
+    expect(page.locator("#job .job-state")).to_have_text("done", timeout=WAIT)
+    page.locator("#job-log-box summary").click()
+    expect(page.locator("#job-log")).to_contain_text("the tube is computed")
+    page.click("#job-start")
+    expect(page.locator("#job .job-state")).to_have_text("running", timeout=WAIT)
+    expect(page.locator("#job-start")).to_be_disabled()
+    page.click("#job-cancel")
+    expect(page.locator("#job .job-state")).to_have_text("cancelled", timeout=WAIT)
+    expect(page.locator("#job-cancel")).to_be_hidden()
+    expect(page.locator("#job-start")).to_be_enabled()
+
+
+def test_a_dead_node_is_seen_named_and_can_be_left_out(page: Page, station: Station) -> None:
+    station.post("sessions", {"name": "without-03"})
+    expect(page.locator("#session-select")).to_have_value("without-03", timeout=WAIT)
+    station.kill_node("03")
+    try:
+        expect(page.locator("[data-node='03']")).to_contain_text("not there", timeout=WAIT)
+        expect(page.locator("#capture-board")).to_be_disabled()
+        expect(page.locator("#capture-status")).to_contain_text("Camera 03")
+        page.check("#override")
+        page.locator("#capture-board").click()
+        capture = page.locator("[data-capture='0001-board'][data-state='closed']")
+        expect(capture).to_contain_text("3 ok", timeout=WAIT)
+        expect(capture).to_contain_text("1 failed")
+        capture.locator("summary").click()
+        expect(capture.locator(".camera.failed small")).not_to_be_empty()
+    finally:
+        station.start_node("03")
+    expect(page.locator("[data-node='03']")).not_to_contain_text("not there", timeout=WAIT)
+
+
+def test_a_name_that_is_taken_is_told_and_the_page_fits_a_narrow_window(page: Page, station: Station) -> None:
+    station.post("sessions", {"name": "taken"})
+    page.fill("#session-name", "taken")
+    page.press("#session-name", "Enter")
+    expect(page.locator("#notice")).to_contain_text("already")
+    page.set_viewport_size({"width": 420, "height": 900})
+    assert page.evaluate("document.documentElement.scrollWidth") <= 420
