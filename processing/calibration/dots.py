@@ -1,7 +1,7 @@
 """Dark dots on a white surface, found in an image and measured to a hundredth of a pixel.
 
 The position of a dot is the centroid of its missing light: in linear light, with a plane ``W`` fitted to the white
-around it, ``q = 1 − I / W``, small q set to zero, position = Σ q x / Σ q.
+around it, ``q = 1 − I / W`` with the extremes flattened, position = Σ q x / Σ q.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ _SEARCH_SIZE = 1640
 _SEARCH_CONTRAST = 0.25
 #: Missing light that is certainly the dot's.
 _SPOT_CONTRAST = 0.2
-#: Missing light below so many standard deviations of the white, but no more than this, counts as none.
-_NOISE_SIGMAS, _LARGEST_NOISE = 2.5, 0.06
+#: Parts of a dot's full missing light that count as none and as all: what lies beyond is noise, texture or sheen.
+_EMPTY, _FULL = 0.05, 0.95
 
 
 @dataclass(frozen=True)
@@ -139,15 +139,15 @@ def _measure(light: Grey, box: NDArray[np.intp]) -> tuple[float, float, float, f
     spot = labels == counts.argmax()
     # The blurred edge belongs to the dot: leaving out its faint pixels would draw the centroid to the full ones.
     reach = cv2.dilate(spot.astype(np.uint8), np.ones((2 * edge + 1,) * 2, np.uint8)).astype(bool)
-    noise = min(_NOISE_SIGMAS * float(np.std(missing[white])), _LARGEST_NOISE)
-    q = np.where(reach & (missing > noise), missing, 0.0)
+    full = float(np.median(missing[spot]))
+    q = np.where(reach, np.clip((missing / full - _EMPTY) / (_FULL - _EMPTY), 0.0, 1.0), 0.0)
     total = q.sum()
     return (
         x0 + float((q * columns).sum() / total),
         y0 + float((q * rows).sum() / total),
         float(w),
         float(h),
-        float(np.median(missing[spot])),
+        full,
     )
 
 

