@@ -1,0 +1,12 @@
+"""A ring of cameras about a body whose every motion is known: rendered images with exact truth.
+
+The renderer is an independent check of the processing and shares no camera mathematics with it. Conventions are the
+same: mm, z up the axis of the target, pixel (0, 0) at the centre of the top-left pixel, cameras look along +z.
+
+``rig``       the cameras of the paper's ring, scattered as real ones are
+``lens``      one camera: pose, intrinsics with skew, distortion and its inverse
+``scenes``    what stands in the ring: board, target, cylinder, limb, each with its truth
+``texture``   speckles, dots and digits as distances in surface coordinates, averaged over a pixel's footprint
+``render``    rays from pixels to surfaces
+``sensor``    point spread, vignetting, noise, gamma, 8 bits
+"""

@@ -1,0 +1,102 @@
+"""The surfaces of the bodies as smooth maps from material coordinates (theta, z) to space, with their derivatives.
+
+A body is an array of parameters: ``[kind, radius, x, y, z, q]`` with kind 0 a cylinder displaced by (x, y, z) and
+kind 1 the limb at load q. Material coordinates are those of the reference: the angle in rad, the height in mm.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+CYLINDER, LIMB = 0.0, 1.0
+MIDDLE = 125.0  # mm, half the height of the body
+# At load 1: bulge, twist over half the height (rad), axial stretch, its waviness (mm), bend at the ends (mm).
+_BULGE, _TWIST, _STRETCH, _WAVE, _BEND = 0.10, 0.10, 0.05, 3.0, 5.0
+_BEND_X, _BEND_Y = math.cos(0.7), math.sin(0.7)
+
+
+@nb.njit(cache=True, nogil=True)
+def _profile(theta, z):  # type: ignore[no-untyped-def]
+    """Reference radius of the limb and its derivatives by theta and z: a calf, 9 mm outside to 10 mm inside 57 mm."""
+    u = (z - 165.0) / 60.0
+    calf = 6.0 * math.exp(-u * u)
+    side = 1.0 + 0.5 * math.cos(theta - 2.0)
+    r = 54.0 + 5.0 * (z - MIDDLE) / MIDDLE + calf * side + 1.5 * math.cos(2.0 * (theta - 0.5))
+    by_theta = -0.5 * calf * math.sin(theta - 2.0) - 3.0 * math.sin(2.0 * (theta - 0.5))
+    by_z = 5.0 / MIDDLE - calf * side * 2.0 * u / 60.0
+    return r, by_theta, by_z
+
+
+@nb.njit(cache=True, nogil=True)
+def point(theta, z, p):  # type: ignore[no-untyped-def]
+    """Position and its derivatives: x y z, d/dtheta x y z, d/dz x y z."""
+    if p[0] == CYLINDER:
+        c, s = math.cos(theta), math.sin(theta)
+        r = p[1]
+        return r * c + p[2], r * s + p[3], z + p[4], -r * s, r * c, 0.0, 0.0, 0.0, 1.0
+    q = p[5]
+    r0, r0_t, r0_z = _profile(theta, z)
+    w = (z - 140.0) / 70.0
+    swell = _BULGE * q * math.exp(-w * w)
+    lobe = 1.0 + 0.3 * math.cos(theta - 2.0)
+    grow = 1.0 + swell * lobe
+    r = r0 * grow
+    r_t = r0_t * grow - r0 * swell * 0.3 * math.sin(theta - 2.0)
+    r_z = r0_z * grow - r0 * swell * lobe * 2.0 * w / 70.0
+    zeta = (z - MIDDLE) / MIDDLE
+    a = theta + _TWIST * q * zeta
+    c, s = math.cos(a), math.sin(a)
+    a_z = _TWIST * q / MIDDLE
+    bend = _BEND * q * zeta * zeta
+    bend_z = 2.0 * _BEND * q * zeta / MIDDLE
+    height = MIDDLE + (z - MIDDLE) * (1.0 + _STRETCH * q) + _WAVE * q * math.sin(math.pi * zeta)
+    height_z = 1.0 + _STRETCH * q + _WAVE * q * math.pi / MIDDLE * math.cos(math.pi * zeta)
+    return (
+        r * c + bend * _BEND_X,
+        r * s + bend * _BEND_Y,
+        height,
+        r_t * c - r * s,
+        r_t * s + r * c,
+        0.0,
+        r_z * c - r * s * a_z + bend_z * _BEND_X,
+        r_z * s + r * c * a_z + bend_z * _BEND_Y,
+        height_z,
+    )
+
+
+@nb.njit(cache=True, nogil=True)
+def points(theta, z, p, out):  # type: ignore[no-untyped-def]
+    """Positions and derivatives of many points: out (n, 9)."""
+    for i in range(len(theta)):
+        out[i] = point(theta[i], z[i], p)
+
+
+@nb.njit(cache=True, nogil=True)
+def nearest(xyz, p, out):  # type: ignore[no-untyped-def]
+    """Nearest surface points of xyz (n, 3), by Gauss-Newton: out (n, 3) theta, z, signed distance, outside positive."""
+    for i in range(len(xyz)):
+        x, y, h = xyz[i]
+        theta = math.atan2(y - p[3], x - p[2])
+        z = h - p[4]
+        for _ in range(60):
+            px, py, pz, tx, ty, tz, zx, zy, zz = point(theta, z, p)
+            ex, ey, ez = x - px, y - py, h - pz
+            a, b, d = tx * tx + ty * ty + tz * tz, tx * zx + ty * zy + tz * zz, zx * zx + zy * zy + zz * zz
+            f, g = tx * ex + ty * ey + tz * ez, zx * ex + zy * ey + zz * ez
+            det = a * d - b * b
+            step_theta, step_z = (d * f - b * g) / det, (a * g - b * f) / det
+            theta += step_theta
+            z += step_z
+            if abs(step_theta) < 1e-13 and abs(step_z) < 1e-11:
+                break
+        px, py, pz, tx, ty, tz, zx, zy, zz = point(theta, z, p)
+        nx, ny, nz = ty * zz - tz * zy, tz * zx - tx * zz, tx * zy - ty * zx
+        out[i, 0] = theta
+        out[i, 1] = z
+        out[i, 2] = (nx * (x - px) + ny * (y - py) + nz * (h - pz)) / math.sqrt(nx * nx + ny * ny + nz * nz)

@@ -1,0 +1,281 @@
+"""Images of the scenes: for every sample of every pixel the ray, what it meets, and how bright that is.
+
+A pixel is the mean of ``samples``² squares; within each the print is averaged over the sample's footprint on the
+surface. Radiance is linear, 1 saturates.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from node_agent.virtual_rig.body import CYLINDER, point
+from node_agent.virtual_rig.lens import VirtualCamera, ideal
+from node_agent.virtual_rig.scenes import Board, Scene, Specimen, Target
+from node_agent.virtual_rig.scenes.board import MARGIN, SQUARE, SQUARES
+from node_agent.virtual_rig.sensor import expose
+from node_agent.virtual_rig.texture import RADIUS, checker, dots, speckle
+
+Array = NDArray[np.float64]
+Radiance = NDArray[np.float32]
+
+SAMPLES = 2
+_WHITE, _BLACK, _SKIN, _BASE = 0.80, 0.05, 0.30, 0.03  # reflectance times exposure
+_TARGET_TOP, _BASE_RADIUS, _BASE_BOTTOM = 250.0, 66.0, -35.0  # mm
+_PRINT_SPECKLE, _PRINT_DOTS = 0, 1
+
+
+def render(camera: VirtualCamera, scene: Scene, seed: int = 0) -> NDArray[np.uint8]:
+    """The image (height, width) of a scene as a camera delivers it; ``seed`` is that of the sensor's noise."""
+    return expose(radiance(camera, scene), seed)
+
+
+def radiance(camera: VirtualCamera, scene: Scene) -> Radiance:
+    """The noise-free, unblurred image (height, width) of a scene, in linear light."""
+    out = np.zeros((camera.height, camera.width), np.float32)
+    if isinstance(scene, Board):
+        R, t = scene.pose(camera)
+        _render_board(camera.lens, camera.R, camera.centre, R, t, out)
+        return out
+    if isinstance(scene, Target):
+        look = np.array([_PRINT_DOTS, 0.0, 0.0, 0.0, _TARGET_TOP])
+    else:
+        look = np.array([_PRINT_SPECKLE, *scene.band, *_extent(scene)])
+    seed = scene.seed if isinstance(scene, Specimen) else 0
+    _render_body(camera.lens, camera.R, camera.centre, scene.body(), look, seed, out)
+    return out
+
+
+def _extent(scene: Specimen) -> tuple[float, float]:
+    """Lowest and highest z of the body, mm: a limb goes on beyond the picture."""
+    return (0.0, _TARGET_TOP) if scene.body()[0] == CYLINDER else (-120.0, 420.0)
+
+
+@nb.njit(cache=True, nogil=True)
+def _background(o, d):  # type: ignore[no-untyped-def]
+    """A dark room with rings of LED strips at the cameras' radius."""
+    a = d[0] * d[0] + d[1] * d[1]
+    b = o[0] * d[0] + o[1] * d[1]
+    c = o[0] * o[0] + o[1] * o[1] - 380.0 * 380.0
+    t = (-b + math.sqrt(max(b * b - a * c, 0.0))) / a
+    h = o[2] + t * d[2]
+    arc = 380.0 * math.atan2(o[1] + t * d[1], o[0] + t * d[0])
+    value = 0.010 + 0.00002 * max(0.0, 300.0 - abs(h - 60.0))
+    for centre in (-12.0, 40.0, 150.0, 165.0, 215.0):
+        off = abs(h - centre)
+        if off < 5.0:
+            value = 1.1 if off < 3.0 and math.sin(arc * 0.9) > -0.6 else 0.75
+        else:
+            value += 0.03 / (1.0 + ((off - 5.0) / 6.0) ** 2)
+    if h < -40.0:
+        value += 0.02 * (1.0 + 0.3 * math.sin(0.35 * h + 0.02 * arc))
+    return value
+
+
+@nb.njit(cache=True, nogil=True)
+def _lit(cosine):  # type: ignore[no-untyped-def]
+    """How bright a surface is under light from all around, by the cosine of its incidence."""
+    return 0.40 + 0.60 * cosine
+
+
+@nb.njit(cache=True, nogil=True)
+def _on_cylinder(o, d, radius, x, y):  # type: ignore[no-untyped-def]
+    """Distance along the ray to the nearer wall of an upright cylinder about (x, y), or -1."""
+    ox, oy = o[0] - x, o[1] - y
+    a = d[0] * d[0] + d[1] * d[1]
+    b = ox * d[0] + oy * d[1]
+    root = b * b - a * (ox * ox + oy * oy - radius * radius)
+    return (-b - math.sqrt(root)) / a if root > 0.0 else -1.0
+
+
+@nb.njit(cache=True, nogil=True)
+def _newton(o, d, p, theta, z, t):  # type: ignore[no-untyped-def]
+    """Where the ray meets the body near a start: theta, z, t and whether it does, from the front."""
+    for _ in range(12):
+        x, y, h, tx, ty, tz, zx, zy, zz = point(theta, z, p)
+        ex, ey, ez = o[0] + t * d[0] - x, o[1] + t * d[1] - y, o[2] + t * d[2] - h
+        # Solve [T Z -d] (dtheta, dz, dt) = e by Cramer's rule.
+        nx, ny, nz = ty * zz - tz * zy, tz * zx - tx * zz, tx * zy - ty * zx
+        det = -(nx * d[0] + ny * d[1] + nz * d[2])
+        if det == 0.0:
+            return theta, z, t, False
+        dt = (nx * ex + ny * ey + nz * ez) / det
+        fx, fy, fz = ex + dt * d[0], ey + dt * d[1], ez + dt * d[2]
+        a, b, c = tx * tx + ty * ty + tz * tz, tx * zx + ty * zy + tz * zz, zx * zx + zy * zy + zz * zz
+        g, k = tx * fx + ty * fy + tz * fz, zx * fx + zy * fy + zz * fz
+        area = a * c - b * b
+        dtheta, dz = (c * g - b * k) / area, (a * k - b * g) / area
+        dtheta = min(0.5, max(-0.5, dtheta))
+        theta += dtheta
+        z += dz
+        t += dt
+        if abs(dtheta) < 1e-10 and abs(dz) < 1e-8:
+            return theta, z, t, det > 0.0 and t > 0.0
+    return theta, z, t, False
+
+
+@nb.njit(cache=True, nogil=True)
+def _meet(o, d, p, near, theta, z, t):  # type: ignore[no-untyped-def]
+    """Where a ray meets the body first. near : whether theta, z, t are those of a ray close by."""
+    if p[0] == CYLINDER:
+        t = _on_cylinder(o, d, p[1], p[2], p[3])
+        if t < 0.0:
+            return theta, z, t, False
+        return math.atan2(o[1] + t * d[1] - p[3], o[0] + t * d[0] - p[2]), o[2] + t * d[2] - p[4], t, True
+    if near:
+        theta, z, t, met = _newton(o, d, p, theta, z, t)
+        if met:
+            return theta, z, t, True
+    for radius in (70.0, 60.0, 50.0):
+        t = _on_cylinder(o, d, radius, 0.0, 0.0)
+        if t > 0.0:
+            theta = math.atan2(o[1] + t * d[1], o[0] + t * d[0])
+            theta, z, t, met = _newton(o, d, p, theta, o[2] + t * d[2], t)
+            if met:
+                return theta, z, t, True
+    return theta, z, t, False
+
+
+@nb.njit(cache=True, nogil=True)
+def _shade(o, d, p, look, seed, theta, z, t, per_x, per_y):  # type: ignore[no-untyped-def]
+    """Brightness of the body where a ray meets it. per_x, per_y : width of a sample at distance 1."""
+    _, _, _, tx, ty, tz, zx, zy, zz = point(theta, z, p)
+    nx, ny, nz = ty * zz - tz * zy, tz * zx - tx * zz, tx * zy - ty * zx
+    size = math.sqrt(nx * nx + ny * ny + nz * nz)
+    length = math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    cosine = max(0.02, -(nx * d[0] + ny * d[1] + nz * d[2]) / (size * length))
+    along = math.sqrt(tx * tx + ty * ty + tz * tz)
+    flat = -(nx * d[0] + ny * d[1]) / (math.sqrt(nx * nx + ny * ny) * math.sqrt(d[0] * d[0] + d[1] * d[1]))
+    ws = t * per_x * RADIUS / along / max(0.05, flat)
+    wz = t * per_y / math.sqrt(zx * zx + zy * zy + zz * zz)
+    s = (theta - 2.0 * math.pi * math.floor(theta / (2.0 * math.pi))) * RADIUS
+    light = _lit(cosine) * (1.0 - 0.0006 * abs(z - 130.0))
+    if look[0] == _PRINT_DOTS:
+        dark = dots(s, z, ws, wz)
+        return light * (_WHITE + dark * (_BLACK - _WHITE))
+    if p[0] == CYLINDER or look[1] + 6.0 < z < look[2] - 6.0:
+        dark = speckle(s, z, ws, wz, seed) if look[1] < z < look[2] else 0.0
+        return light * (_WHITE + dark * (_BLACK - _WHITE))
+    ragged = 2.0 * math.sin(5.0 * theta) + 1.3 * math.sin(13.0 * theta + 1.0) + 0.6 * math.sin(31.0 * theta)
+    low, high = look[1] - 3.0 + 0.5 * ragged, look[2] + 3.0 + 0.5 * ragged
+    if z < low or z > high:
+        return light * _SKIN * (1.0 + 0.03 * math.sin(0.8 * z + 3.0 * math.sin(4.0 * theta)))
+    dark = 0.0
+    if look[1] < z < look[2]:
+        dark = speckle(s, z, ws, wz, seed)
+    return light * (_WHITE + dark * (_BLACK - _WHITE))
+
+
+@nb.njit(cache=True, nogil=True)
+def _to_world(R, x, y, d):  # type: ignore[no-untyped-def]
+    """The direction (x, y, 1) of the camera's frame in the world, written to d."""
+    for i in range(3):
+        d[i] = R[0, i] * x + R[1, i] * y + R[2, i]
+
+
+@nb.njit(cache=True, nogil=True)
+def _render_body(lens, R, o, p, look, seed, out):  # type: ignore[no-untyped-def]
+    """A body on its base before the room. look : print, band from, to, bottom, top."""
+    height, width = out.shape
+    d = np.empty(3)
+    share = 1.0 / SAMPLES
+    per_x, per_y = share / lens[0], share / lens[1]
+    x = y = first_x = first_y = 0.0
+    for v in range(height):
+        theta = z = t = 0.0
+        near = False
+        if v > 0:  # the first pixel of the row above is a good start
+            x, y = first_x, first_y
+        for u in range(width):
+            x, y, xu, xv, yu, yv = ideal(u, v, lens, x, y)
+            if u == 0:
+                first_x, first_y = x, y
+            _to_world(R, x, y, d)
+            if _on_cylinder(o, d, 95.0, 0.0, 0.0) < 0.0:  # far beside the body
+                out[v, u] = _background(o, d)
+                near = False
+                continue
+            total = 0.0
+            for k in range(SAMPLES * SAMPLES):
+                a = (k % SAMPLES + 0.5) * share - 0.5
+                b = (k // SAMPLES + 0.5) * share - 0.5
+                _to_world(R, x + a * xu + b * xv, y + a * yu + b * yv, d)
+                theta, z, t, near = _meet(o, d, p, near, theta, z, t)
+                if near and look[3] <= z <= look[4]:
+                    total += _shade(o, d, p, look, seed, theta, z, t, per_x, per_y)
+                else:
+                    total += _behind(o, d, p)
+            out[v, u] = total * share * share
+
+
+@nb.njit(cache=True, nogil=True)
+def _behind(o, d, p):  # type: ignore[no-untyped-def]
+    """The base below a cylinder, else the room."""
+    if p[0] == CYLINDER:
+        t = _on_cylinder(o, d, _BASE_RADIUS, 0.0, 0.0)
+        if t > 0.0:
+            h = o[2] + t * d[2]
+            if _BASE_BOTTOM < h < 0.0:
+                return _BASE
+            if h >= 0.0 and d[2] < 0.0:  # onto the top of the base
+                t = -o[2] / d[2]
+                x, y = o[0] + t * d[0], o[1] + t * d[1]
+                if x * x + y * y < _BASE_RADIUS * _BASE_RADIUS:
+                    return 2.0 * _BASE
+    return _background(o, d)
+
+
+@nb.njit(cache=True, nogil=True)
+def _board_sample(x, y, o, R, d, Rb, tb, per_x, per_y):  # type: ignore[no-untyped-def]
+    """Brightness along one ray (x, y, 1) of the camera's frame, and how far outside the sheet it passes, squares."""
+    slope = Rb[0, 2] * x + Rb[1, 2] * y + Rb[2, 2]
+    depth = (Rb[0, 2] * tb[0] + Rb[1, 2] * tb[1] + Rb[2, 2] * tb[2]) / slope
+    px, py, pz = depth * x - tb[0], depth * y - tb[1], depth - tb[2]
+    bx = (Rb[0, 0] * px + Rb[1, 0] * py + Rb[2, 0] * pz) / SQUARE
+    by = (Rb[0, 1] * px + Rb[1, 1] * py + Rb[2, 1] * pz) / SQUARE
+    outside = (
+        max(abs(bx - SQUARES[0] / 2) - SQUARES[0] / 2, abs(by - SQUARES[1] / 2) - SQUARES[1] / 2) - MARGIN / SQUARE
+    )
+    if outside > 0.0 or depth < 0.0:
+        _to_world(R, x, y, d)
+        return _background(o, d), outside
+    # Footprint of the sample: derivatives of the board's coordinates by x and y.
+    across = Rb[0, 0] * x + Rb[1, 0] * y + Rb[2, 0]
+    along = Rb[0, 1] * x + Rb[1, 1] * y + Rb[2, 1]
+    gx, gy = Rb[0, 2] / slope, Rb[1, 2] / slope
+    ux, uy = depth * per_x / SQUARE, depth * per_y / SQUARE
+    wx = abs(Rb[0, 0] - gx * across) * ux + abs(Rb[1, 0] - gy * across) * uy
+    wy = abs(Rb[0, 1] - gx * along) * ux + abs(Rb[1, 1] - gy * along) * uy
+    cosine = abs(slope) / math.sqrt(x * x + y * y + 1.0)
+    return _lit(cosine) * (_WHITE + checker(bx, by, wx, wy) * (_BLACK - _WHITE)), outside
+
+
+@nb.njit(cache=True, nogil=True)
+def _render_board(lens, R, o, Rb, tb, out):  # type: ignore[no-untyped-def]
+    """The sheet with the checkerboard before the room; Rb, tb take the board's frame to the camera's."""
+    height, width = out.shape
+    d = np.empty(3)
+    share = 1.0 / SAMPLES
+    per_x, per_y = share / lens[0], share / lens[1]
+    x = y = first_x = first_y = 0.0
+    for v in range(height):
+        if v > 0:
+            x, y = first_x, first_y
+        for u in range(width):
+            x, y, xu, xv, yu, yv = ideal(u, v, lens, x, y)
+            if u == 0:
+                first_x, first_y = x, y
+            total, outside = _board_sample(x, y, o, R, d, Rb, tb, per_x, per_y)
+            if outside > 1.0:  # a square beside the sheet: one sample of the room will do
+                out[v, u] = total
+                continue
+            total = 0.0
+            for k in range(SAMPLES * SAMPLES):
+                a = (k % SAMPLES + 0.5) * share - 0.5
+                b = (k // SAMPLES + 0.5) * share - 0.5
+                value, _ = _board_sample(x + a * xu + b * xv, y + a * yu + b * yv, o, R, d, Rb, tb, per_x, per_y)
+                total += value
+            out[v, u] = total * share * share

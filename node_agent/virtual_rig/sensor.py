@@ -1,0 +1,46 @@
+"""From radiance to grey levels: point spread, vignetting, shot and read noise, gamma, 8 bits."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FULL_WELL = 4500.0  # electrons at radiance 1
+READ_NOISE = 3.0  # electrons
+POINT_SPREAD = 0.6  # px, standard deviation of the Gaussian point spread
+_VIGNETTING = 0.18  # loss in the corners
+
+
+def expose(radiance: NDArray[np.float32], seed: int) -> NDArray[np.uint8]:
+    """Grey levels (height, width), sRGB-coded, of a linear image (height, width); the same for the same seed."""
+    light = _vignetted(_blurred(radiance))
+    noise = np.random.default_rng([seed, 4500]).standard_normal(light.shape, dtype=np.float32)
+    electrons = np.minimum(light, 1.0) * np.float32(FULL_WELL)
+    electrons += noise * np.sqrt(np.maximum(electrons, 0.0) + np.float32(READ_NOISE**2))
+    return np.rint(255.0 * encode(np.clip(electrons / np.float32(FULL_WELL), 0.0, 1.0))).astype(np.uint8)
+
+
+def encode(linear: NDArray[np.float32]) -> NDArray[np.float32]:
+    """sRGB coding of linear light 0 … 1 (IEC 61966-2-1)."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def _blurred(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The point spread as two passes of a sampled Gaussian, mirrored at the rim."""
+    reach = 3
+    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / POINT_SPREAD) ** 2)
+    taps = (taps / taps.sum()).astype(np.float32)
+    for axis in (0, 1):
+        padded = np.pad(image, [(reach, reach) if i == axis else (0, 0) for i in (0, 1)], mode="reflect")
+        size = image.shape[axis]
+        image = sum(  # type: ignore[assignment]
+            tap * (padded[k : k + size] if axis == 0 else padded[:, k : k + size]) for k, tap in enumerate(taps)
+        )
+    return image
+
+
+def _vignetted(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    height, width = image.shape
+    y = (np.arange(height, dtype=np.float32) / (height - 1) - 0.5)[:, None]
+    x = (np.arange(width, dtype=np.float32) / (width - 1) - 0.5)[None, :]
+    return image * (1.0 - np.float32(_VIGNETTING) * 2.0 * (x * x + y * y))

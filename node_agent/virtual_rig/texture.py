@@ -1,0 +1,150 @@
+"""Printed patterns as signed distances in surface coordinates, averaged over the footprint of a sample.
+
+``s`` is the arc along the circumference of the 57 mm cylinder (57 theta), ``z`` the height; both mm. ``ws`` and
+``wz`` are the widths that one sample covers on the surface. A pattern answers with the share of the sample that is
+dark, so no pixel image is ever resampled.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+
+RADIUS = 57.0  # mm
+CIRCUMFERENCE = 2.0 * math.pi * RADIUS
+_CELLS = 179  # speckle cells round the circumference
+_CELL = CIRCUMFERENCE / _CELLS  # mm
+_COLUMNS, _ROWS, _SPACING = 30, 20, 12.0
+_DOT = 4.0  # mm
+_MARK_Z, _MARK_RADIUS = 124.0, 1.5  # mm, the disk between columns 1 and 2
+_DIGIT_Z, _DIGIT_HEIGHT, _DIGIT_WIDTH, _STROKE = 242.5, 5.0, 2.6, 0.7  # mm
+# Segments of the digits 0 … 9: top, top right, bottom right, bottom, bottom left, top left, middle.
+_SEGMENTS = np.array([0x3F, 0x06, 0x5B, 0x4F, 0x66, 0x6D, 0x7D, 0x07, 0x7F, 0x6F], dtype=np.int64)
+
+
+@nb.njit(cache=True, nogil=True)
+def covered(distance, width):  # type: ignore[no-untyped-def]
+    """Share of a sample of this width that lies inside (distance < 0) of a straight edge."""
+    return min(1.0, max(0.0, 0.5 - distance / width))
+
+
+@nb.njit(cache=True, nogil=True)
+def _random(i, j, k, seed):  # type: ignore[no-untyped-def]
+    """A number in [0, 1) that belongs to a cell."""
+    h = np.uint64(i) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(j) * np.uint64(0xC2B2AE3D27D4EB4F)
+    h += np.uint64(k) * np.uint64(0x165667B19E3779F9) + np.uint64(seed) * np.uint64(0xD6E8FEB86659FD93)
+    h ^= h >> np.uint64(32)
+    h *= np.uint64(0xD6E8FEB86659FD93)
+    h ^= h >> np.uint64(32)
+    h *= np.uint64(0xD6E8FEB86659FD93)
+    h ^= h >> np.uint64(32)
+    return float(h >> np.uint64(11)) * 1.1102230246251565e-16
+
+
+@nb.njit(cache=True, nogil=True)
+def speckle(s, z, ws, wz, seed):  # type: ignore[no-untyped-def]
+    """Dark share of a random pattern of disks of 1.0 … 1.6 mm on a jittered grid, seamless round the body."""
+    ci, cj = math.floor(s / _CELL), math.floor(z / _CELL)
+    reach = 0.8 + 0.35 * _CELL + max(ws, wz)  # largest radius, largest displacement, rim of the sample
+    dark = 0.0
+    for j in range(cj - 1, cj + 2):
+        if abs(z - (j + 0.5) * _CELL) > reach:
+            continue
+        for i in range(ci - 1, ci + 2):
+            if abs(s - (i + 0.5) * _CELL) > reach:
+                continue
+            key = np.int64(i % _CELLS)
+            row = np.int64(j + 4096)
+            x = (i + 0.5 + 0.7 * (_random(key, row, 0, seed) - 0.5)) * _CELL
+            y = (j + 0.5 + 0.7 * (_random(key, row, 1, seed) - 0.5)) * _CELL
+            r = 0.5 + 0.3 * _random(key, row, 2, seed)
+            a, b = s - x, z - y
+            length = math.sqrt(a * a + b * b)
+            if length > 1e-9:
+                width = (abs(a) * ws + abs(b) * wz) / length
+            else:
+                width = 0.5 * (ws + wz)
+            dark = max(dark, covered(length - r, width))
+    return dark
+
+
+@nb.njit(cache=True, nogil=True)
+def _box(a, b, half_a, half_b, ws, wz):  # type: ignore[no-untyped-def]
+    """Dark share of a rectangle with sides along s and z about the origin: exact for a rectangular sample."""
+    in_a = min(a + ws / 2, half_a) - max(a - ws / 2, -half_a)
+    in_b = min(b + wz / 2, half_b) - max(b - wz / 2, -half_b)
+    return max(0.0, in_a) * max(0.0, in_b) / (ws * wz)
+
+
+@nb.njit(cache=True, nogil=True)
+def _digit(a, b, number, ws, wz):  # type: ignore[no-untyped-def]
+    """Dark share of a digit whose lower left corner is the origin."""
+    bits = _SEGMENTS[number]
+    w, h, t = _DIGIT_WIDTH - 0.8, _DIGIT_HEIGHT, _STROKE / 2
+    dark = 0.0
+    if bits & 1:
+        dark = max(dark, _box(a - w / 2, b - h + t, w / 2, t, ws, wz))
+    if bits & 2:
+        dark = max(dark, _box(a - w + t, b - 0.75 * h, t, h / 4, ws, wz))
+    if bits & 4:
+        dark = max(dark, _box(a - w + t, b - 0.25 * h, t, h / 4, ws, wz))
+    if bits & 8:
+        dark = max(dark, _box(a - w / 2, b - t, w / 2, t, ws, wz))
+    if bits & 16:
+        dark = max(dark, _box(a - t, b - 0.25 * h, t, h / 4, ws, wz))
+    if bits & 32:
+        dark = max(dark, _box(a - t, b - 0.75 * h, t, h / 4, ws, wz))
+    if bits & 64:
+        dark = max(dark, _box(a - w / 2, b - h / 2, w / 2, t, ws, wz))
+    return dark
+
+
+@nb.njit(cache=True, nogil=True)
+def dots(s, z, ws, wz):  # type: ignore[no-untyped-def]
+    """Dark share of the target's print: squares, column numbers above the top row, one disk as a mark."""
+    column = math.floor(s / _SPACING + 0.5)
+    a = s - column * _SPACING
+    if column >= _COLUMNS:
+        column, a = 0, s - CIRCUMFERENCE
+        if a < -_SPACING / 2:
+            column, a = _COLUMNS - 1, s - (_COLUMNS - 1) * _SPACING
+    dark = 0.0
+    row = math.floor((z - 10.0) / _SPACING + 0.5)
+    if 0 <= row < _ROWS:
+        dark = _box(a, z - 10.0 - row * _SPACING, _DOT / 2, _DOT / 2, ws, wz)
+    if abs(z - _MARK_Z) < 3.0 and abs(s - _SPACING / 2) < 3.0:
+        x, y = s - _SPACING / 2, z - _MARK_Z
+        length = math.sqrt(x * x + y * y)
+        dark = max(dark, covered(length - _MARK_RADIUS, (abs(x) * ws + abs(y) * wz) / max(length, 1e-9)))
+    if z > _DIGIT_Z - 1.0:
+        number = column + 1
+        if number < 10:
+            dark = max(dark, _digit(a + _DIGIT_WIDTH / 2 - 0.4, z - _DIGIT_Z, number, ws, wz))
+        else:
+            dark = max(dark, _digit(a + _DIGIT_WIDTH - 0.4, z - _DIGIT_Z, number // 10, ws, wz))
+            dark = max(dark, _digit(a - 0.4, z - _DIGIT_Z, number % 10, ws, wz))
+    return dark
+
+
+@nb.njit(cache=True, nogil=True)
+def _square_wave(x, width):  # type: ignore[no-untyped-def]
+    """+1 over [0, 1), -1 over [1, 2), repeated, averaged over a width."""
+    return (_triangle(x + width / 2) - _triangle(x - width / 2)) / width
+
+
+@nb.njit(cache=True, nogil=True)
+def _triangle(x):  # type: ignore[no-untyped-def]
+    """The integral of the square wave."""
+    x = x - 2.0 * math.floor(x / 2.0)
+    return x if x < 1.0 else 2.0 - x
+
+
+@nb.njit(cache=True, nogil=True)
+def checker(x, y, wx, wy):  # type: ignore[no-untyped-def]
+    """Dark share of a checkerboard of unit squares over [0, 15] x [0, 20], white around it."""
+    if not (-wx < x < 15.0 + wx and -wy < y < 20.0 + wy):
+        return 0.0
+    inside = min(1.0, max(0.0, min(x, 15.0 - x) / wx + 0.5)) * min(1.0, max(0.0, min(y, 20.0 - y) / wy + 0.5))
+    return inside * (0.5 + 0.5 * _square_wave(x, wx) * _square_wave(y, wy))

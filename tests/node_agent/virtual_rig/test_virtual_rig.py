@@ -1,0 +1,167 @@
+"""The simulated rig: its mathematics against itself, its images against its own truth."""
+
+import cv2
+import numpy as np
+import pytest
+
+from node_agent.virtual_rig.lens import distort, ideal
+from node_agent.virtual_rig.render import radiance, render
+from node_agent.virtual_rig.rig import paper_rig, write_truth
+from node_agent.virtual_rig.scenes import Cylinder, Limb, Specimen, Target, scene
+from node_agent.virtual_rig.sensor import FULL_WELL, READ_NOISE, expose
+
+SCALE = 0.25
+RIG = paper_rig(12, SCALE, seed=3)
+CAMERA = RIG.cameras[1]
+
+
+def linear(image: np.ndarray) -> np.ndarray:
+    """Inverse of the sRGB coding."""
+    coded = image / 255.0
+    return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
+
+
+def test_the_lens_inverts_itself_all_over_the_image() -> None:
+    lens = CAMERA.lens
+    for u in np.linspace(0, CAMERA.width, 7):
+        for v in np.linspace(0, CAMERA.height, 7):
+            x, y, *_ = ideal(u, v, lens, 0.0, 0.0)
+            a, b = distort(x, y, lens)
+            assert lens[0] * a + lens[2] * b + lens[3] == pytest.approx(u, abs=1e-9)
+            assert lens[1] * b + lens[4] == pytest.approx(v, abs=1e-9)
+
+
+def test_the_lens_derivatives_are_those_of_its_inverse() -> None:
+    lens, h = CAMERA.lens, 1e-4
+    x, y, xu, xv, yu, yv = ideal(100.0, 700.0, lens, 0.0, 0.0)
+    right, below = ideal(100.0 + h, 700.0, lens, x, y), ideal(100.0, 700.0 + h, lens, x, y)
+    np.testing.assert_allclose([xu, yu], [(right[0] - x) / h, (right[1] - y) / h], rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose([xv, yv], [(below[0] - x) / h, (below[1] - y) / h], rtol=1e-4, atol=1e-9)
+
+
+def test_the_scale_keeps_what_a_pixel_shows() -> None:
+    large, small = paper_rig(12, 1.0, seed=3).cameras[4], paper_rig(12, 0.5, seed=3).cameras[4]
+    xyz = np.array([[10.0, 50.0, 100.0], [-40.0, 20.0, 30.0]])
+    # The centre of pixel k of the small image is the corner between pixels 2k and 2k + 1 of the large one.
+    np.testing.assert_allclose((large.project(xyz) + 0.5) / 2 - 0.5, small.project(xyz), atol=1e-9)
+
+
+@pytest.mark.parametrize("surface", [Cylinder(), Limb()])
+def test_derivatives_are_those_of_the_positions(surface: Cylinder | Limb) -> None:
+    theta, z, h = np.linspace(0, 6, 20), np.linspace(5, 245, 20), 1e-5
+    tangents = surface.tangents(theta, z, 4)
+    by_theta = (surface.position(theta + h, z, 4) - surface.position(theta - h, z, 4)) / (2 * h)
+    by_z = (surface.position(theta, z + h, 4) - surface.position(theta, z - h, 4)) / (2 * h)
+    np.testing.assert_allclose(tangents[:, 0], by_theta, atol=1e-7)
+    np.testing.assert_allclose(tangents[:, 1], by_z, atol=1e-7)
+
+
+def test_stretches_bound_the_elongation_of_every_fibre() -> None:
+    limb, h = Limb(), 1e-4
+    theta, z = np.linspace(0.1, 6.1, 12), np.linspace(10, 240, 12)
+    low, high = limb.stretches(theta, z, 5)
+    ratios = []
+    for angle in np.radians(np.arange(0, 180, 0.5)):
+        a, b = h * np.cos(angle) / 57.0, h * np.sin(angle)
+        ends = [limb.position(theta + a, z + b, step) - limb.position(theta - a, z - b, step) for step in (0, 5)]
+        ratios.append(np.linalg.norm(ends[1], axis=1) / np.linalg.norm(ends[0], axis=1))
+    np.testing.assert_allclose(np.min(ratios, axis=0), low, atol=5e-5)
+    np.testing.assert_allclose(np.max(ratios, axis=0), high, atol=5e-5)
+    assert 1.10 < high.max() < 1.25  # the stated load
+
+
+def test_a_rigid_cylinder_does_not_stretch() -> None:
+    low, high = Cylinder().stretches(np.linspace(0, 6, 9), np.linspace(20, 200, 9), 7)
+    np.testing.assert_allclose([low, high], 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("surface", [Cylinder(), Limb()])
+def test_a_point_off_the_surface_is_named_and_measured(surface: Cylinder | Limb) -> None:
+    theta, z = np.linspace(-3, 3, 30), np.linspace(10, 240, 30)
+    tangents = surface.tangents(theta, z, 2)
+    normals = np.cross(tangents[:, 0], tangents[:, 1])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    found = surface.material_coordinates(surface.position(theta, z, 2) + 0.8 * normals, 2)
+    np.testing.assert_allclose(found[0], theta, atol=1e-9)
+    np.testing.assert_allclose(found[1], z, atol=1e-7)
+    np.testing.assert_allclose(found[2], 0.8, atol=1e-9)
+
+
+def test_the_dots_are_where_their_centres_project() -> None:
+    image = linear(render(CAMERA, Target(), 5))
+    centres = Target().dots()
+    outwards = centres * [1, 1, 0] / 57.0
+    towards = CAMERA.centre - centres
+    frontal = np.sum(outwards * towards, axis=-1) / np.linalg.norm(towards, axis=-1) > np.cos(np.radians(35))
+    assert frontal.sum() > 60
+    errors = []
+    for px in CAMERA.project(centres[frontal]):
+        x0, y0 = np.round(px).astype(int)
+        patch = image[y0 - 8 : y0 + 9, x0 - 8 : x0 + 9]
+        dark = np.clip(1 - patch / np.percentile(patch, 80) - 0.1, 0, None)
+        y, x = np.mgrid[-8:9, -8:9]
+        errors.append([x0 + np.sum(x * dark) / dark.sum() - px[0], y0 + np.sum(y * dark) / dark.sum() - px[1]])
+    # A dot's image has its centroid up to 0.24 px at full scale (0.06 px here) from its centre's projection.
+    assert np.sqrt(np.mean(np.sum(np.square(errors), axis=1))) < 0.06
+
+
+def test_the_corners_are_where_the_board_truth_says() -> None:
+    board = scene("board", 2, seed=3)
+    image = render(CAMERA, board, 5)
+    truth = board.corners(CAMERA).astype(np.float32)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
+    found = cv2.cornerSubPix(image, truth.reshape(-1, 1, 2).copy(), (4, 4), (-1, -1), stop).reshape(-1, 2)
+    error = found - truth
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.08
+    assert np.linalg.norm(error.mean(axis=0)) < 0.02  # no shift of the whole image
+
+
+def test_a_moved_cylinder_moves_in_the_image_as_projected() -> None:
+    cylinder = Cylinder(per_step=(0.0, 0.0, 0.35))
+    before = radiance(CAMERA, Specimen(cylinder, 0)).astype(np.float64)
+    after = radiance(CAMERA, Specimen(cylinder, 1)).astype(np.float64)
+    facing = np.arctan2(CAMERA.centre[1], CAMERA.centre[0])
+    errors = []
+    for z in np.linspace(50, 200, 12):
+        material = np.array([facing]), np.array([z])
+        a, b = (CAMERA.project(cylinder.position(*material, step))[0] for step in (0, 1))
+        x, y = np.round(a).astype(int)
+        window = slice(y - 20, y + 20), slice(x - 20, x + 20)
+        shift, _ = cv2.phaseCorrelate(before[window], after[window], cv2.createHanningWindow((40, 40), cv2.CV_64F))
+        errors.append(np.array(shift) - (b - a))
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.03
+    assert np.abs(errors).max() < 0.12
+
+
+def test_noise_is_the_stated_shot_and_read_noise() -> None:
+    level = 0.4
+    images = [linear(expose(np.full((200, 300), level, np.float32), seed)) for seed in (1, 2)]
+    electrons = (images[0] - images[1])[80:120, 130:170] * FULL_WELL  # the middle, without vignetting
+    expected = np.sqrt(2 * (level * FULL_WELL + READ_NOISE**2))
+    assert electrons.std() == pytest.approx(expected, rel=0.06)  # 1,600 samples: 1.8 %, and 8-bit rounding
+
+
+def test_the_same_seed_gives_the_same_image_and_another_does_not() -> None:
+    small = paper_rig(4, 0.06, seed=1).cameras[0]
+    first, again, other = (render(small, scene("specimen", 1, seed=1), seed) for seed in (7, 7, 8))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).mean() > 0.1
+
+
+def test_the_speckles_are_seamless_and_about_two_fifths_dark() -> None:
+    flat = radiance(paper_rig(12, 0.25, seed=0).cameras[0], scene("specimen", 0, "cylinder"))
+    middle = flat[300:500, 280:340]
+    assert 0.25 < (middle < 0.3).mean() < 0.55
+
+
+@pytest.mark.parametrize(
+    ("kind", "index", "specimen", "sentence"),
+    [("face", 0, "limb", "no scene of kind"), ("board", -1, "limb", "counted from 0"), ("static", 0, "arm", "'arm'")],
+)
+def test_a_scene_that_does_not_exist_is_refused(kind: str, index: int, specimen: str, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        scene(kind, index, specimen)
+
+
+def test_the_truth_file_names_every_camera(tmp_path) -> None:
+    assert write_truth(RIG, tmp_path).read_text().count('"id"') == 12
