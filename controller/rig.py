@@ -410,7 +410,8 @@ _ANSWERS: dict[type[Any], tuple[str, type[Any]]] = {Arm: ("arm", ArmReply), Trig
 def _decoded(reply: zenoh.Reply, answer: type[Any]) -> Any | None:
     """The reply's message; None, with a line in the log, for a refusal or a breach of the contract."""
     if reply.ok is None:
-        log.warning("a node declines: %s", reply.err.payload.to_string() if reply.err else "no reason given")
+        reason = reply.err.payload.to_string() if reply.err else "no reason given"
+        log.warning("a question to a node went without its answer: %s", reason)
         return None
     try:
         return decode_as(answer, reply.ok.payload.to_bytes())

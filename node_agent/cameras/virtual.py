@@ -1,4 +1,8 @@
-"""A camera of the simulated rig: it renders what the real one would see at the planned moment."""
+"""A camera of the simulated rig: it renders what the real one would see at the planned moment.
+
+A node shows itself to the controller only after its camera is built, and the camera warms its renderer up first:
+whoever is alive renders at full speed.
+"""
 
 from __future__ import annotations
 
@@ -41,11 +45,15 @@ class VirtualCamera:
     ) -> None:
         try:
             from node_agent.virtual_rig.rig import paper_rig
+
+            ring = {lens.id: lens for lens in paper_rig(cameras=cameras, scale=scale, seed=seed).cameras}
+            warm_up(specimen)
         except ImportError as error:
             raise CameraError(
                 f"the simulated rig cannot be loaded ({error}); install the extra: pip install 'ringdic[virtual]'"
             ) from error
-        ring = {lens.id: lens for lens in paper_rig(cameras=cameras, scale=scale, seed=seed).cameras}
+        except ValueError as error:
+            raise CameraError(f"the simulated rig cannot be built: {error}") from error
         if camera not in ring:
             raise CameraError(f"the simulated rig has no camera '{camera}'; it has {', '.join(ring)}")
         self._lens = ring[camera]
@@ -84,3 +92,14 @@ class VirtualCamera:
 
     def close(self) -> None:
         pass
+
+
+def warm_up(specimen: str = "limb") -> None:
+    """Load, or compile and cache, everything that rendering needs, by rendering each kind of scene very small."""
+    from node_agent.virtual_rig.render import render
+    from node_agent.virtual_rig.rig import paper_rig
+    from node_agent.virtual_rig.scenes import scene
+
+    small = paper_rig(cameras=12, scale=0.05).cameras[0]
+    for kind in ("board", "target", "specimen"):
+        render(small, scene(kind, 0, specimen=specimen), 0)

@@ -1,0 +1,47 @@
+"""The node's process: it ends when told, and does not hang when one of its threads dies."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from node_agent.agent import ArmAsked
+from node_agent.cameras.pattern import PatternCamera
+from node_agent.clock import SystemClock
+from node_agent.config import NodeConfig
+from node_agent.service import NodeService, ServiceError
+from node_agent.spool import Spool
+from node_agent.wire import Arm
+
+
+class BrokenCamera(PatternCamera):
+    """A driver with a bug."""
+
+    def lock(self, settings):
+        raise ZeroDivisionError
+
+
+def service_of(tmp_path, camera_type) -> NodeService:
+    config = NodeConfig("ring", "201", "tcp/127.0.0.1:1", tmp_path / "spool", "pattern")
+    clock = SystemClock()
+    return NodeService(config, camera_type("201", clock), Spool(config.spool), clock)
+
+
+def test_a_node_without_a_controller_waits_and_ends_when_told(tmp_path):
+    service = service_of(tmp_path, PatternCamera)
+    thread = threading.Thread(target=service.run, daemon=True)
+    thread.start()
+    thread.join(1.0)
+    assert thread.is_alive(), "it keeps waiting for its controller"
+    service.stop()
+    thread.join(10)
+    assert not thread.is_alive()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_bug_in_the_cameras_thread_ends_the_node(tmp_path):
+    service = service_of(tmp_path, BrokenCamera)
+    service._events.put(ArmAsked(Arm("s", "board", {}, "0" * 64, ("201",)), 1))
+    with pytest.raises(ServiceError, match="camera thread has died"):
+        service.run()
