@@ -28,8 +28,12 @@ from processing.correlation import (
 )
 from processing.errors import ComputationError
 from processing.proxy import compose, stereo_hypotheses, sweep_radii
-from processing.region import coherent, lattice, paint, well_seen
+from processing.region import coherent, contrast, lattice, paint, well_seen
 from processing.results import Matches
+
+# Beside the speckled surface there may be bare skin that matches, but poorly: less contrast than this share of the
+# usual is no speckle.
+_LEAST_CONTRAST = 0.3
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8] | NDArray[np.uint16]
@@ -118,9 +122,8 @@ def _radii(cameras: tuple[Camera, Camera], search: Search) -> Array:
     towards = towards / np.linalg.norm(towards)
     height = 0.5 * (first.centre[2] + second.centre[2])
     ends = [np.array([*(radius * towards), height]) for radius in (search.radius, search.radius + 1.0)]
-    px_per_mm = np.linalg.norm(
-        np.diff(second.project(np.array(ends)), axis=0) - np.diff(first.project(np.array(ends)), axis=0)
-    )
+    seen = [camera.project(np.array(ends)) for camera in cameras]
+    px_per_mm = float(np.linalg.norm(np.diff(seen[1], axis=0) - np.diff(seen[0], axis=0)))
     return sweep_radii(search.radius, search.reach, float(np.clip(1.5 / max(px_per_mm, 1e-6), 0.1, 2.0)))
 
 
@@ -141,7 +144,11 @@ def _find_region(stereo: _Stereo, image: Image, current: Current, mask: Mask | N
     with np.errstate(invalid="ignore"):
         convincing = (zncc > stereo.search.zncc_min) & (second_best < 0.9 * zncc)
     convincing &= (which > 0) & (which < len(stereo.radii) - 1)
-    if mask is not None:
+    if mask is None:
+        texture = contrast(image, px, settings.radius)
+        usual = float(np.median(texture[convincing])) if convincing.any() else 0.0
+        convincing &= texture > _LEAST_CONTRAST * usual
+    else:
         convincing &= mask[px[:, 1].astype(int), px[:, 0].astype(int)]
     good = coherent(radius, convincing.reshape(shape), tolerance=2.0)
     if mask is None:

@@ -61,6 +61,15 @@ def coherent(radius: Array, convincing: Mask, tolerance: float) -> Mask:
     return labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
 
 
+def contrast(image: NDArray[np.generic], xy: Array, half_width: int) -> Array:
+    """Root mean square of the grey level's gradient in a square about each position (..., 2) of an image. (...)."""
+    grey = image.astype(np.float32)
+    energy = cv2.Sobel(grey, -1, 1, 0, scale=0.125) ** 2 + cv2.Sobel(grey, -1, 0, 1, scale=0.125) ** 2
+    size = (2 * half_width + 1, 2 * half_width + 1)
+    mean = cv2.blur(energy, size)
+    return np.sqrt(mean[xy[..., 1].astype(int), xy[..., 0].astype(int)]).astype(float)
+
+
 def lattice_normals(xyz: Array) -> Array:
     """Outward unit normals (rows, columns, 3) of a lattice of points (rows, columns, 3), NaN where unknown.
 

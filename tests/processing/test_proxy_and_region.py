@@ -5,7 +5,7 @@ import pytest
 
 from processing.camera import Camera
 from processing.proxy import compose, on_cylinder, stereo_hypotheses, sweep_radii
-from processing.region import Lattice, coherent, lattice, lattice_normals, paint, well_seen
+from processing.region import Lattice, coherent, contrast, lattice, lattice_normals, paint, well_seen
 
 
 def camera(azimuth_deg: float) -> Camera:
@@ -117,3 +117,12 @@ def test_the_painted_region_covers_the_good_positions_only() -> None:
     assert mask[100, 60:121].all()
     assert not mask[:, :48].any()
     assert not mask[:48].any()
+
+
+def test_contrast_is_the_rms_gradient() -> None:
+    x = np.arange(200.0)
+    image = np.tile(100 + 50 * np.sin(2 * np.pi * x / 20), (100, 1)).astype(np.float32)
+    # The derivative of a sine, sampled by a central difference: amplitude 50 sin(2 pi / 20), root mean square / √2.
+    expected = 50 * np.sin(2 * np.pi / 20) / np.sqrt(2)
+    assert contrast(image, np.array([[100.0, 50.0]]), 20)[0] == pytest.approx(expected, rel=0.02)
+    assert contrast(np.full((50, 50), 7, np.uint8), np.array([[25.0, 25.0]]), 5)[0] == 0.0
