@@ -33,13 +33,16 @@ NODE_STATES = ("idle", "arming", "armed", "capturing")
 TRIGGER_VERDICTS = ("accepted", "late", "not armed")
 ACK_VERDICTS = ("archived", "unknown")
 
+MAX_MESSAGE = 64 << 20
+IMAGE_LIMIT = MAX_MESSAGE - (1 << 20)  # bytes; a larger message is dropped by its receiver without a word
+
 # Zenoh's configuration where both sides must agree or profit alike. Shared memory drops messages silently and
 # is slower for images; waiting on a frozen receiver must end before the lease does, or images vanish unnoticed.
 NETWORK: dict[str, object] = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "transport/shared_memory/enabled": False,
-    "transport/link/rx/max_message_size": 64 << 20,
+    "transport/link/rx/max_message_size": MAX_MESSAGE,
     "transport/link/tx/lease": 10_000,
     "transport/link/tx/queue/congestion_control/block/wait_before_close": 8_000_000,
 }
@@ -229,6 +232,8 @@ class Manifest(_Message):
         _require_in("kind", self.kind, CAPTURE_KINDS)
         _require_hash("sha256", self.sha256)
         _require_int("bytes", self.bytes, at_least=1)
+        if self.bytes > IMAGE_LIMIT:
+            raise WireError(f"an image of {self.bytes} bytes is too large to be sent; the limit is {IMAGE_LIMIT}")
         _require_int("width", self.width, at_least=1)
         _require_int("height", self.height, at_least=1)
         _require_int("time_ns", self.time_ns, at_least=0)

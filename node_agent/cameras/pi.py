@@ -35,6 +35,7 @@ RECORDED = (
     "SyncReady",
     "SyncTimer",
 )
+FROZEN = ("ExposureTime", "AnalogueGain", "ColourGains")
 SYNC_MODES = {"off": 0, "server": 1, "client": 2}
 LOCK_TIMEOUT = 10.0  # s, for the locked values to reach the sensor
 FRAMES_AFTER = 3  # frame periods to wait beyond the moment before the frame is given up
@@ -148,14 +149,33 @@ class PiCamera:
         check_settings(settings)
         self._period_us = float(settings.get("period_us", self._period_us))
         self._wanted = self._controls(settings)
+        if not self._camera.started:
+            self._start()
+        metadata = self._hold()
+        # What the automatics had found becomes the fixed value, and must be seen in the frames like any other.
+        frozen = {name: metadata[name] for name in FROZEN if name not in self._wanted and name in metadata}
+        if frozen:
+            self._wanted.update(frozen, AwbEnable=False)
+            metadata = self._hold()
+        sync = self._sync if self._sync != "client" else "client, locked"
+        period_ns = round(1000 * float(metadata.get("FrameDuration", self._period_us)))
+        return Lock(recorded(metadata), sync, frame_time(metadata, self._clock), period_ns)
+
+    def _start(self) -> None:
         try:
-            if not self._camera.started:
-                self._camera.start()
+            self._camera.start()
+        except RuntimeError as error:
+            raise CameraError(f"the camera does not start: {error}") from error
+
+    def _hold(self) -> dict[str, Any]:
+        """Set the wanted controls; return the metadata of the last of several frames in a row that show them."""
+        try:
             self._camera.set_controls(self._wanted)
         except RuntimeError as error:
             raise CameraError(f"the camera does not take its settings: {error}") from error
         with self._frames:
             self._matching = 0
+            self._newest = {}
             done = self._frames.wait_for(lambda: self._matching >= self._settle_frames, LOCK_TIMEOUT)
             metadata = dict(self._newest)
         if not metadata:
@@ -165,14 +185,7 @@ class PiCamera:
                 f"the camera did not hold its settings over {self._settle_frames} frames within {LOCK_TIMEOUT:g} s: "
                 f"wanted {self._wanted}, newest frame {recorded(metadata)}"
             )
-        if "ExposureTime" not in self._wanted or "AnalogueGain" not in self._wanted:
-            # What the automatics had found becomes the fixed value.
-            self._wanted["ExposureTime"] = int(metadata["ExposureTime"])
-            self._wanted["AnalogueGain"] = float(metadata["AnalogueGain"])
-            self._camera.set_controls(self._wanted)
-        sync = self._sync if self._sync != "client" else "client, locked"
-        period_ns = round(1000 * float(metadata.get("FrameDuration", self._period_us)))
-        return Lock(recorded(metadata), sync, frame_time(metadata, self._clock), period_ns)
+        return metadata
 
     def _controls(self, settings: Mapping[str, Any]) -> dict[str, Any]:
         period = round(self._period_us)
@@ -188,6 +201,8 @@ class PiCamera:
         if "colour_gains" in settings:
             red, blue = settings["colour_gains"]
             controls.update(AwbEnable=False, ColourGains=(float(red), float(blue)))
+        if "AfMode" in self._camera.camera_controls:
+            controls["AfMode"] = 0  # manual: the lens stays where it is
         if self._sync != "off":
             controls["SyncMode"] = SYNC_MODES[self._sync]
         return controls

@@ -49,7 +49,8 @@ class StandInCamera:
         self.silent = False
         self.starts = 0
         self.camera_properties = {"Model": "stand-in"}
-        self.held = {"ExposureTime": 9000, "AnalogueGain": 3.0}
+        self.camera_controls = {"AfMode": (0, 2, 0)}
+        self.held = {"ExposureTime": 9000, "AnalogueGain": 3.0, "ColourGains": (1.5, 1.7)}
         self.coming: list[tuple[int, dict]] = []
         self.number = 0
         self.ledger: dict[int, int] = {}
@@ -109,9 +110,11 @@ def test_armed_means_that_the_frames_show_the_settings(camera):
 
 
 def test_without_settings_the_found_exposure_is_frozen(camera):
-    camera.lock({})
-    assert camera._camera.coming[-1][1]["ExposureTime"] == 9000
-    assert camera._camera.coming[-1][1]["AnalogueGain"] == 3.0
+    camera.lock({"gain": 2.0})
+    held = camera._camera.coming[-1][1]
+    assert (held["ExposureTime"], held["AnalogueGain"]) == (9000, 2.0)
+    assert (held["AwbEnable"], held["ColourGains"]) == (False, (1.5, 1.7))
+    assert held["AfMode"] == 0
 
 
 def test_the_frame_nearest_to_the_moment_is_kept(camera):

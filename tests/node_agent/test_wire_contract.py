@@ -9,6 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from node_agent.wire import (
+    IMAGE_LIMIT,
+    NETWORK,
     Ack,
     Arm,
     ArmReply,
@@ -40,7 +42,7 @@ manifests = st.builds(
     key=keys,
     kind=kinds,
     sha256=hashes,
-    bytes=st.integers(1, 2**40),
+    bytes=st.integers(1, IMAGE_LIMIT),
     width=st.integers(1, 9999),
     height=st.integers(1, 9999),
     time_ns=counts,
@@ -132,3 +134,14 @@ def test_a_refusal_without_a_reason_cannot_exist():
         ArmReply("n", armed=False, settings_hash="0" * 64)
     with pytest.raises(WireError, match="reason"):
         Failure("n", KEY, "")
+
+
+def test_an_image_that_the_network_would_drop_silently_cannot_be_announced():
+    limit = NETWORK["transport/link/rx/max_message_size"]
+    with pytest.raises(WireError, match="too large"):
+        Manifest("n", KEY, "board", "0" * 64, bytes=limit, width=1, height=1, time_ns=0)
+
+
+def test_a_frozen_receiver_is_given_up_before_its_lease_ends():
+    wait_us = NETWORK["transport/link/tx/queue/congestion_control/block/wait_before_close"]
+    assert wait_us < 1000 * NETWORK["transport/link/tx/lease"]
