@@ -62,6 +62,13 @@ class _Node:
     status: Status | None = None
     seen_ns: int = 0
     offset_ms: float | None = None
+    quickest_ns: int = 0
+
+    def note_offset(self, round_trip_ns: int, offset_ns: int) -> None:
+        """Keep the clock's offset as seen over a quick round trip; half the round trip bounds its error."""
+        if self.offset_ms is None or round_trip_ns <= 1.5 * self.quickest_ns:
+            self.offset_ms = offset_ns / 1e6
+            self.quickest_ns = min(round_trip_ns, self.quickest_ns or round_trip_ns)
 
 
 class RigLink:
@@ -280,8 +287,9 @@ class RigLink:
         """Ask one node for its status and its inventory; fetch what the archive lacks."""
         sent = time.time_ns()
         for status in self._answers(camera, "status", Status):
+            received = time.time_ns()
             with self._lock:
-                self._nodes[camera].offset_ms = (status.time_ns - (sent + time.time_ns()) / 2) / 1e6
+                self._nodes[camera].note_offset(received - sent, status.time_ns - (sent + received) // 2)
             self._note_status(status)
         for inventory in self._answers(camera, "inventory", Inventory):
             for failure in inventory.failures:

@@ -66,6 +66,7 @@ def _run(config: NodeConfig) -> int:
 
     clock = SystemClock()
     spool = Spool(config.spool, reserve=config.spool_reserve_mb << 20)
+    spool.claim()
     service = NodeService(config, make_camera(config, clock), spool, clock)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.stop())

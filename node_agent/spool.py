@@ -6,6 +6,7 @@
     SPOOL/<session>~<capture>~<moment>.json   its manifest: the commit point
     SPOOL/<session>~<capture>~<moment>.freed  tombstone: delivered and acknowledged, holds the hash
     SPOOL/.partial-…                          being written; swept at the next start
+    SPOOL/.claim                              locked by the process that uses the spool
 
 Every file is written aside, flushed to the disk and renamed, so a power cut leaves either the whole image with
 its manifest or nothing that counts.
@@ -19,8 +20,14 @@ import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import IO
 
 from node_agent.wire import CaptureKey, Manifest, WireError, decode_as, encode
+
+try:
+    import fcntl
+except ImportError:  # not a POSIX system: simulated nodes on a PC, each with a folder of its own
+    fcntl = None  # type: ignore[assignment]
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +53,26 @@ class Spool:
         self.folder = Path(folder)
         self.reserve = reserve
         self.folder.mkdir(parents=True, exist_ok=True)
+        self._claim: IO[bytes] | None = None
+
+    def claim(self) -> None:
+        """Take the spool for this process alone, until it ends, and sweep up what a power cut left half-written.
+
+        Raises SpoolError if another process has it: two nodes on one spool would sweep each other's images.
+        """
+        if fcntl is not None:
+            self._claim = open(self.folder / ".claim", "ab")  # noqa: SIM115 - held open as long as the process lives
+            try:
+                fcntl.flock(self._claim, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                self._claim.close()
+                raise SpoolError(f"the spool {self.folder} is in use by another ringdic-node; stop that one") from error
         self._sweep()
+
+    def release(self) -> None:
+        """Give the spool up."""
+        if self._claim is not None:
+            self._claim.close()
 
     def _sweep(self) -> None:
         for left in self.folder.glob(".partial-*"):

@@ -17,10 +17,29 @@ def manifest_of(capture: str = "0001-board", parts=PARTS) -> Manifest:
     return Manifest("n", CaptureKey("s", capture, 5), "board", sha256, length, 3, 2, 6)
 
 
+def claimed(folder) -> Spool:
+    """A spool as a starting node finds it."""
+    spool = Spool(folder)
+    spool.claim()
+    return spool
+
+
+def test_a_spool_belongs_to_one_process(tmp_path):
+    first = claimed(tmp_path)
+    (tmp_path / ".partial-x.pgm").write_bytes(b"being written")
+    with pytest.raises(SpoolError, match="in use"):
+        claimed(tmp_path)
+    assert Spool(tmp_path).free > 0
+    assert (tmp_path / ".partial-x.pgm").exists(), "who does not own the spool sweeps nothing"
+    first.release()
+    claimed(tmp_path).release()
+    assert not (tmp_path / ".partial-x.pgm").exists()
+
+
 def test_a_stored_image_survives_a_restart(tmp_path):
     manifest = manifest_of()
     Spool(tmp_path).store(manifest, PARTS)
-    again = Spool(tmp_path)
+    again = claimed(tmp_path)
     assert again.manifests() == [manifest]
     assert again.read(manifest.key) == b"".join(PARTS)
 
@@ -47,7 +66,7 @@ def test_a_power_cut_at_any_step_leaves_all_or_nothing(tmp_path, monkeypatch, st
             finished = True
         except KeyboardInterrupt:
             finished = False
-    again = Spool(tmp_path)
+    again = claimed(tmp_path)
     held = again.manifests()
     assert held in ([], [manifest_of()])
     if finished:
@@ -55,7 +74,7 @@ def test_a_power_cut_at_any_step_leaves_all_or_nothing(tmp_path, monkeypatch, st
     for manifest in held:
         assert digest([again.read(manifest.key)]) == (manifest.sha256, manifest.bytes)
     committed = len(held)
-    assert len(list(tmp_path.iterdir())) == 2 * committed, "nothing half-written is left"
+    assert len([p for p in tmp_path.iterdir() if p.name != ".claim"]) == 2 * committed, "nothing half-written is left"
 
 
 def test_only_its_own_hash_frees_an_image_and_a_tombstone_stays(tmp_path):

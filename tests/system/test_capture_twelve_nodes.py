@@ -22,6 +22,7 @@ from controller.archive import Archive, SessionWriter, verify
 from controller.capture import MS, SECOND, Timing
 from controller.rig import RigLink
 from controller.rounds import CaptureRefusedError
+from node_agent.cli import main as node_command
 from processing.errors import InputError
 from processing.session import read_session
 
@@ -270,6 +271,9 @@ def test_a_capture_is_refused_while_a_camera_is_absent_unless_the_operator_overr
         with pytest.raises(CaptureRefusedError, match="unknown camera setting 'iso'"):
             rig.capture(session, "board", override=True, settings={"iso": 100})
 
+        # One host, one clock: the offsets seen are the errors of the measurement.
+        assert all(abs(node["clock_offset_ms"]) < 500 for node in rig.roster() if node["alive"])
+        assert node_command(["check", "--config", str(three.folder / "a.toml")]) == 0
         assert rig.preview("a") is not None
         assert rig.preview("ghost", timeout=0.5) is None
     for camera in three.cameras:
