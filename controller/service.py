@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from threading import current_thread, main_thread
+from types import FrameType
 
 import uvicorn
 
@@ -71,9 +74,9 @@ def serve(desk: Desk, config: ControllerConfig, on_ready: Callable[[str], None] 
         uvicorn.Config(create_app(desk), log_level="warning", timeout_graceful_shutdown=SHUTDOWN_LIMIT)
     )
     logger.info("the page is at %s", address)
-    if on_ready:
-        on_ready(address)
-    with listener:
+    with listener, _ended_by_signal(server):
+        if on_ready:
+            on_ready(address)
         server.run([listener])
 
 
@@ -88,6 +91,27 @@ def free_endpoint(config: ControllerConfig) -> ControllerConfig:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return replace(config, endpoint=f"tcp/127.0.0.1:{probe.getsockname()[1]}")
+
+
+@contextmanager
+def _ended_by_signal(server: uvicorn.Server) -> Iterator[None]:
+    """SIGINT and SIGTERM end the server and nothing more, so that what was opened is closed in order.
+
+    The server raises the signals that it caught once more when it has ended; they must not end the process then.
+    """
+    if current_thread() is not main_thread():
+        yield
+        return
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        server.should_exit = True
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _listen(config: ControllerConfig) -> socket.socket:

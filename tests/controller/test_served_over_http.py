@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -75,6 +79,47 @@ def test_the_event_stream_tells_a_capture_from_arming_to_the_close_and_does_not_
         assert not thread.is_alive()
         assert time.monotonic() - started < SHUTDOWN_LIMIT + 4
     reader.join(10)
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from controller.config import ControllerConfig
+from controller.service import open_desk, serve
+
+child = "import os, sys, time; open(sys.argv[1] + '/pid', 'w').write(str(os.getpid())); time.sleep(60)"
+config = ControllerConfig(archive=Path(sys.argv[1]), port=0)
+with open_desk(config, lambda session: [sys.executable, "-c", child, str(session)]) as desk:
+    desk.jobs.submit("limb", Path(sys.argv[1]), reason="asked for")
+    serve(desk, config, lambda address: print(address, flush=True))
+print("closed in order", flush=True)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_controller_with_its_streams_and_jobs(tmp_path: Path, number: signal.Signals) -> None:
+    process = subprocess.Popen([sys.executable, "-c", PROGRAM, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        address = process.stdout.readline().strip()
+        deadline = time.monotonic() + 20
+        while not ((tmp_path / "pid").is_file() and (tmp_path / "pid").read_text()):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        child = int((tmp_path / "pid").read_text())
+        with httpx.stream("GET", f"{address}/api/v1/live", timeout=20) as stream:
+            assert next(stream.iter_lines()) == "event: snapshot"
+            process.send_signal(number)
+            said, _ = process.communicate(timeout=20)
+        assert process.returncode == 0
+        assert said.strip() == "closed in order"
+        with pytest.raises(ProcessLookupError):
+            os.kill(child, 0)
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.wait(10)
 
 
 def test_without_a_rig_the_controller_shows_and_captures_nothing(tmp_path: Path) -> None:

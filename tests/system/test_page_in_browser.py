@@ -167,12 +167,16 @@ def page(chromium: Browser, station: Station) -> Iterator[Page]:
     opened = context.new_page()
     opened.on("pageerror", lambda error: complaints.append(str(error)))
     opened.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+    asked: list[str] = []
+    opened.on("request", lambda request: asked.append(request.url))
     opened.goto(station.address)
     expect(opened.locator("#live")).to_have_text("live", timeout=WAIT)
     yield opened
     context.close()
     unexpected = [text for text in complaints if "409" not in text and "422" not in text]
     assert not unexpected, unexpected
+    strangers = [address for address in asked if not address.startswith((station.address, "data:"))]
+    assert not strangers, strangers  # the page needs nobody but its controller
 
 
 def _skip_or_fail(reason: str) -> None:

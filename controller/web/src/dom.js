@@ -47,6 +47,9 @@ export const duration = (seconds) => {
   return whole < 60 ? `${whole} s` : `${Math.floor(whole / 60)} min ${whole % 60} s`;
 };
 
+/** "1 capture", "12 captures". */
+export const counted = (number, noun) => `${number.toLocaleString()} ${noun}${number === 1 ? "" : "s"}`;
+
 export const clockTime = (iso) => (iso ? new Date(iso).toLocaleTimeString([], { hour12: false }) : "");
 
 /** A number with as many digits as a reader wants. */

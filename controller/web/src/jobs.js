@@ -31,7 +31,7 @@ export function showJobs() {
   byId("job-start").disabled = !state.current || Boolean(job && active(job));
   byId("job-log-box").hidden = !job;
   if (!job) {
-    box.replaceChildren(element("p", { class: "muted" }, "Nothing has been processed in this session."));
+    box.replaceChildren(element("p", { class: "muted" }, "No job of this session yet. Processing starts by itself after a specimen capture."));
     return;
   }
   const percent = Math.round(100 * job.done);

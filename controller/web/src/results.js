@@ -2,7 +2,7 @@
 
 import { get, getBytes, url } from "./api.js";
 import { SCALES, cssGradient, ticks } from "./colours.js";
-import { byId, element, figure, notice, setOptions } from "./dom.js";
+import { byId, counted, element, figure, notice, setOptions } from "./dom.js";
 import { state } from "./live.js";
 
 const GROUPS = [
@@ -14,16 +14,23 @@ const GROUPS = [
 const FIRST_FIELD = "lambda2";
 const PLAY_EVERY = 900; // ms
 
-let surface = null; // the viewer, loaded when there is something to see
-let header = null;
+let viewer = null; // promise of the viewer, loaded when there is something to see
+let surface = null;
+let header = null; // of the chosen run
+let facesOf = null; // the header whose triangles the viewer has
 let newestShown = null;
 let limitsByHand = null; // [low, high] typed by the operator for the present field
 let playing = null;
+let viewedSession = null; // the session that the view was made for
+let shownPoints = null; // the positions that the viewer has
 let wanted = 0; // the newest request to show; older ones give up when their numbers arrive
 const arrays = new Map(); // address -> promise of an ArrayBuffer
 
 const chosenField = () => header.fields.find((field) => field.name === byId("field").value) ?? header.fields[0];
 const removed = () => byId("rigid").checked;
+
+const shortTime = (iso) =>
+  new Date(iso).toLocaleString([], { day: "numeric", month: "short", hour: "2-digit", minute: "2-digit", hour12: false });
 
 // Loading ----------------------------------------------------------------------------------------
 
@@ -45,7 +52,7 @@ export async function showRuns() {
   byId("results").hidden = runs.length === 0;
   setOptions(
     byId("run"),
-    runs.map(({ run, finished_at }) => ({ value: run, label: `${run} of ${new Date(finished_at).toLocaleString([], { hour12: false })}` })),
+    runs.map(({ run, finished_at }) => ({ value: run, label: `${run}, ${shortTime(finished_at)}` })),
   );
   if (!runs.length) {
     header = null;
@@ -63,15 +70,16 @@ export async function showRuns() {
 async function openRun() {
   stop();
   arrays.clear();
+  const request = ++wanted;
   const opened = await get(url("sessions", state.current, "results", byId("run").value));
-  const sameSession = header?.session === opened.session;
+  if (request !== wanted) return;
   header = opened;
   limitsByHand = null;
-  if (!surface) {
-    const { Surface } = await import("./surface.js");
-    surface = new Surface(byId("surface"));
+  viewer ??= import("./surface.js").then(({ Surface }) => {
+    surface = new Surface(byId("surface"), drawAxes);
     wirePicking();
-  }
+  });
+  await viewer;
   const options = header.fields.map(({ name, label, unit }) => ({
     value: name,
     label: unit ? `${label} (${unit})` : label,
@@ -83,22 +91,29 @@ async function openRun() {
   byId("step").max = String(header.steps.length - 1);
   byId("step").value = String(header.steps.length - 1);
   byId("download").href = url("sessions", header.session, "results", header.run, "file");
-  surface.setFaces(new Uint32Array(await bytes("faces")));
+  const faces = await bytes("faces");
+  if (header !== opened) return; // another run was chosen meanwhile
+  surface.setFaces(new Uint32Array(faces));
+  facesOf = opened;
+  shownPoints = null;
   showFigures();
-  await show();
-  if (!sameSession) surface.resetView();
+  if ((await show()) && viewedSession !== opened.session) {
+    viewedSession = opened.session;
+    surface.resetView();
+  }
 }
 
-/** Load what the controls ask for, and draw it. */
+/** Load what the controls ask for, and draw it; true unless something else was asked for meanwhile. */
 async function show() {
   const field = chosenField();
   const step = Number(byId("step").value);
   const request = ++wanted;
   const [points, values] = await Promise.all([bytes("positions", step), bytes("fields", field.name, step)]);
-  if (request !== wanted) return;
+  if (request !== wanted || facesOf !== header) return false;
   const scale = SCALES[field.centre === null ? "sequential" : "diverging"];
   const [low, high] = limitsByHand ?? automaticLimits(field);
-  surface.setPositions(new Float32Array(points));
+  if (points !== shownPoints) surface.setPositions(new Float32Array(points));
+  shownPoints = points;
   surface.setField(new Float32Array(values), field.location, scale, low, high);
   showLegend(field, scale, low, high);
   const name = step === 0 ? `${header.steps[0]} (reference)` : header.steps[step];
@@ -106,6 +121,7 @@ async function show() {
   byId("step").setAttribute("aria-valuetext", name);
   byId("rigid").title = field.rigid ? "" : "This field is the same with and without; the shape moves.";
   byId("surface").dataset.shown = `${field.name}/${step}/${removed()}`;
+  return true;
 }
 
 // Colours ----------------------------------------------------------------------------------------
@@ -155,7 +171,7 @@ function typedLimits() {
 function showFigures() {
   const { points, faces, pairs, cameras } = header;
   byId("figures").textContent =
-    `${points.toLocaleString()} points, ${faces.toLocaleString()} triangles, ${cameras.length} cameras, ${pairs.length} pairs`;
+    [counted(points, "point"), counted(faces, "triangle"), counted(cameras.length, "camera"), counted(pairs.length, "pair")].join(", ");
   const rows = header.summary?.table;
   if (!Array.isArray(rows) || !rows.length) {
     byId("table").replaceChildren();
@@ -163,14 +179,29 @@ function showFigures() {
   }
   const names = Object.keys(rows[0]);
   const cells = (row) => names.map((name) => element("td", {}, String(row[name] ?? "")));
+  // Rows of figures read as numbers only if every column but the first is one.
+  const numeric = rows.every((row) => names.slice(1).every((name) => /^[-−–\d.,e+\s%]*$/.test(String(row[name] ?? ""))));
   byId("table").replaceChildren(
     element(
       "table",
-      {},
+      { class: numeric ? "numbers" : null },
       element("thead", {}, element("tr", {}, ...names.map((name) => element("th", { scope: "col" }, name)))),
       element("tbody", {}, ...rows.map((row) => element("tr", {}, ...cells(row)))),
     ),
   );
+}
+
+/** The world's axes as the present view sees them. */
+function drawAxes(axes) {
+  for (const [k, [right, up]] of axes.entries()) {
+    const name = "xyz"[k];
+    const line = byId(`axis-${name}`);
+    line.setAttribute("x2", String(24 * right));
+    line.setAttribute("y2", String(-24 * up));
+    const letter = byId(`letter-${name}`);
+    letter.setAttribute("x", String(31 * right));
+    letter.setAttribute("y", String(-31 * up));
+  }
 }
 
 function wirePicking() {

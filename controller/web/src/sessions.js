@@ -1,13 +1,13 @@
 // Choosing and making sessions.
 
 import { post, put, url } from "./api.js";
-import { byId, notice, setOptions } from "./dom.js";
+import { byId, counted, notice, setOptions } from "./dom.js";
 import { state } from "./live.js";
 
 export function showSessions() {
   const options = state.sessions.map(({ name, captures, runs }) => {
     const count = Object.values(captures).reduce((sum, n) => sum + n, 0);
-    return { value: name, label: `${name}  (${count} captures, ${runs} runs)` };
+    return { value: name, label: `${name} (${counted(count, "capture")}, ${counted(runs, "run")})` };
   });
   const none = [{ value: "", label: "no session yet" }];
   setOptions(byId("session-select"), options.length ? options : none, state.current ?? "");

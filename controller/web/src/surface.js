@@ -2,7 +2,6 @@
 
 import {
   AmbientLight,
-  AxesHelper,
   BufferAttribute,
   BufferGeometry,
   DirectionalLight,
@@ -21,9 +20,10 @@ import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { paint } from "./colours.js";
 
 export class Surface {
-  /** @param {HTMLCanvasElement} canvas */
-  constructor(canvas) {
+  /** @param {HTMLCanvasElement} canvas @param {(axes: number[][]) => void} onDraw told, after each drawing, how the axes lie */
+  constructor(canvas, onDraw = () => {}) {
     this.canvas = canvas;
+    this.onDraw = onDraw;
     // The drawing is kept, so that it can be copied and looked at by a test.
     this.renderer = new WebGLRenderer({ canvas, antialias: false, alpha: true, preserveDrawingBuffer: true });
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
@@ -37,9 +37,6 @@ export class Surface {
     this.mesh = new Mesh(new BufferGeometry(), new MeshLambertMaterial({ vertexColors: true, side: DoubleSide }));
     this.mesh.frustumCulled = false;
     this.scene.add(this.mesh);
-    this.axes = new AxesHelper(1);
-    this.axes.setColors(0xd04040, 0x3a9a3a, 0x4070d0);
-    this.scene.add(this.axes);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.listenToKeyEvents(canvas);
     this.controls.addEventListener("change", () => this.draw());
@@ -50,6 +47,7 @@ export class Surface {
   /** The triangles of a run: vertex indices, Uint32Array (3 × faces). */
   setFaces(faces) {
     this.faces = faces;
+    this.points = null;
     this.mesh.geometry.dispose();
     const geometry = new BufferGeometry();
     for (const name of ["position", "normal", "color"]) {
@@ -61,6 +59,8 @@ export class Surface {
   /** Vertices of one step, Float32Array (3 × points) in mm, NaN where not measured: such faces are not drawn. */
   setPositions(points) {
     const { faces } = this;
+    if (points === this.points) return;
+    this.points = points;
     const normals = vertexNormals(points, faces);
     const position = this.mesh.geometry.attributes.position;
     const normal = this.mesh.geometry.attributes.normal;
@@ -99,20 +99,20 @@ export class Surface {
     this.draw();
   }
 
-  /** Look at the whole surface from the side, a little from above. */
+  /** Look at the whole surface from where it faces, a little from above; a closed ring from any side. */
   resetView() {
     const sphere = this.mesh.geometry.boundingSphere;
     if (!sphere || !(sphere.radius > 0)) return;
     const opening = (this.camera.fov * Math.PI) / 360;
     const distance = (1.05 * sphere.radius) / Math.sin(Math.min(opening, Math.atan(Math.tan(opening) * this.camera.aspect)));
-    const direction = new Vector3(1, -0.55, 0.4).normalize();
+    const { direction: facing, share } = facingOf(this.mesh.geometry.attributes.position.array, 9 * this.count);
+    const direction = share > 0.2 ? facing.setZ(0.2 + facing.z) : new Vector3(1, -0.55, 0.4);
+    direction.normalize();
     this.camera.position.copy(sphere.center).addScaledVector(direction, distance);
     this.camera.near = distance / 100;
     this.camera.far = distance * 20;
     this.camera.updateProjectionMatrix();
     this.controls.target.copy(sphere.center);
-    this.axes.scale.setScalar(sphere.radius * 0.25);
-    this.axes.position.copy(sphere.center).addScaledVector(new Vector3(0.35, -0.75, -0.75), sphere.radius);
     this.controls.update();
     this.draw();
   }
@@ -135,8 +135,16 @@ export class Surface {
     return { value, position: hit.point };
   }
 
+  /** Where the world's axes point on the screen: [right, up, towards the eye] for x, y and z, unit vectors. */
+  axes() {
+    this.camera.updateMatrixWorld();
+    const columns = this.camera.matrixWorldInverse.elements;
+    return [0, 1, 2].map((k) => [columns[4 * k], columns[4 * k + 1], columns[4 * k + 2]]);
+  }
+
   draw() {
     this.renderer.render(this.scene, this.camera);
+    this.onDraw(this.axes());
   }
 
   #resize() {
@@ -160,6 +168,22 @@ function boundingSphere(array, length) {
   }
   if (!length) return new Sphere(new Vector3(), 0);
   return new Sphere(low.clone().add(high).multiplyScalar(0.5), low.distanceTo(high) / 2);
+}
+
+/** The mean direction of the triangles, weighted by area, and how much of the area agrees with it, 0 … 1. */
+function facingOf(array, length) {
+  const direction = new Vector3();
+  const [a, b, c] = [new Vector3(), new Vector3(), new Vector3()];
+  let area = 0;
+  for (let i = 0; i < length; i += 9) {
+    a.fromArray(array, i);
+    b.fromArray(array, i + 3).sub(a);
+    c.fromArray(array, i + 6).sub(a);
+    b.cross(c);
+    area += b.length();
+    direction.add(b);
+  }
+  return { share: area ? direction.length() / area : 0, direction: direction.normalize() };
 }
 
 /** Normals of the vertices: the sum of the area vectors of the faces around them. */
