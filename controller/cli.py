@@ -54,7 +54,7 @@ def controller(
     from controller.config import read_config
     from controller.service import run_controller
 
-    run_controller(read_config(config))
+    run_controller(read_config(config), on_ready=typer.echo)
 
 
 @app.command(name="import")
@@ -82,10 +82,9 @@ def process(
     as_json: AsJson = False,
 ) -> None:
     """Calibrate, correlate, triangulate and compute strain, with nothing to click."""
+    from processing.errors import InputError
     from processing.pipeline import process_session
     from processing.settings import load_settings
-
-    from processing.errors import InputError
 
     if cluster is not None:
         raise InputError("--cluster: computing on a cluster is not available in this version; leave the option out")

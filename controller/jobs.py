@@ -66,7 +66,7 @@ def processing_command(settings: Path | None = None) -> Command:
 
     def command(session: Path) -> list[str]:
         chosen = ["--settings", str(settings)] if settings else []
-        return [sys.executable, "-m", "processing", str(session), *chosen, "--progress-json"]
+        return [sys.executable, "-m", "processing", str(session), *chosen]
 
     return command
 

@@ -183,12 +183,11 @@ def _render_body(lens, R, o, p, look, seed, out):  # type: ignore[no-untyped-def
     d = np.empty(3)
     share = 1.0 / SAMPLES
     per_x, per_y = share / lens[0], share / lens[1]
-    x = y = first_x = first_y = 0.0
+    first_x, first_y = -lens[3] / lens[0], -lens[4] / lens[1]  # the first pixel, were there no distortion
     for v in range(height):
         theta = z = t = 0.0
         near = False
-        if v > 0:  # the first pixel of the row above is a good start
-            x, y = first_x, first_y
+        x, y = first_x, first_y  # the first pixel of the row above is a good start
         for u in range(width):
             x, y, xu, xv, yu, yv = ideal(u, v, lens, x, y)
             if u == 0:
@@ -260,10 +259,9 @@ def _render_board(lens, R, o, Rb, tb, out):  # type: ignore[no-untyped-def]
     d = np.empty(3)
     share = 1.0 / SAMPLES
     per_x, per_y = share / lens[0], share / lens[1]
-    x = y = first_x = first_y = 0.0
+    first_x, first_y = -lens[3] / lens[0], -lens[4] / lens[1]  # the first pixel, were there no distortion
     for v in range(height):
-        if v > 0:
-            x, y = first_x, first_y
+        x, y = first_x, first_y
         for u in range(width):
             x, y, xu, xv, yu, yv = ideal(u, v, lens, x, y)
             if u == 0:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from node_agent.virtual_rig.lens import distort, ideal
+from node_agent.virtual_rig.lens import VirtualCamera, distort, ideal
 from node_agent.virtual_rig.render import radiance, render
 from node_agent.virtual_rig.rig import paper_rig, write_truth
 from node_agent.virtual_rig.scenes import Cylinder, Limb, Specimen, Target, scene
@@ -21,11 +21,22 @@ def linear(image: np.ndarray) -> np.ndarray:
     return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
 
 
+@pytest.mark.parametrize("camera", [camera for seed in range(4) for camera in paper_rig(12, SCALE, seed).cameras])
+def test_no_lens_folds_the_image_over(camera: VirtualCamera) -> None:
+    lens = camera.lens
+    for u in (0.0, camera.width - 1.0):
+        for v in (0.0, camera.height - 1.0):
+            x, y, xu, xv, yu, yv = ideal(u, v, lens, (u - lens[3]) / lens[0], (v - lens[4]) / lens[1])
+            assert abs(x) < 1
+            assert abs(y) < 1
+            assert xu * yv - xv * yu > 0
+
+
 def test_the_lens_inverts_itself_all_over_the_image() -> None:
     lens = CAMERA.lens
     for u in np.linspace(0, CAMERA.width, 7):
         for v in np.linspace(0, CAMERA.height, 7):
-            x, y, *_ = ideal(u, v, lens, 0.0, 0.0)
+            x, y, *_ = ideal(u, v, lens, (u - lens[3]) / lens[0], (v - lens[4]) / lens[1])
             a, b = distort(x, y, lens)
             assert lens[0] * a + lens[2] * b + lens[3] == pytest.approx(u, abs=1e-9)
             assert lens[1] * b + lens[4] == pytest.approx(v, abs=1e-9)

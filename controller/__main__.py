@@ -1,0 +1,5 @@
+"""``python -m controller …`` is ``ringdic …``."""
+
+from controller.cli import main
+
+main()

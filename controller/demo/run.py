@@ -1,0 +1,130 @@
+"""The straight line of the demo: start, capture, process, compare, serve."""
+
+from __future__ import annotations
+
+import json
+import time
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from controller.console import narrated, say, show_table
+from controller.demo.client import Client
+from controller.demo.comparison import compare_with_truth
+from controller.demo.rig import Setting, check_alive, running_controller, running_nodes
+from node_agent.virtual_rig.render import render
+from node_agent.virtual_rig.rig import VirtualRig, paper_rig, write_truth
+from node_agent.virtual_rig.scenes import Limb, scene
+from processing.progress import Progress, Report
+from processing.rig import parse_rig
+from processing.session import newest_results
+
+BOARDS = 8  # views of the checkerboard a camera
+_JOB = 3600.0  # seconds that processing may take
+
+
+def run_demo(folder: Path, *, cameras: int, scale: float, steps: int, serve: bool) -> dict[str, Any]:
+    """Run the demo in ``folder`` and return the table of measured against true as JSON values.
+
+    Every run makes a folder of its own inside. With ``serve`` the page stays up until Ctrl-C.
+    """
+    began = time.monotonic()
+    setting = Setting(_new_folder(folder), cameras, scale)
+    rig = paper_rig(cameras, scale, setting.seed)
+    say(f"a simulated ring of {cameras} cameras of {rig.cameras[0].width} x {rig.cameras[0].height} px")
+    _warm_up(cameras)
+    write_truth(rig, setting.folder)
+    name = parse_rig(rig.rig_toml()).name
+    ids = [camera.id for camera in rig.cameras]
+    with (
+        running_controller(setting, rig.rig_toml(), _settings(scale)) as (address, endpoint),
+        running_nodes(setting, name, ids, endpoint) as nodes,
+    ):
+        client = Client(address)
+        client.wait_for_nodes(ids, 120.0, lambda: check_alive(nodes, setting.folder))
+        say(f"{cameras} nodes and the controller are up; the page is at {address}")
+        session = client.post("/sessions", {"name": "demo"})["name"]
+        with narrated() as report:
+            _capture_all(client, steps, report)
+            _follow(client, session, report)
+        comparison = _compare(setting, session, rig, began)
+        if serve:
+            say(f"the result is on the page: {address}  (Ctrl-C ends)")
+            _wait_for_ctrl_c()
+    return comparison
+
+
+def _warm_up(cameras: int) -> None:
+    """Compile the renderer once here, so that the nodes find it compiled."""
+    tiny = paper_rig(cameras, 0.05).cameras[0]
+    for kind in ("board", "target", "specimen"):
+        render(tiny, scene(kind, 0))
+
+
+def _capture_all(client: Client, steps: int, report: Report) -> None:
+    """Boards, target, the reference and the steps; a job that starts by itself before the last step is stopped."""
+    kinds = ["board"] * BOARDS + ["target"] + ["specimen"] * (steps + 1)
+    for k, kind in enumerate(kinds):
+        report(Progress("capture", k / len(kinds), f"{kind}, capture {k + 1} of {len(kinds)}"))
+        record = client.capture(kind)
+        failed = {id_: entry["reason"] for id_, entry in record["cameras"].items() if entry["status"] == "failed"}
+        if failed:
+            say(f"{record['capture_id']}: {', '.join(f'{id_} failed ({reason})' for id_, reason in failed.items())}")
+        if k < len(kinds) - 1:
+            client.cancel_jobs()
+    report(Progress("capture", 1.0, f"{len(kinds)} captures archived"))
+
+
+def _follow(client: Client, session: str, report: Report) -> None:
+    def watch(job: dict[str, Any]) -> None:
+        if job["stage"]:
+            report(Progress(job["stage"], job["done"], job["message"], job["rate"], job["left_s"]))
+
+    client.follow_job(session, watch, _JOB)
+
+
+def _compare(setting: Setting, session: str, rig: VirtualRig, began: float) -> dict[str, Any]:
+    """Show and keep the table of measured against true."""
+    results = newest_results(setting.archive / session)
+    figures = compare_with_truth(results, Limb())
+    summary = json.loads((results.parent / "summary.json").read_text(encoding="utf-8"))
+    show_table(f"session {session}: {setting.archive / session}", summary["table"])
+    show_table("the virtual rig knows the truth", [figure.row() for figure in figures])
+    seconds = time.monotonic() - began
+    say(f"from start to result: {seconds:.0f} s")
+    comparison = {
+        "session": str(setting.archive / session),
+        "cameras": len(rig.cameras),
+        "seconds": round(seconds, 1),
+        "control_points_rms_mm": summary["control_points"]["rms_mm"],
+        "figures": [figure.to_dict() for figure in figures],
+    }
+    (setting.folder / "comparison.json").write_text(json.dumps(comparison, indent=1, ensure_ascii=False))
+    return comparison
+
+
+def _settings(scale: float) -> str:
+    """The paper's radius 20 and step 10 px at full scale; at a smaller one no fewer pixels than a subset needs."""
+    radius, step = max(10, round(20 * scale)), max(5, round(10 * scale))
+    return f"[correlation]\nradius_px = {radius}\nstep_px = {step}\n"
+
+
+def _new_folder(folder: Path) -> Path:
+    """A folder of this run's own: nothing of an earlier run is touched."""
+    stamp = datetime.now().strftime("%Y-%m-%d-%H%M%S")
+    for k in range(100):
+        path = Path(folder) / (stamp if k == 0 else f"{stamp}-{k}")
+        try:
+            path.mkdir(parents=True)
+            return path.resolve()
+        except FileExistsError:
+            continue
+    raise FileExistsError(f"{folder}: no free name for a new run")
+
+
+def _wait_for_ctrl_c() -> None:
+    try:
+        while True:
+            time.sleep(1.0)
+    except KeyboardInterrupt:
+        say("ended")
