@@ -119,12 +119,12 @@ def _match_automatically(points: Field, seconds: dict[str, float]) -> None:
     doubtful = []
     for name, method in _METHODS:
         open_points = _open(points)
-        if len(open_points) <= (1.0 - _ENOUGH) * len(points.xy):
+        if len(open_points) <= (1.0 - _ENOUGH) * _worth(points):
             break
         began = time.perf_counter()
         seeds = open_points[spread(points.xy[open_points])]
         trial = _try_seeds(points, seeds, method)
-        share = float(trial.good.mean())
+        share = float(trial.good.sum() / max((trial.status != Status.NO_TEXTURE).sum(), 1))
         log.debug("%s: %d of %d seeds hold", name, int(trial.good.sum()), len(seeds))
         seconds["start"] += time.perf_counter() - began
         if share < _TRUSTED:
@@ -133,13 +133,18 @@ def _match_automatically(points: Field, seconds: dict[str, float]) -> None:
         points.adopt(seeds, trial)
         _carry_on(points, seconds)
     for _, seeds, trial in sorted(doubtful, key=lambda entry: -entry[0]):
-        if len(_open(points)) > (1.0 - _ENOUGH) * len(points.xy):
+        if len(_open(points)) > (1.0 - _ENOUGH) * _worth(points):
             points.adopt(seeds, trial)
             _carry_on(points, seconds)
 
 
 def _open(points: Field) -> NDArray[np.int64]:
     return np.flatnonzero(~points.good & (points.status != Status.NO_TEXTURE))
+
+
+def _worth(points: Field) -> int:
+    """The number of points with texture enough to be matched."""
+    return int((points.status != Status.NO_TEXTURE).sum())
 
 
 def _try_seeds(points: Field, seeds: NDArray[np.int64], method: StartValues) -> Field:

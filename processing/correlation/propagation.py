@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -57,6 +58,8 @@ class Field:
         self.iterations = np.zeros(n, np.int64)
         self.sigma = np.full((n, 2), np.nan)
         self.tried = np.zeros((n, COUNT), bool)
+        bare = bare_points(self.reference, self.xy, self.settings)
+        self.status[bare] = Status.NO_TEXTURE
 
     @property
     def good(self) -> NDArray[np.bool_]:
@@ -144,6 +147,31 @@ class Field:
 
     def _has_good_neighbour(self) -> NDArray[np.bool_]:
         return np.asarray(((self.near >= 0) & self.good[self.near]).any(axis=1))
+
+
+def bare_points(reference: Reference, xy: Array, settings: CorrelationSettings) -> NDArray[np.bool_]:
+    """Points (n,) with clearly too little texture about them, seen at once for all: no start value is sought there.
+
+    The weaker eigenvalue of the structure tensor over the square about the point; the kernel judges the subset itself.
+    """
+    size = (2 * settings.radius + 1,) * 2
+    inside = reference.mask.astype(np.float64)
+    at = np.rint(xy - reference.origin).astype(np.int64)
+    h, w = inside.shape
+    column, row = np.clip(at[:, 0], 0, w - 1), np.clip(at[:, 1], 0, h - 1)
+
+    def mean(values: Array) -> Array:
+        filtered = cv2.boxFilter(values * inside, cv2.CV_64F, size, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(filtered, dtype=np.float64)[row, column]
+
+    share = np.maximum(mean(inside), 1e-9)
+    xx, xy_, yy = (
+        mean(a * b) / share
+        for a, b in ((reference.gx, reference.gx), (reference.gx, reference.gy), (reference.gy, reference.gy))
+    )
+    weakest = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy_**2)
+    limit = 0.7 * settings.texture_min * reference.grey_range / 255.0
+    return np.asarray(weakest < limit**2)
 
 
 def _degenerate(parameters: Array) -> NDArray[np.bool_]:

@@ -21,7 +21,8 @@ class CorrelationSettings:
     tolerance : px; iteration stops when no pixel at the subset's rim moves by more, in the root mean square sense.
     max_iterations : after so many the point is lost.
     zncc_min : below this a point is lost.
-    texture_min : least root-mean-square gradient along the weakest direction, in 1/255 of the grey range a pixel.
+    texture_min : least root-mean-square gradient along the weakest direction, in 1/255 of the grey range a pixel;
+        the rounding to whole grey levels alone makes 0.5.
     noise : standard deviation of the grey levels; None takes it from the residual of each subset.
     """
 
@@ -33,7 +34,7 @@ class CorrelationSettings:
     tolerance: float = 1e-5
     max_iterations: int = 50
     zncc_min: float = 0.7
-    texture_min: float = 0.5
+    texture_min: float = 1.0
     noise: float | None = None
 
     def __post_init__(self) -> None:
