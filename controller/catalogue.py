@@ -40,17 +40,19 @@ class Catalogue:
         with self._lock:
             self._db.close()
 
-    def sync(self) -> None:
-        """Read the session folders that are new or changed; forget those that are gone."""
+    def sync(self) -> bool:
+        """Read the session folders that are new or changed, forget those that are gone; whether there were any."""
         found = {path.name: path for path in self._folders()}
         with self._lock:
             known = {row["name"]: row["signature"] for row in self._db.execute("select name, signature from sessions")}
-            for name in known.keys() - found.keys():
+            gone = known.keys() - found.keys()
+            changed = [name for name, path in found.items() if known.get(name) != _signature(path)]
+            for name in gone:
                 with self._transaction():
                     self._forget(name)
-            for name, path in found.items():
-                if known.get(name) != _signature(path):
-                    self.refresh(name)
+            for name in changed:
+                self.refresh(name)
+        return bool(gone or changed)
 
     def refresh(self, name: str) -> None:
         """Read one session folder anew."""

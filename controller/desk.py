@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from threading import Lock, Thread
+from threading import Event, Lock, Thread
 from typing import Any, Protocol
 
 from controller.catalogue import Catalogue
@@ -76,6 +76,9 @@ class Desk:
     clock
         The present time.
 
+    watch
+        Seconds between two looks at the folders for what other programs have put there.
+
     `connect` adds the archive and the nodes; until then the desk only shows.
     """
 
@@ -85,6 +88,7 @@ class Desk:
         command: Command,
         rig_toml: str | None = None,
         clock: Callable[[], datetime] = lambda: datetime.now(UTC),
+        watch: float = 3.0,
     ) -> None:
         self.root = Path(root)
         self.root.mkdir(parents=True, exist_ok=True)
@@ -100,6 +104,9 @@ class Desk:
         self._selected: str | None = None
         self._rounds: dict[str, Round] = {}
         self._running: str | None = None
+        self._closing = Event()
+        self._watcher = Thread(target=self._watch, args=(watch,), name="folders", daemon=True)
+        self._watcher.start()
 
     def connect(self, archive: Sessions | None, ring: Ring | None) -> None:
         """Use this archive and these nodes from now on."""
@@ -107,8 +114,10 @@ class Desk:
         self.live.publish_snapshot()
 
     def close(self) -> None:
-        """Stop the jobs."""
+        """Stop the jobs and the watch over the folders."""
+        self._closing.set()
         self.jobs.close()
+        self._watcher.join(5)
 
     # What is -------------------------------------------------------------------------------------
 
@@ -267,6 +276,15 @@ class Desk:
                     self._rounds[running.id] = replace(running, state="open", capture_id=capture_id)
                 self._round_changed()
         self._publish_capture(session, capture_id)
+
+    def _watch(self, interval: float) -> None:
+        """Show sessions and runs that the command line makes while the controller is open."""
+        while not self._closing.wait(interval):
+            try:
+                if self.catalogue.sync():
+                    self.live.publish_snapshot()
+            except OSError as error:  # a folder on a network drive may go and come back
+                logger.warning("the archive's folder cannot be read: %s", error)
 
     def _capture(self, started: Round) -> None:
         assert self._ring is not None

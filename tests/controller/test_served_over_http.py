@@ -18,10 +18,13 @@ import pytest
 import uvicorn
 
 from controller.app import create_app
+from controller.archive import Archive
 from controller.config import ControllerConfig
 from controller.desk import Desk
 from controller.service import SHUTDOWN_LIMIT, open_desk, serve
 from processing.errors import InputError
+
+RIG = '[rig]\nname = "ring-2"\n[[cameras]]\nid = "01"\n'
 
 
 @pytest.fixture
@@ -79,6 +82,15 @@ def test_the_event_stream_tells_a_capture_from_arming_to_the_close_and_does_not_
         assert not thread.is_alive()
         assert time.monotonic() - started < SHUTDOWN_LIMIT + 4
     reader.join(10)
+
+
+def test_a_session_that_another_program_makes_is_shown(tmp_path: Path) -> None:
+    desk = Desk(tmp_path, lambda _: [], watch=0.05)
+    shown: queue.Queue = queue.Queue()
+    desk.live.publish_snapshot = lambda: shown.put(desk.snapshot())  # type: ignore[method-assign]
+    Archive(tmp_path).create_session("imported", RIG, source="import")
+    assert [session["name"] for session in shown.get(timeout=10)["sessions"]] == ["imported"]
+    desk.close()
 
 
 PROGRAM = """
