@@ -321,7 +321,7 @@ class Desk:
             self._running = None
         self.live.publish("round", asdict(ended))
         self._publish_rig()
-        self.live.publish("sessions", {"sessions": self.catalogue.sessions(), "current": self.current()})
+        self._publish_sessions()
 
     def _round_changed(self) -> None:
         with self._lock:
@@ -332,6 +332,9 @@ class Desk:
 
     def _publish_rig(self) -> None:
         self.live.publish("rig", self.rig_state())
+
+    def _publish_sessions(self) -> None:
+        self.live.publish("sessions", {"sessions": self.catalogue.sessions(), "current": self.current()})
 
     def _publish_capture(self, session: str, capture_id: str) -> None:
         self.catalogue.refresh(session)
@@ -346,4 +349,5 @@ class Desk:
             self.catalogue.sync()
             self.catalogue.refresh(job.session)
             self.live.publish("runs", {"session": job.session, "runs": self.catalogue.runs(job.session)})
+            self._publish_sessions()
         self.live.publish("job", asdict(job))

@@ -6,7 +6,8 @@
     queued → superseded (a newer capture of the same session) | cancelled
 
 The child prints JSON lines: progress ``{"stage", "done", "rate", "left_s", "message"}`` and at the end
-``{"state": "done", "run", "summary"}`` or ``{"state": "failed", "error"}``. Every other line is log.
+``{"state": "done", "run", "summary"}`` or ``{"state": "failed", "error"}``. Every other line is log, and so is the
+begin of every stage.
 """
 
 from __future__ import annotations
@@ -202,15 +203,22 @@ class Jobs:
             if cancelled:
                 _end(child)
             outcome: dict[str, Any] = {}
+            told = ""
             for line in _lines(child):
                 message = _message(line)
                 if message is None:
                     log.write(line)
-                    log.flush()
                 elif "state" in message:
                     outcome = message
                 else:
                     self._progress(job_id, message)
+                    step = f"{message.get('stage', '')} {message.get('message', '')}".rstrip()
+                    if step != told:
+                        log.write(f"{datetime.now():%H:%M:%S} {step}\n")
+                        told = step
+                log.flush()
+            if outcome.get("error"):
+                log.write(f"{datetime.now():%H:%M:%S} failed: {outcome['error']}\n")
             code = child.wait()
             with self._changed:
                 self._child = None

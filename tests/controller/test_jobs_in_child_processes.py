@@ -44,7 +44,9 @@ def test_a_job_reports_its_stage_and_keeps_the_rest_as_log(tmp_path: Path) -> No
     assert recorder.states(job.id) == ["queued", "running", "done"]
     told = next(seen for seen in recorder.seen if seen.stage == "calibrate")
     assert (told.done, told.rate, told.left_s, told.message) == (0.25, "3 views/s", 9.0, "camera 201")
-    assert jobs.log(job.id).splitlines() == ["a line of log with ångström", "{not json"]
+    step, *rest = jobs.log(job.id).splitlines()
+    assert step.split(" ", 1)[1] == "calibrate camera 201"
+    assert rest == ["a line of log with ångström", "{not json"]
     jobs.close()
 
 

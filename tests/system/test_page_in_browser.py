@@ -234,6 +234,7 @@ def test_an_operator_presses_the_buttons_and_sees_the_strain(page: Page, station
     assert min(ticks(page)) == pytest.approx(0.9)
     assert max(ticks(page)) == pytest.approx(1.1)
     expect(page.locator("#table")).to_contain_text("larger stretch")
+    expect(page.locator("#session-select option:checked")).to_have_text("by-hand (4 captures, 1 run)")
 
 
 def test_the_images_of_a_capture_can_be_looked_at_and_had(page: Page, station: Station) -> None:
