@@ -19,6 +19,7 @@ class Lost(IntEnum):
 
     RESIDUAL = 16  # the lines of sight miss one another
     SURFACE = 17  # off the surface that its neighbours form
+    UNCERTAIN = 18  # matched, but with too large a standard deviation in an image
 
 
 def crossing_outliers(residuals: Array, factor: float = 8.0, floor: float = 0.3) -> Mask:

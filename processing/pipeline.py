@@ -118,7 +118,7 @@ def _surfaces(
         progress(0.0)
         try:
             found = match_pair(cameras, image, len(steps), _mask(session, cameras[0]), search, correlation, progress)
-            surfaces.append(pair_surface(cameras, found, correlation.step))
+            surfaces.append(pair_surface(cameras, found, correlation.step, settings.surface.sigma_max_px))
         except ComputationError as error:
             log.warning("%s", error)
             warnings.append(str(error))

@@ -70,12 +70,14 @@ class SurfaceGroup(_Group):
 
     radius_mm : of the cylinder from which the search sets out; 0 takes the target's.
     reach_mm : how far from it the surface may lie. incidence_deg : the steepest angle of view that is used.
+    sigma_max_px : a point whose match has a larger standard deviation, where the speckle ends, is lost.
     """
 
     method: Literal["pairs", "global"] = "pairs"
     radius_mm: float = Field(default=0.0, ge=0)
     reach_mm: float = Field(default=20.0, gt=0)
     incidence_deg: float = Field(default=65.0, gt=0, lt=90)
+    sigma_max_px: float = Field(default=0.05, gt=0)
 
     @field_validator("method")
     @classmethod

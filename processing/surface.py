@@ -37,16 +37,18 @@ class PairSurface:
     drift: Array
 
 
-def pair_surface(cameras: tuple[Camera, Camera], found: PairMatches, step_px: int) -> PairSurface:
+def pair_surface(cameras: tuple[Camera, Camera], found: PairMatches, step_px: int, sigma_max_px: float) -> PairSurface:
     """Triangulate a pair's matches, drop what cannot be right, and keep the triangles between measured points.
 
-    step_px : spacing of the grid in the reference image.
+    step_px : spacing of the grid in the reference image. sigma_max_px : least certain match that is believed.
     """
     matches = found.matches
     steps, n = matches.c_ls.shape
     xyz = np.full((steps, n, 3), np.nan)
     sigma = np.full((steps, n, 3), np.nan)
-    status = matches.status.copy()
+    with np.errstate(invalid="ignore"):
+        uncertain = (matches.sigma > sigma_max_px).any(axis=(1, 3))
+    status = np.where((matches.status == 0) & uncertain, Lost.UNCERTAIN, matches.status).astype(np.int8)
     drift = np.full(steps, np.nan)
     for step in range(steps):
         good = status[step] == 0
