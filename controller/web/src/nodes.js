@@ -33,7 +33,7 @@ function tile(node) {
     { class: `node ${kind}`, "data-node": node.id, title: details.join("\n") },
     element("span", { class: "node-id" }, node.id),
     element("span", { class: "node-state" }, word),
-    element("span", { class: `node-last ${last?.status ?? ""}` }, last ? `last: ${last.status}` : "no capture yet"),
+    element("span", { class: `node-last ${last?.status ?? ""}` }, last ? `last: ${last.status}` : "no capture"),
     element("span", { class: "node-spool" }, spool.join(", ") || " "),
   );
 }
