@@ -281,7 +281,8 @@ class RigLink:
         try:
             self._reconcile_node(camera)
         except (OSError, ValueError, zenoh.ZError) as error:
-            log.error("node %s could not be reconciled: %s", camera, error)
+            if not self._stop.is_set():
+                log.error("node %s could not be reconciled: %s", camera, error)
 
     def _reconcile_node(self, camera: str) -> None:
         """Ask one node for its status and its inventory; fetch what the archive lacks."""

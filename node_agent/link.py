@@ -149,8 +149,6 @@ def node_config(controller: str) -> zenoh.Config:
         "mode": "peer",
         "listen/endpoints": [],
         "connect/endpoints": [f"{controller}{';' if '#' in controller else '#'}{parameters}"],
-        "connect/timeout_ms": 0,
-        "connect/exit_on_failure": False,
         **NETWORK,
     }
     for key, value in settings.items():

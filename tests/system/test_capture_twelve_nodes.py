@@ -221,6 +221,9 @@ with RigLink("test-ring", ["a", "b", "c"], endpoint, archive, lambda event: None
 def test_a_controller_and_a_node_killed_in_a_burst_lose_nothing(three: Ring, tmp_path: Path):
     root = tmp_path / "archive"
     session = Archive(root).create_session("burst", rig_toml(three.cameras))
+    # Nodes come up first, try in vain for a while, and must find the controller when it appears.
+    assert until(lambda: all("serves" in three.log(camera) for camera in three.cameras), 30)
+    time.sleep(1.5)
     process = subprocess.Popen([sys.executable, "-c", CONTROLLER, str(root), three.endpoint], env=os.environ)
     try:
         # Dead in the middle of the third capture: its record is open and its cameras are about to fire.
