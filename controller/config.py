@@ -7,7 +7,7 @@
     settings = "settings.toml"       # settings of the processing
 
     [http]
-    host = "127.0.0.1"
+    host = "127.0.0.1"               # the page has no password: another address opens it to that network
     port = 8000                      # 0: a free port
 
     [zenoh]

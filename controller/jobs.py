@@ -94,6 +94,7 @@ class Jobs:
         self._child: subprocess.Popen[str] | None = None
         self._changed = Condition()
         self._closing = False
+        self._noticed = 0.0  # when progress was last told, s
         self._load()
         self._worker = Thread(target=self._work, name="jobs", daemon=True)
         self._worker.start()
@@ -245,7 +246,7 @@ class Jobs:
             known = {name: message[name] for name in _PROGRESS if name in message}
             self._jobs[job_id] = moved = replace(job, **known)
         now = time.monotonic()
-        if moved.stage != job.stage or now - getattr(self, "_noticed", 0.0) > _NOTICE_EVERY:
+        if moved.stage != job.stage or now - self._noticed > _NOTICE_EVERY:
             self._noticed = now
             self._on_change(moved)
 

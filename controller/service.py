@@ -69,7 +69,8 @@ def serve(desk: Desk, config: ControllerConfig, on_ready: Callable[[str], None] 
     Raises InputError if the port is taken.
     """
     listener = _listen(config)
-    address = f"http://{config.host}:{listener.getsockname()[1]}"
+    host = f"[{config.host}]" if ":" in config.host else config.host
+    address = f"http://{host}:{listener.getsockname()[1]}"
     server = uvicorn.Server(
         uvicorn.Config(create_app(desk), log_level="warning", timeout_graceful_shutdown=SHUTDOWN_LIMIT)
     )
