@@ -30,9 +30,7 @@ def create_app(desk: Desk, static: Path = STATIC) -> FastAPI:
         "Everything the page can do, a script can do.",
     )
     app.state.desk = desk
-    api = APIRouter(
-        prefix="/api/v1", responses={404: {"description": "Not there"}, 409: {"description": "Refused"}}
-    )
+    api = APIRouter(prefix="/api/v1", responses={404: {"description": "Not there"}, 409: {"description": "Refused"}})
     for resource in (rig, sessions, captures, jobs, results, live):
         api.include_router(resource.router)
     app.include_router(api)
