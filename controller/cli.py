@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from controller.console import narrated, show_table
-from processing.errors import RingdicError
+from processing.errors import InputError, RingdicError
 
 app = typer.Typer(
     name="ringdic",
@@ -82,7 +82,6 @@ def process(
     as_json: AsJson = False,
 ) -> None:
     """Calibrate, correlate, triangulate and compute strain, with nothing to click."""
-    from processing.errors import InputError
     from processing.pipeline import process_session
     from processing.settings import load_settings
 
@@ -104,7 +103,7 @@ def correlate(
     cur: Annotated[Path, typer.Argument(metavar="CUR", help="Current image.")],
     out: Annotated[Path, typer.Option(help="Where the points go (npz).")],
     mask: Annotated[Path | None, typer.Option(help="Region of interest: an image, not 0 inside.")] = None,
-    radius: Annotated[int, typer.Option(min=3, help="Subset radius, px.")] = 20,
+    radius: Annotated[int, typer.Option(min=2, max=500, help="Subset radius, px.")] = 20,
     step: Annotated[int, typer.Option(min=1, help="Grid step, px.")] = 10,
     order: Annotated[int, typer.Option(min=1, max=2, help="Order of the shape function.")] = 1,
     subset: Annotated[str, typer.Option(help="circle or square.")] = "circle",
@@ -113,10 +112,10 @@ def correlate(
 ) -> None:
     """2D correlation of one pair of images."""
     from processing.correlation.command import correlate_files
+    from processing.correlation.settings import CorrelationSettings
 
-    summary = correlate_files(
-        ref, cur, out, mask=mask, radius=radius, step=step, order=order, subset=subset, threads=threads
-    )
+    settings = CorrelationSettings(radius=radius, step=step, order=order, subset=subset)
+    summary = correlate_files(ref, cur, out, settings, mask=mask, threads=threads)
     if as_json:
         _print_json(summary)
     else:
@@ -148,6 +147,13 @@ def main() -> None:
     except RingdicError as error:
         typer.echo(f"ringdic: {error}", err=True)
         sys.exit(error.exit_code)
+    except OSError as error:  # a folder that may not be written, a full disk: the operator's to mend
+        if error.filename is None:
+            raise
+        typer.echo(
+            f"ringdic: {error.filename}: {error.strerror}; check the path, its permissions and the disk", err=True
+        )
+        sys.exit(InputError.exit_code)
 
 
 def _print_json(value: dict[str, Any]) -> None:

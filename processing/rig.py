@@ -143,17 +143,18 @@ def parse_rig(text: str) -> Rig:
     _refuse_unknown(tables, {"rig", "target", "board", "cameras", "capture", "pairs"}, "")
     for name in ("rig", "target", "board", "cameras"):
         _require(name in tables, f"[{name}] is missing")
-    _refuse_unknown(tables["rig"], {"name"}, "[rig] ")
-    _require("name" in tables["rig"], "[rig] name is missing")
-    cameras = tuple(
-        _build(RigCamera, entry, f"[[cameras]] number {i + 1} ") for i, entry in enumerate(tables["cameras"])
-    )
+    rig = _table(tables["rig"], "[rig]")
+    _refuse_unknown(rig, {"name"}, "[rig] ")
+    _require("name" in rig, "[rig] name is missing")
+    entries = tables["cameras"]
+    _require(isinstance(entries, list), "cameras must be one [[cameras]] table a camera, with two pairs of brackets")
+    cameras = tuple(_build(RigCamera, entry, f"[[cameras]] number {i + 1} ") for i, entry in enumerate(entries))
     _require(len(cameras) >= 2, "[[cameras]] needs at least two cameras")
     ids = [camera.id for camera in cameras]
     for camera_id in ids:
         _require(ids.count(camera_id) == 1, f"camera id '{camera_id}' occurs more than once")
     return Rig(
-        name=tables["rig"]["name"],
+        name=_typed(rig["name"], "str", "[rig] name"),
         target=_build(Target, tables["target"], "[target] "),
         board=_build(Board, tables["board"], "[board] "),
         cameras=cameras,
@@ -165,11 +166,15 @@ def parse_rig(text: str) -> Rig:
 def _pairs(table: Any, cameras: tuple[RigCamera, ...]) -> tuple[tuple[str, str], ...]:
     if table is None:
         return adjacent_pairs(cameras)
+    table = _table(table, "[pairs]")
     _refuse_unknown(table, {"pairs"}, "[pairs] ")
-    ids = {camera.id for camera in cameras}
+    listed = table.get("pairs", [])
+    _require(isinstance(listed, list), f"[pairs] pairs must be a list of pairs of camera ids, not {listed!r}")
+    ids = [camera.id for camera in cameras]
     pairs = []
-    for pair in table.get("pairs", []):
-        _require(len(pair) == 2 and pair[0] != pair[1], f"[pairs] {pair} is not a pair of cameras")
+    for pair in listed:
+        two = isinstance(pair, list) and len(pair) == 2 and pair[0] != pair[1]
+        _require(two, f"[pairs] {pair!r} is not a pair of cameras")
         for camera_id in pair:
             _require(camera_id in ids, f"[pairs] names camera '{camera_id}', which [[cameras]] does not have")
         pairs.append((pair[0], pair[1]))
@@ -177,36 +182,47 @@ def _pairs(table: Any, cameras: tuple[RigCamera, ...]) -> tuple[tuple[str, str],
     return tuple(pairs)
 
 
-def _build(kind: type[T], table: dict[str, Any], where: str) -> T:
+def _build(kind: type[T], table: Any, where: str) -> T:
     """One frozen dataclass from one TOML table, with unknown, missing and mistyped keys named."""
     known = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
+    table = _table(table, where.strip())
     _refuse_unknown(table, set(known), where)
     values: dict[str, Any] = {}
     for name, field in known.items():
         if name not in table:
             _require(field.default is not MISSING, f"{where}{name} is missing")
             continue
-        value = table[name]
-        values[name] = tuple(value) if isinstance(value, list) else _typed(value, str(field.type), where + name)
+        values[name] = _typed(table[name], str(field.type), where + name)
     return kind(**values)
 
 
+_WANTED = {"float": "a number", "int": "a whole number", "str": "text in quotes"}
+
+
 def _typed(value: Any, annotation: str, where: str) -> Any:
+    """A TOML value as the field's annotation wants it: a number, a whole number, text, or two numbers."""
     wanted = annotation.split(" | ")[0]
-    if wanted == "float":
+    if wanted.startswith("tuple["):
+        inner = wanted.removeprefix("tuple[").removesuffix("]").split(", ")
         _require(
-            isinstance(value, int | float) and not isinstance(value, bool),
-            f"{where} must be a number, not {value!r}",
+            isinstance(value, list) and len(value) == len(inner),
+            f"{where} must be a list of {len(inner)} numbers, not {value!r}",
         )
-        return float(value)
-    if wanted == "int":
-        _require(
-            isinstance(value, int) and not isinstance(value, bool),
-            f"{where} must be a whole number, not {value!r}",
-        )
+        return tuple(_typed(each, kind, where) for each, kind in zip(value, inner, strict=True))
     if wanted == "str":
-        _require(isinstance(value, str), f'{where} must be text in quotes, not {value!r} (write "{value}")')
-    return value
+        written = f' (write "{value}")' if isinstance(value, int | float) else ""
+        _require(isinstance(value, str), f"{where} must be {_WANTED[wanted]}, not {value!r}{written}")
+        return value
+    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    _require(
+        number and (wanted == "float" or isinstance(value, int)), f"{where} must be {_WANTED[wanted]}, not {value!r}"
+    )
+    return float(value) if wanted == "float" else value
+
+
+def _table(value: Any, header: str) -> dict[str, Any]:
+    _require(isinstance(value, dict), f"{header} must be a table, not {value!r}")
+    return dict(value)
 
 
 def _refuse_unknown(table: dict[str, Any], known: set[str], where: str) -> None:
