@@ -1,6 +1,7 @@
 """Fixtures of the whole suite."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -21,3 +22,26 @@ def shared_data() -> Path:
     if not (path / "multidic_rig" / "reference.npz").is_file():
         _skip_or_fail(f"SKIPPED FOR WANT OF DATA: no shared reference data at {path}")
     return path
+
+
+_FIGURES = pytest.StashKey[list[tuple[str, str, str]]]()
+
+
+@pytest.fixture(scope="session")
+def figures(request: pytest.FixtureRequest) -> Callable[[str, str, str], None]:
+    """Call it with what was measured, the figure and its bound: the table at the end of the run shows it."""
+    kept = request.config.stash.setdefault(_FIGURES, [])
+
+    def report(what: str, figure: str, bound: str) -> None:
+        kept.append((what, figure, bound))
+
+    return report
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """The figures that tests measured, beside their bounds."""
+    rows = config.stash.get(_FIGURES, [])
+    if rows:
+        terminalreporter.section("figures measured")
+        for what, figure, bound in rows:
+            terminalreporter.write_line(f"{what:<62} {figure:>24}   {bound}")
