@@ -101,6 +101,11 @@ class Problem:
         """Images of the dots' centres. (n, 2) px."""
         return project_centres(self.views(state))
 
+    def lens_gap(self, state: State) -> Array:
+        """Squared distance of each lens from what is known of it, in units of its covariance. (C,)."""
+        gap = state.inner - self.lens
+        return np.einsum("ci,cij,cj->c", gap, self.lens_information, gap)
+
     def without(self, left_out: Mask) -> Problem:
         """The same with some observations (n,) taken away."""
         return replace(self, px=self.px[~left_out], camera=self.camera[~left_out], dot=self.dot[~left_out])
@@ -108,10 +113,13 @@ class Problem:
 
 @dataclass(frozen=True)
 class Scales:
-    """Standard deviations of a centroid, px a component, and of the print errors, mm; 0 where the dots are held."""
+    """Standard deviations of a centroid, px a component, and of the print errors, mm, 0 where the dots are held; and
+    by what the standard errors that the boards gave the lenses must be multiplied, 1 or more.
+    """
 
     px: float
     print: float
+    lens: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -143,7 +151,11 @@ def adjust(problem: Problem, start: State, print_sigma: float, *, limit: int = 6
         normal = _normal(problem, state, scales)
         if near:
             now = _estimate(problem, state, normal)
-            settled = abs(now.px / scales.px - 1) < 0.005 and abs(now.print - scales.print) <= 0.02 * scales.print
+            settled = (
+                abs(now.px / scales.px - 1) < 0.005
+                and abs(now.print - scales.print) <= 0.02 * scales.print
+                and abs(now.lens / scales.lens - 1) < 0.02
+            )
             scales, normal = now, _reweighted(problem, state, normal, now)
         trial, damping, gained, cost = _step(problem, state, normal, damping)
         iterations += 1
@@ -212,7 +224,7 @@ def _assembled(
 ) -> _Normal:
     m = len(problem.rows) if scales.print else 0
     w = np.minimum(1.0, HUBER * scales.px / np.maximum(np.abs(residuals), 1e-300)) / scales.px**2  # (n, 2)
-    prior, a = _beforehand(problem, state)
+    prior, a = _beforehand(problem, state, scales)
     weighted = by_rest * w.reshape(-1)[:, None]
     A = (by_rest.T @ weighted).toarray() + prior
     a = a + by_rest.T @ (w * residuals).ravel()
@@ -228,14 +240,14 @@ def _assembled(
     return _Normal(scales, A, B, D, a, d, prior, by_rest, by_dot, residuals)
 
 
-def _beforehand(problem: Problem, state: State) -> tuple[Array, Array]:
+def _beforehand(problem: Problem, state: State, scales: Scales) -> tuple[Array, Array]:
     """Information on the free parameters known beforehand (k, k), and its pull on the state (k,)."""
     C = len(state.inner)
     whole, pull = np.zeros((len(problem.free),) * 2), np.zeros(len(problem.free))
     for c, (information, gap) in enumerate(zip(problem.lens_information, state.inner - problem.lens, strict=True)):
         lens = slice(PER_CAMERA * c, PER_CAMERA * c + 10)
-        whole[lens, lens] = information
-        pull[lens] = -information @ gap
+        whole[lens, lens] = information / scales.lens**2
+        pull[lens] = -information @ gap / scales.lens**2
     known = np.flatnonzero(problem.sheet_sigma > 0)
     at = PER_CAMERA * C + known
     whole[at, at] = 1 / problem.sheet_sigma[known] ** 2
@@ -248,9 +260,7 @@ def _sheet_gap(problem: Problem, state: State) -> Array:
     return np.array([sheet.radius - nominal.radius, sheet.pitch - nominal.pitch, sheet.tilt])
 
 
-def _step(
-    problem: Problem, state: State, normal: _Normal, damping: float
-) -> tuple[State | None, float, float, float]:
+def _step(problem: Problem, state: State, normal: _Normal, damping: float) -> tuple[State | None, float, float, float]:
     """The state after one step, or None where none lowers the cost; the damping, the gain and the cost before."""
     cost = _cost(problem, state, normal.scales)
     while damping < 1e8:
@@ -269,8 +279,7 @@ def _cost(problem: Problem, state: State, scales: Scales) -> float:
     with np.errstate(all="ignore"):
         t = np.abs(problem.px - problem.project(state)) / scales.px
         cost = float(np.sum(np.where(t <= HUBER, t * t, HUBER * (2 * t - HUBER))))
-    gap = state.inner - problem.lens
-    cost += float(np.einsum("ci,cij,cj->", gap, problem.lens_information, gap))
+    cost += float(problem.lens_gap(state).sum()) / scales.lens**2
     known = problem.sheet_sigma > 0
     cost += float(np.sum((_sheet_gap(problem, state)[known] / problem.sheet_sigma[known]) ** 2))
     if scales.print:
@@ -286,11 +295,20 @@ def _estimate(problem: Problem, state: State, normal: _Normal) -> Scales:
     spent = len(normal.a) + normal.d.size - float(np.sum(covariance * normal.prior)) - own
     redundancy = max(1 - spent / normal.residuals.size, 0.05)
     px = max(_robust_sigma(normal.residuals) / float(np.sqrt(redundancy)), _PX_FLOOR)
+    lens = 1.0
+    known: Mask = np.any(problem.lens_information != 0, axis=2)
+    if known.any():
+        at = np.zeros(len(problem.free), dtype=bool)
+        at[:-3].reshape(len(known), PER_CAMERA)[:, :10] = known
+        at = at[problem.free]
+        own_lens = float(np.sum(covariance[np.ix_(at, at)] * normal.prior[np.ix_(at, at)]))
+        left = max(float(known.sum()) - own_lens, 0.01 * float(known.sum()))
+        lens = max(float(np.sqrt(problem.lens_gap(state).sum() / left)), 1.0)
     if not old.print:
-        return Scales(px, 0.0)
+        return Scales(px, 0.0, lens)
     count = state.offsets.size
     found = float(np.sqrt(np.sum(state.offsets**2) / max(count - own, 1e-6 * count)))
-    return Scales(px, max(found, _PRINT_FLOOR))
+    return Scales(px, max(found, _PRINT_FLOOR), lens)
 
 
 def _robust_sigma(residuals: Array) -> float:
@@ -301,8 +319,8 @@ def _robust_sigma(residuals: Array) -> float:
 def _reduced(normal: _Normal, damping: float) -> tuple[tuple[Array, bool], Array, Array, Array]:
     """Factor and scale of the equations without the dots, D⁻¹ (m, 2, 2) and B D⁻¹ (k, m, 2)."""
     A = normal.A + damping * np.diag(np.diag(normal.A))
-    inverse_D = np.linalg.inv(normal.D + damping * normal.D * np.eye(2))
-    BD = np.einsum("kmi,mij->kmj", normal.B, inverse_D)
+    inverse_D = np.asarray(np.linalg.inv(normal.D + damping * normal.D * np.eye(2)), dtype=np.float64)
+    BD: Array = np.einsum("kmi,mij->kmj", normal.B, inverse_D)
     S = A - BD.reshape(len(A), -1) @ normal.B.reshape(len(A), -1).T
     scale = 1 / np.sqrt(np.diag(A))
     try:

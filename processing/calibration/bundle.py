@@ -241,8 +241,8 @@ def _require_dots(ids: tuple[str, ...], part: Problem) -> None:
         found = int((part.camera == number).sum())
         if found < 12:
             raise ComputationError(
-                f"camera {id_}: only {found} of its dots agree with the other cameras; check that the target was not "
-                "moved between its images and that all belong to one capture"
+                f"camera {id_}: only {found} of its dots lie where a camera with its lens can see them; check that the "
+                "images of board and target are of this camera, sharp and unscaled"
             )
 
 
@@ -277,8 +277,6 @@ def _adjusted(
 def _fit(ids: tuple[str, ...], part: Problem, solution: Solution) -> BundleFit:
     state = solution.state
     dots_sigma = np.sqrt(np.einsum("mii->mi", solution.dots_covariance))
-    gap = state.inner - part.lens
-    squared = np.einsum("ci,cij,cj->c", gap, part.lens_information, gap)
     count = part.free[:-3].reshape(-1, PER_CAMERA)[:, :10].sum(axis=1)
     known = part.lens_information.any(axis=(1, 2))
     return BundleFit(
@@ -291,5 +289,5 @@ def _fit(ids: tuple[str, ...], part: Problem, solution: Solution) -> BundleFit:
         part.columns,
         state.offsets,
         dots_sigma if len(dots_sigma) else np.zeros_like(state.offsets),
-        np.where(known, squared / np.maximum(count, 1), np.nan),
+        np.where(known, part.lens_gap(state) / np.maximum(count, 1), np.nan),
     )

@@ -62,8 +62,8 @@ def by_sheet(target: Target, rows: NDArray[np.intp], columns: NDArray[np.intp]) 
 
 
 def _nominal(target: Target, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> tuple[Array, Array]:
-    arc = (np.asarray(columns) - 1) * float(target.column_spacing_mm)
-    return arc, target.first_row_z_mm + (np.asarray(rows) - 1) * float(target.row_spacing_mm)
+    arc = (np.asarray(columns, dtype=np.float64) - 1) * target.column_spacing_mm
+    return arc, target.first_row_z_mm + (np.asarray(rows, dtype=np.float64) - 1) * target.row_spacing_mm
 
 
 def _middle(target: Target) -> tuple[float, float]:
@@ -85,14 +85,15 @@ def nodes(shape: str, size: float) -> tuple[Array, Array]:
     square : 4 × 4 Gauss-Legendre points of the edge ``size``. circle : of the diameter ``size``, two radii by Gauss's
     rule in r² and eight angles, exact to the seventh degree.
     """
+    x: Array
+    w: Array
     if shape == "square":
-        x, w = np.polynomial.legendre.leggauss(4)
-        s, z = np.meshgrid(x, x)
-        return 0.5 * size * np.column_stack([s.ravel(), z.ravel()]), np.outer(w, w).ravel() / 4
+        x, w = (np.asarray(each, dtype=np.float64) for each in np.polynomial.legendre.leggauss(4))
+        return 0.5 * size * np.column_stack([np.tile(x, 4), np.repeat(x, 4)]), np.outer(w, w).ravel() / 4
     x, w = np.polynomial.legendre.leggauss(2)
-    radius, angle = np.meshgrid(0.5 * size * np.sqrt((x + 1) / 2), np.arange(8) * np.pi / 4, indexing="ij")
-    weights = np.repeat(w / 2, 8) / 8
-    return np.column_stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()]), weights
+    radius = np.repeat(0.5 * size * np.sqrt((x + 1) / 2), 8)
+    angle = np.tile(np.arange(8) * np.pi / 4, 2)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]), np.repeat(w, 8) / 16
 
 
 @dataclass(frozen=True)
