@@ -169,7 +169,7 @@ def adjust(problem: Problem, start: State, print_sigma: float, *, limit: int = 6
             px = _robust_sigma(problem.px - problem.project(state))
             scales = Scales(max(px, _PX_FLOOR), print_sigma)
         near = near or done or gained <= 0.02 * cost
-    covariance, dots_covariance = _inverse(normal)
+    covariance, _, dots_covariance = _inverse(normal)
     whole = np.zeros((len(problem.free),) * 2)
     whole[np.ix_(problem.free, problem.free)] = covariance
     return Solution(state, scales, whole, dots_covariance, iterations)
@@ -179,7 +179,8 @@ def adjust(problem: Problem, start: State, print_sigma: float, *, limit: int = 6
 class _Normal:
     """Normal equations at a state and at scales: A of the k free parameters of cameras and sheet (k, k), D of each dot
     (m, 2, 2), B between them (k, m, 2), right sides a (k,) and d (m, 2); the information known beforehand, prior
-    (k, k), is in A. by_rest (2 n, k) and by_dot (n, 2, 2) are the Jacobians and residuals (n, 2), all in px.
+    (k, k), is in A. by_rest (2 n, k) and by_dot (n, 2, 2) are the Jacobians and residuals (n, 2), all in px;
+    weights (n, 2) in px⁻².
     """
 
     scales: Scales
@@ -192,6 +193,7 @@ class _Normal:
     by_rest: sparse.csr_array
     by_dot: Array
     residuals: Array
+    weights: Array
 
 
 def _normal(problem: Problem, state: State, scales: Scales) -> _Normal:
@@ -237,7 +239,7 @@ def _assembled(
         np.add.at(D, problem.dot, np.swapaxes(by_dot, 1, 2) @ (w[..., None] * by_dot))
         D += np.eye(2) / scales.print**2
         d = (J.T @ (w * residuals).ravel()).reshape(m, 2) - state.offsets / scales.print**2
-    return _Normal(scales, A, B, D, a, d, prior, by_rest, by_dot, residuals)
+    return _Normal(scales, A, B, D, a, d, prior, by_rest, by_dot, residuals, w)
 
 
 def _beforehand(problem: Problem, state: State, scales: Scales) -> tuple[Array, Array]:
@@ -288,13 +290,12 @@ def _cost(problem: Problem, state: State, scales: Scales) -> float:
 
 
 def _estimate(problem: Problem, state: State, normal: _Normal) -> Scales:
-    """Both scales from what is left over, each divided by its redundancy."""
+    """All scales from what is left over, each divided by its redundancy."""
     old = normal.scales
-    covariance, dots = _inverse(normal)
-    own = float(np.einsum("mii->", dots)) / old.print**2 if old.print else 0.0
-    spent = len(normal.a) + normal.d.size - float(np.sum(covariance * normal.prior)) - own
-    redundancy = max(1 - spent / normal.residuals.size, 0.05)
-    px = max(_robust_sigma(normal.residuals) / float(np.sqrt(redundancy)), _PX_FLOOR)
+    covariance, crossed, dots = _inverse(normal)
+    redundancy = 1 - _leverage(problem, normal, covariance, crossed, dots)
+    telling = redundancy > 0.05  # the rest is what fits anything
+    px = max(_robust_sigma(normal.residuals[telling] / np.sqrt(redundancy[telling])), _PX_FLOOR)
     lens = 1.0
     known: Mask = np.any(problem.lens_information != 0, axis=2)
     if known.any():
@@ -307,8 +308,21 @@ def _estimate(problem: Problem, state: State, normal: _Normal) -> Scales:
     if not old.print:
         return Scales(px, 0.0, lens)
     count = state.offsets.size
+    own = float(np.einsum("mii->", dots)) / old.print**2
     found = float(np.sqrt(np.sum(state.offsets**2) / max(count - own, 1e-6 * count)))
     return Scales(px, max(found, _PRINT_FLOOR), lens)
+
+
+def _leverage(problem: Problem, normal: _Normal, covariance: Array, crossed: Array, dots: Array) -> Array:
+    """Share of each residual (n, 2) that the parameters take up: diagonal of J N⁻¹ Jᵀ W."""
+    J, by_dot = normal.by_rest, normal.by_dot
+    taken = np.sum((J @ covariance) * J.toarray(), axis=1).reshape(-1, 2)
+    if len(dots):
+        both = (J @ crossed.reshape(len(covariance), -1)).reshape(len(by_dot), 2, -1, 2)
+        both = both[np.arange(len(by_dot)), :, problem.dot]
+        taken += 2 * np.einsum("nri,nri->nr", both, by_dot)
+        taken += np.einsum("nri,nij,nrj->nr", by_dot, dots[problem.dot], by_dot)
+    return np.asarray(taken * normal.weights, dtype=np.float64)
 
 
 def _robust_sigma(residuals: Array) -> float:
@@ -342,9 +356,9 @@ def _solve(normal: _Normal, damping: float) -> tuple[Array, Array]:
     return rest, dots
 
 
-def _inverse(normal: _Normal) -> tuple[Array, Array]:
-    """Covariance of the free parameters of cameras and sheet (k, k) and of each dot (m, 2, 2)."""
+def _inverse(normal: _Normal) -> tuple[Array, Array, Array]:
+    """Covariance of the free parameters of cameras and sheet (k, k), with the dots (k, m, 2), of each dot (m, 2, 2)."""
     factor, scale, inverse_D, BD = _reduced(normal, 0.0)
     covariance = cho_solve(factor, np.eye(len(scale))) * np.outer(scale, scale)
-    by_rest = np.tensordot(covariance, BD, axes=1)
-    return covariance, inverse_D + np.einsum("kmi,kmj->mij", BD, by_rest)
+    crossed = -np.tensordot(covariance, BD, axes=1)
+    return covariance, crossed, inverse_D - np.einsum("kmi,kmj->mij", BD, crossed)

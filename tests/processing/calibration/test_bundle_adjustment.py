@@ -246,7 +246,7 @@ def test_the_diameter_is_right_where_the_dlt_s_is_not(request, fits, shape, figu
     figures(f"diameter bias, {shape} dots: DLT, bundle, µm", f"{before * 1e3:.1f}, {after * 1e3:.2f}", "> 50, 3")
     assert 0.05 < before < 0.12
     assert abs(after) < 0.003
-    assert fit.px_sigma == pytest.approx(0.01, rel=0.08)
+    assert fit.px_sigma == pytest.approx(0.01, rel=0.1)
     assert fit.print_sigma < 0.002
 
 
