@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from processing.calibration.adjustment import PER_CAMERA, Problem, Solution, State, adjust
 from processing.calibration.camera_calibration import CameraCalibration
-from processing.calibration.patch import Sheet, sheet_points, wrapped
+from processing.calibration.patch import Sheet, Views, project_centres, project_patches, sheet_points, wrapped
 from processing.camera import Camera, Intrinsics
 from processing.errors import ComputationError
 from processing.rig import Target
@@ -165,6 +165,38 @@ def adjust_ring(
     return adjusted, _fit(ids, part, solution)
 
 
+def centroid_shift(
+    camera: Camera,
+    target: Target,
+    rows: Index,
+    columns: Index,
+    *,
+    sheet: Sheet | None = None,
+    rotation: Array | None = None,
+    translation: Array | None = None,
+) -> Array:
+    """Centroid of the image of each dot minus the image of its centre, for a target that was moved. (n, 2) px.
+
+    Measured centroids less this are images of points, which lines of sight through them meet.
+
+    rows, columns : (n,), from 1. sheet : as adjusted, else the nominal one.
+    rotation : (3, 3) and translation : (3,) mm, of the target in the world; none leaves it in place.
+    """
+    sheet = sheet or Sheet.nominal(target)
+    R, t = _pose(camera.P, camera.intrinsics)
+    t = t if translation is None else t + R @ np.asarray(translation, dtype=float)
+    R = R if rotation is None else R @ np.asarray(rotation, dtype=float)
+    n = len(rows)
+    views = Views(
+        np.tile(_inner(camera), (n, 1)),
+        np.tile(R, (n, 1, 1)),
+        np.tile(t, (n, 1)),
+        sheet_points(target, sheet, rows, columns),
+        sheet.radius,
+    )
+    return project_patches(views, target.dot_shape, target.dot_size_mm) - project_centres(views)
+
+
 def _problem(given: list[CameraCalibration], target: Target, prior: TargetPrior) -> tuple[Problem, State]:
     rows = np.concatenate([each.dots.rows for each in given])
     columns = np.concatenate([each.dots.columns for each in given])
@@ -198,20 +230,22 @@ def _problem(given: list[CameraCalibration], target: Target, prior: TargetPrior)
 def _lens(given: CameraCalibration) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Parameters of a lens (10,), what is known of them (10, 10), and which are free (10,)."""
     information, free = np.zeros((10, 10)), np.zeros(10, dtype=bool)
-    lens = given.camera.intrinsics
-    if lens is None:
-        K, _ = _split(given.camera.P)
+    if given.camera.intrinsics is None:
         free[:5] = True
-        return np.array([K[0, 0], K[1, 1], K[0, 1], K[0, 2], K[1, 2], 0, 0, 0, 0, 0]), information, free
-    K = lens.K
-    values = np.array([K[0, 0], K[1, 1], K[0, 1], K[0, 2], K[1, 2], *lens.distortion])
-    if given.fit is not None:
+    elif given.fit is not None:
         free = given.fit.sigma > 0
         sigma = given.fit.sigma[free]
         correlation = given.fit.covariance[np.ix_(free, free)] / np.outer(sigma, sigma)
         inflation = max(1.0, 2 * _CORNER_SIGMA**2 / max(given.fit.rms**2, 1e-12))
         information[np.ix_(free, free)] = np.linalg.pinv(correlation) / np.outer(sigma, sigma) / inflation
-    return values, information, free
+    return _inner(given.camera), information, free
+
+
+def _inner(camera: Camera) -> Array:
+    """fx fy s cx cy k1 k2 p1 p2 k3. (10,)."""
+    lens = camera.intrinsics
+    K, distortion = (_split(camera.P)[0], np.zeros(5)) if lens is None else (lens.K, lens.distortion)
+    return np.array([K[0, 0], K[1, 1], K[0, 1], K[0, 2], K[1, 2], *distortion])
 
 
 def _split(P: Array) -> tuple[Array, Array]:

@@ -13,7 +13,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from processing.calibration import dlt
-from processing.calibration.bundle import BundleFit, TargetPrior, adjust_ring
+from processing.calibration.bundle import BundleFit, TargetPrior, adjust_ring, centroid_shift
 from processing.calibration.camera_calibration import CameraCalibration
 from processing.calibration.intrinsics import IntrinsicsFit, calibrate_intrinsics
 from processing.calibration.patch import Sheet, Views, nodes, patch_jacobians, project_patches, sheet_points
@@ -190,6 +190,23 @@ def test_the_centroid_of_a_patch_is_that_of_its_outline(true_cameras, shape) -> 
     centre = camera.project(np.column_stack([57 * np.cos(angle), 57 * np.sin(angle), sz[:, 1]]))
     assert 0.15 < np.linalg.norm(outline - centre, axis=1).max() < 0.6
     assert nodes(shape, 4.0)[1].sum() == pytest.approx(1.0)
+
+
+def test_centroids_of_a_moved_target_are_known_too(true_cameras) -> None:
+    camera, rows, columns = true_cameras["c03"], np.array([1, 8, 20]), np.array([4, 6, 8])
+    R, t = turned(np.array([0.01, -0.02, 0.03])), np.array([5.0, 1.0, -2.0])
+    sz = sheet_points(TARGET, Sheet.nominal(TARGET), rows, columns)
+    M = np.column_stack([R, t])
+    moved = Camera("moved", camera.P @ np.vstack([M, [0, 0, 0, 1]]), SIZE, camera.intrinsics)
+    centre = camera.project(dot_points(TARGET, rows, columns) @ R.T + t)
+    truth = outline_centroids(moved, sz, 57.0, "square", 4.0) - centre
+    found = centroid_shift(camera, TARGET, rows, columns, rotation=R, translation=t)
+    assert np.allclose(found, truth, rtol=0, atol=2e-5)
+    still = centroid_shift(camera, TARGET, rows, columns)
+    assert np.abs(still - found).max() > 1e-3
+    bare = replace(camera, intrinsics=None)
+    flat = outline_centroids(bare, sz, 57.0, "square", 4.0) - bare.project(dot_points(TARGET, rows, columns))
+    assert np.allclose(centroid_shift(bare, TARGET, rows, columns), flat, rtol=0, atol=2e-5)
 
 
 def test_derivatives_of_a_patch_are_those_of_differences(true_cameras) -> None:

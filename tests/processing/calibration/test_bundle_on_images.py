@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from processing.calibration.bundle import adjust_ring
+from processing.calibration.bundle import adjust_ring, centroid_shift
 from processing.calibration.camera_calibration import CameraCalibration, calibrate_camera
 from processing.calibration.dots import find_dots
 from processing.calibration.target import DotObservations, identify
 from processing.camera import Camera, Intrinsics
 from processing.errors import InputError
-from processing.rig import Rig, RigCamera, Target, read_rig
+from processing.rig import Rig, RigCamera, read_rig
 from processing.ring import calibrate_ring, control_points
 from processing.session import Capture, Session
 from processing.settings import CalibrationGroup
@@ -103,22 +103,6 @@ def diameter_bias(rig: Rig, true: dict[str, Camera], cameras: dict[str, CameraCa
     return fitted_diameter(np.concatenate(points), 124.0)[0] - 114.0
 
 
-def outline_shift(camera: Camera, xyz: np.ndarray, target: Target) -> np.ndarray:
-    """Centroid of the image of each dot, moved with the target, minus the image of its centre. (n, 2) px."""
-    side, half = np.linspace(-0.5, 0.5, 50, endpoint=False), np.full(50, 0.5)
-    parts = [(side, -half), (half, side), (-side, half), (-half, -side)]
-    outline = target.dot_size_mm * np.concatenate([np.column_stack(part) for part in parts])
-    home = xyz - MOVED
-    angle = np.arctan2(home[:, 1], home[:, 0])[:, None] + outline[:, 0] / target.radius_mm
-    around = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1) * target.radius_mm
-    around[..., 2] = home[:, 2, None] + outline[:, 1]
-    px, centre = camera.project(around + MOVED), camera.project(xyz)
-    p = px - centre[:, None]
-    q = np.roll(p, -1, axis=1)
-    area = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
-    return np.sum((p + q) * area[..., None], axis=1) / (3 * area.sum(axis=1)[:, None])
-
-
 def stage(
     rig: Rig, cameras: dict[str, CameraCalibration], moved: dict[str, DotObservations], patches: bool
 ) -> tuple[float, float]:
@@ -136,7 +120,8 @@ def stage(
         X = triangulate(lenses, np.stack([c.dot_centres[i] for c, i in zip(before, chosen[:2], strict=True)]))
         px = np.stack([d.px[i] for d, i in zip(after, chosen[2:], strict=True)])
         if patches:
-            px = px - np.stack([outline_shift(camera, X + MOVED, rig.target) for camera in lenses])
+            names = [np.array(name) for name in zip(*common, strict=True)]
+            px = px - np.stack([centroid_shift(each, rig.target, *names, translation=MOVED) for each in lenses])
         Y = triangulate(lenses, px)
         a, b = X - X.mean(axis=0), Y - Y.mean(axis=0)
         U, _, Vt = np.linalg.svd(a.T @ b)
