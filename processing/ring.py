@@ -157,7 +157,7 @@ def _contradictions(fit: BundleFit) -> tuple[str, ...]:
     return (
         f"camera {', '.join(off)}: the lens that fits the target is up to {worst:.0f} standard errors from the one "
         "that fits the checkerboard, so the board counted less; check that the board is flat and its squares true, "
-        "that [target] describes the target, and that no lens was touched in between",
+        "that rig.toml describes the target, and that no lens was touched in between",
     )
 
 
