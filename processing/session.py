@@ -72,13 +72,7 @@ class Session:
 def read_session(path: Path) -> Session:
     """The session of a folder; InputError says what is missing."""
     path = Path(path)
-    if not path.is_dir():
-        raise InputError(f"{path}: no such session folder")
-    if not (path / "session.json").is_file():
-        raise InputError(
-            f"{path}: not a session (no session.json); "
-            f"a folder of images becomes one with 'ringdic import {path} SESSION'"
-        )
+    _require_session(path)
     header = _read_json(path / "session.json")
     captures = sorted(_captures(path / "captures"), key=lambda capture: capture.number)
     return Session(path, str(header.get("session", path.name)), read_rig(path / "rig.toml"), tuple(captures))
@@ -96,6 +90,7 @@ def newest_results(path: Path) -> Path:
     """The results file of the newest run; InputError if the session has not been processed."""
     finished = runs(path)
     if not finished:
+        _require_session(Path(path))
         raise InputError(f"{path}: no results yet; run 'ringdic process {path}' first")
     return finished[-1] / "results.h5"
 
@@ -136,6 +131,16 @@ def new_run(path: Path) -> Iterator[NewRun]:
         raise
 
 
+def _require_session(path: Path) -> None:
+    if not path.is_dir():
+        raise InputError(f"{path}: no such session folder")
+    if not (path / "session.json").is_file():
+        raise InputError(
+            f"{path}: not a session (no session.json); "
+            f"a folder of images becomes one with 'ringdic import {path} SESSION'"
+        )
+
+
 def _captures(folder: Path) -> Iterator[Capture]:
     if not folder.is_dir():
         return
@@ -152,13 +157,19 @@ def _captures(folder: Path) -> Iterator[Capture]:
         for camera_id, image in images.items():
             if not image.is_file():
                 raise InputError(
-                    f"{image}: the record of {path.name} names this image of camera {camera_id}, but it is not there"
+                    f"{image}: the record of {path.name} names this image of camera {camera_id}, but it is not there; "
+                    "copy it back, or import the session again"
                 )
         yield Capture(path.name, int(match[1]), match[2], path, images, record)
 
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
+        value = json.loads(path.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error})") from error
+        raise InputError(
+            f"{path}: not readable as JSON ({error}); copy it back, or import the session again"
+        ) from error
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: not a record of a session; copy it back, or import the session again")
+    return value

@@ -172,7 +172,7 @@ def test_bad_requests_are_refused_and_leave_nothing(session: Path, tmp_path: Pat
         export(session, "stl", tmp_path / "x.stl")
     with pytest.raises(InputError, match="no such folder"):
         export(session, "npz", tmp_path / "none" / "x.npz")
-    with pytest.raises(InputError, match="no results yet"):
+    with pytest.raises(InputError, match="not a session"):
         export(tmp_path, "npz")
     with pytest.raises(InputError, match="writes one file"):
         export(session, "npz", tmp_path)

@@ -54,5 +54,5 @@ def test_a_fault_is_named(tmp_path: Path, change: tuple[str, str], sentence: str
 
 
 def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"needs a rig\.toml"):
+    with pytest.raises(InputError, match=r"must describe the target"):
         read_rig(tmp_path / "rig.toml")
