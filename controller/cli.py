@@ -82,12 +82,13 @@ def process(
     as_json: AsJson = False,
 ) -> None:
     """Calibrate, correlate, triangulate and compute strain, with nothing to click."""
-    from processing.pipeline import process_session
     from processing.settings import load_settings
 
     if cluster is not None:
         raise InputError("--cluster: computing on a cluster is not available in this version; leave the option out")
     chosen = load_settings(settings, set_ or [])
+    from processing.pipeline import process_session  # takes a while: what was typed is checked first
+
     with narrated() as report:
         run = process_session(session, chosen, report)
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))

@@ -68,7 +68,8 @@ def read_mask(path: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
     mask = read_gray(path) > 0
     if mask.shape != tuple(shape):
         raise InputError(
-            f"{path}: the mask is {mask.shape[1]} x {mask.shape[0]} px but its image is {shape[1]} x {shape[0]} px"
+            f"{path}: the mask is {mask.shape[1]} x {mask.shape[0]} px but its image is {shape[1]} x {shape[0]} px; "
+            "draw it on the reference image"
         )
     if not mask.any():
         raise InputError(f"{path}: the mask marks no pixel; paint the region of interest white")
