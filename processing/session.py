@@ -31,6 +31,7 @@ from processing.errors import InputError
 from processing.rig import Rig, read_rig
 
 KINDS = ("board", "target", "specimen", "static")
+_MEND = "copy it back, or import the session again"
 _CAPTURE_NAME = re.compile(r"(\d{4,})-(board|target|specimen|static)")
 
 
@@ -149,16 +150,15 @@ def _captures(folder: Path) -> Iterator[Capture]:
         if not match or not (path / "capture.json").is_file():
             continue
         record = _read_json(path / "capture.json")
-        images = {
-            camera_id: path / frame["file"]
-            for camera_id, frame in record.get("cameras", {}).items()
-            if frame.get("file")
-        }
+        frames = record.get("cameras", {})
+        if not isinstance(frames, dict) or not all(isinstance(frame, dict) for frame in frames.values()):
+            raise InputError(f"{path / 'capture.json'}: 'cameras' must have one record a camera; {_MEND}")
+        images = {camera_id: path / frame["file"] for camera_id, frame in frames.items() if frame.get("file")}
         for camera_id, image in images.items():
             if not image.is_file():
                 raise InputError(
                     f"{image}: the record of {path.name} names this image of camera {camera_id}, but it is not there; "
-                    "copy it back, or import the session again"
+                    f"{_MEND}"
                 )
         yield Capture(path.name, int(match[1]), match[2], path, images, record)
 
@@ -167,9 +167,7 @@ def _read_json(path: Path) -> dict[str, Any]:
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{path}: not readable as JSON ({error}); copy it back, or import the session again"
-        ) from error
+        raise InputError(f"{path}: not readable as JSON ({error}); {_MEND}") from error
     if not isinstance(value, dict):
-        raise InputError(f"{path}: not a record of a session; copy it back, or import the session again")
+        raise InputError(f"{path}: not a record of a session; {_MEND}")
     return value

@@ -318,6 +318,11 @@ UNPROCESSABLE: dict[str, tuple[Callable[[Path], object], int, list[str]]] = {
         BAD_INPUT,
         ["0006-specimen/capture.json", "not a record"],
     ),
+    "record without cameras": (
+        lambda session: (session / "captures" / STEPS[0] / "capture.json").write_text('{"cameras": [1]}'),
+        BAD_INPUT,
+        ["0006-specimen/capture.json", "one record a camera", "copy it back"],
+    ),
     "unknown key": (
         lambda session: edited(session / "rig.toml", "rows =", "lines ="),
         BAD_INPUT,
