@@ -35,12 +35,12 @@ def run_demo(folder: Path, *, cameras: int, scale: float, steps: int, serve: boo
     setting = Setting(_new_folder(folder), cameras, scale)
     rig = paper_rig(cameras, scale, setting.seed)
     say(f"a simulated ring of {cameras} cameras of {rig.cameras[0].width} x {rig.cameras[0].height} px")
-    _warm_up(cameras)
+    warm_up(cameras)
     write_truth(rig, setting.folder)
     name = parse_rig(rig.rig_toml()).name
     ids = [camera.id for camera in rig.cameras]
     with (
-        running_controller(setting, rig.rig_toml(), _settings(scale)) as (address, endpoint),
+        running_controller(setting, rig.rig_toml(), settings_for(scale)) as (address, endpoint),
         running_nodes(setting, name, ids, endpoint) as nodes,
     ):
         client = Client(address)
@@ -62,7 +62,7 @@ def _leave(signum: int, _: FrameType | None) -> None:
     raise SystemExit(128 + signum)
 
 
-def _warm_up(cameras: int) -> None:
+def warm_up(cameras: int) -> None:
     """Compile the renderer once here, so that the nodes find it compiled."""
     tiny = paper_rig(cameras, 0.05).cameras[0]
     for kind in ("board", "target", "specimen"):
@@ -111,7 +111,7 @@ def _compare(setting: Setting, session: str, rig: VirtualRig, began: float) -> d
     return comparison
 
 
-def _settings(scale: float) -> str:
+def settings_for(scale: float) -> str:
     """The paper's radius 20 and step 10 px at full scale; at a smaller one no fewer pixels than a subset needs."""
     radius, step = max(10, round(20 * scale)), max(5, round(10 * scale))
     return f"[correlation]\nradius_px = {radius}\nstep_px = {step}\n"
