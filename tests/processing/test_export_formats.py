@@ -149,7 +149,6 @@ def test_vtkhdf_is_the_moving_surface_alone(session: Path, tmp_path: Path) -> No
 
 @pytest.mark.parametrize("name", ["vtkhdf", "vtp"])
 def test_vtk_reads_what_is_exported(session: Path, tmp_path: Path, name: str) -> None:
-    pytest.importorskip("vtkmodules", reason="the vtk package is not installed")
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkIOHDF import vtkHDFReader
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
