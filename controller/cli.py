@@ -25,7 +25,7 @@ app = typer.Typer(
 )
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
-Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="group.name=value; repeatable.")]
+Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="GROUP.NAME=VALUE", help="Repeatable.")]
 SettingsFile = Annotated[Path | None, typer.Option("--settings", help="Settings as a TOML file.")]
 
 
