@@ -22,6 +22,7 @@ from processing.rig import parse_rig
 from processing.session import newest_results
 
 BOARDS = 8  # views of the checkerboard a camera
+_START = 300.0  # seconds for all nodes to load their renderer on a busy machine
 _JOB = 3600.0  # seconds that processing may take
 
 
@@ -44,7 +45,7 @@ def run_demo(folder: Path, *, cameras: int, scale: float, steps: int, serve: boo
         running_nodes(setting, name, ids, endpoint) as nodes,
     ):
         client = Client(address)
-        client.wait_for_nodes(ids, 120.0, lambda: check_alive(nodes, setting.folder))
+        client.wait_for_nodes(ids, _START, lambda: check_alive(nodes, setting.folder))
         say(f"{cameras} nodes and the controller are up; the page is at {address}")
         session = client.post("/sessions", {"name": "demo"})["name"]
         with narrated() as report:
