@@ -69,7 +69,8 @@ def _lines() -> Report:
         tenth = int(progress.done * 10)
         if progress.stage != last["stage"] or tenth != last["tenth"]:
             last.update(stage=progress.stage, tenth=tenth)
-            left = "" if progress.left_s is None else f", {progress.left_s:.0f} s left"
-            say(f"{progress.done:4.0%}  {progress.stage}  {progress.message} {progress.rate}{left}")
+            left = "" if progress.left_s is None else f"{progress.left_s:.0f} s left"
+            told = (progress.stage, progress.message, progress.rate, left)
+            say(f"{progress.done:4.0%}  {'  '.join(part for part in told if part)}")
 
     return report

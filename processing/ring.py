@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from processing.calibration.bundle import BundleFit, TargetPrior, adjust_ring
 from processing.calibration.camera_calibration import CameraCalibration, calibrate_camera
@@ -97,7 +98,7 @@ def control_points(first: CameraCalibration, second: CameraCalibration) -> Recon
     if not common:
         raise ComputationError(
             f"cameras {first.camera.id} and {second.camera.id} have no dot of the target in common; "
-            "check their azimuths in rig.toml"
+            "check that nothing hides the target, and their azimuths in rig.toml"
         )
     chosen = [[places[dot] for dot in common] for places in seen]
     px = np.stack([first.dot_centres[chosen[0]], second.dot_centres[chosen[1]]])
@@ -114,11 +115,12 @@ def _calibrated(
     kept = session.path / "calibration" / f"{camera_id}-{key}.json"
     if kept.is_file():
         return CameraCalibration.from_dict(json.loads(kept.read_text(encoding="utf-8"))), key
+    images = _of_one_size(camera_id, [target, *boards] if settings.distortion and lens_file is None else [target])
     calibration = calibrate_camera(
         session.rig,
         camera_id,
-        [read_gray(path) for path in boards] if settings.distortion and lens_file is None else [],
-        read_gray(target),
+        images[1:],
+        images[0],
         distortion=settings.distortion,
         intrinsics=None if lens_file is None else read_intrinsics(session.path / lens_file),
         drop_percentile=settings.drop_percentile,
@@ -166,6 +168,19 @@ def _keep(path: Path, values: dict[str, Any]) -> None:
     aside = path.with_suffix(".partial")
     aside.write_text(json.dumps(values), encoding="utf-8")
     aside.replace(path)
+
+
+def _of_one_size(camera_id: str, paths: list[Path]) -> list[NDArray]:
+    """The images, grey; InputError names the first whose size differs from that of the first image."""
+    images = [read_gray(path) for path in paths]
+    height, width = images[0].shape
+    for path, image in zip(paths, images, strict=True):
+        if image.shape != (height, width):
+            raise InputError(
+                f"{path}: {image.shape[1]} x {image.shape[0]} px, but {paths[0]} of the same camera '{camera_id}' has "
+                f"{width} x {height} px; capture board, target and specimen at one size"
+            )
+    return images
 
 
 def _key(session: Session, camera_id: str, images: list[Path], settings: CalibrationGroup) -> str:

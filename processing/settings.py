@@ -165,6 +165,15 @@ def _toml(value: Any) -> str:
     return f'"{value}"' if isinstance(value, str) else repr(value)
 
 
+_WANTED = {
+    "int": "a whole number",
+    "float": "a number",
+    "bool": "true or false",
+    "string": "text",
+    "model": "a group of settings",
+}
+
+
 def _sentence(error: Any) -> str:
     where = ".".join(str(part) for part in error["loc"])
     if error["type"] == "extra_forbidden":
@@ -175,4 +184,6 @@ def _sentence(error: Any) -> str:
         return f"unknown group of settings '{where}'; known are {', '.join(Settings.model_fields)}"
     if error["type"] == "value_error":
         return f"{where}: {error['ctx']['error']}"
-    return f"{where}: {error['msg'][0].lower()}{error['msg'][1:]}, not {error['input']!r}"
+    wanted = _WANTED.get(error["type"].split("_")[0])
+    must = f"must be {wanted}" if wanted else error["msg"].replace("Input should be", "must be")
+    return f"{where} {must}, not {error['input']!r}"
