@@ -47,22 +47,23 @@ class CorrelationGroup(_Group):
 
 
 class CalibrationGroup(_Group):
-    """Cameras: the direct linear transformation, with or without the lens measured on the checkerboard.
+    """Cameras: the direct linear transformation (dlt), or from there the adjustment of all together (bundle).
 
+    distortion : the lens is measured on the checkerboard and corrected.
     drop_percentile : checkerboard views whose error lies above it are dropped and the rest is fitted again; 100 keeps
     all views.
+    print_error_mm, radius_error_mm, pitch_error_mm, tilt_error_deg : of the bundle: how far, as standard deviations,
+    the dots, the target's radius, its columns' spacing and the turn of the sheet on it may be from what rig.toml
+    says; 0 holds them.
     """
 
     method: Literal["dlt", "bundle"] = "dlt"
     distortion: bool = True
     drop_percentile: float = Field(default=80.0, gt=0, le=100)
-
-    @field_validator("method")
-    @classmethod
-    def _available(cls, value: str) -> str:
-        if value == "bundle":
-            raise ValueError("'bundle' is not available in this version; use 'dlt'")
-        return value
+    print_error_mm: float = Field(default=0.03, ge=0, le=5)
+    radius_error_mm: float = Field(default=0.0, ge=0, le=5)
+    pitch_error_mm: float = Field(default=0.0, ge=0, le=5)
+    tilt_error_deg: float = Field(default=0.0, ge=0, le=5)
 
 
 class SurfaceGroup(_Group):
