@@ -17,7 +17,8 @@ from processing.errors import RingdicError
 STATIC = Path(__file__).parent / "web" / "static"
 _NO_PAGE = (
     "<!doctype html><title>RingDIC</title><p>The page is not part of this installation: it was made with "
-    "RINGDIC_SKIP_PAGE set. Install again without it. The HTTP interface works: see <a href='/openapi.json'>/openapi.json</a>."
+    "RINGDIC_SKIP_PAGE set. Install again without it. The HTTP interface works: see "
+    "<a href='/openapi.json'>/openapi.json</a>."
 )
 
 
