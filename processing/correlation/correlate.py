@@ -89,7 +89,7 @@ def correlate(
         raise InputError(f"the current image was prepared for degree {current.degree}, not {settings.interpolation}")
     if xy.ndim != 2 or xy.shape[1] != 2 or not len(xy):
         raise InputError("there is no point to correlate; check the mask and the step")
-    with _threads(threads):
+    with on_threads(threads):
         load_kernels()
         points = Field(reference, current, xy, settings, progress)
         seconds = {"prepare": reference.seconds + current.seconds, "start": 0.0, "refine": 0.0}
@@ -209,7 +209,8 @@ def usable_threads(count: int | None) -> int:
 
 
 @contextmanager
-def _threads(count: int | None) -> Iterator[None]:
+def on_threads(count: int | None) -> Iterator[None]:
+    """Run what follows on so many threads; all cores for None."""
     before = numba.get_num_threads()
     if count is not None and count < 1:
         raise InputError(f"the number of threads must be at least 1, not {count}")
