@@ -139,6 +139,33 @@ def export(
         typer.echo(f"written {written}", err=True)
 
 
+@app.command()
+def bench(
+    data: Annotated[
+        Path | None, typer.Option(help="Folder multidic_rig of the reference data; else synthetic.")
+    ] = None,
+    repeats: Annotated[int, typer.Option(min=1, help="Runs of which the best counts.")] = 5,
+    interpolation: Annotated[str, typer.Option(help="cubic or quintic.")] = "cubic",
+    compare: Annotated[Path | None, typer.Option(help="An earlier result (JSON) to compare with.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """How fast the correlation is on this machine."""
+    from processing.correlation.bench import bench_correlation, ratios, read_result
+
+    before = read_result(compare) if compare is not None else None
+    result: dict[str, Any] = {
+        "correlation": bench_correlation(
+            data, repeats=repeats, interpolation=interpolation, say=lambda line: typer.echo(line, err=True)
+        )
+    }
+    if before is not None:
+        result["ratios"] = ratios(result, before)
+        for row in result["ratios"]:
+            typer.echo("  ".join(f"{name} {value:.3g}" for name, value in row.items()), err=True)
+    if as_json:
+        _print_json(result)
+
+
 def main() -> None:
     """The command's entry: sentences instead of tracebacks for whatever an operator can mend."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", stream=sys.stderr)

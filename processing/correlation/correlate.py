@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from processing.correlation import kernels
 from processing.correlation.features import feature_starts
-from processing.correlation.prepared import Current, Reference
+from processing.correlation.prepared import Current, Reference, prepare_current, prepare_reference
 from processing.correlation.propagation import Field, Progress, refine
 from processing.correlation.seeds import flow_starts, search_starts, spread
 from processing.correlation.settings import CorrelationSettings
@@ -89,7 +89,7 @@ def correlate(
         raise InputError(f"the current image was prepared for degree {current.degree}, not {settings.interpolation}")
     if xy.ndim != 2 or xy.shape[1] != 2 or not len(xy):
         raise InputError("there is no point to correlate; check the mask and the step")
-    with _threads(threads):
+    with on_threads(threads):
         load_kernels()
         points = Field(reference, current, xy, settings, progress)
         seconds = {"prepare": reference.seconds + current.seconds, "start": 0.0, "refine": 0.0}
@@ -102,9 +102,11 @@ def correlate(
 
 def load_kernels() -> None:
     """Compile or load the kernels, so that no timing contains it."""
-    tiny = np.zeros((8, 8))
-    image = Reference(tiny, np.zeros(2), tiny, tiny, tiny, np.zeros((14, 14)), np.ones((8, 8), bool), 255.0)
-    refine(image, Current(tiny, np.zeros(2), np.zeros((14, 14)), 5), np.full((1, 2), 4.0), np.zeros((1, 12)), _TINY)
+    tiny = np.zeros((16, 16))
+    refine(
+        prepare_reference(tiny, None, _TINY), prepare_current(tiny, None, _TINY),
+        np.full((1, 2), 4.0), np.zeros((1, kernels.N_PARAMETERS)), _TINY,
+    )  # fmt: skip
 
 
 _TINY = CorrelationSettings(radius=2)
@@ -209,7 +211,8 @@ def usable_threads(count: int | None) -> int:
 
 
 @contextmanager
-def _threads(count: int | None) -> Iterator[None]:
+def on_threads(count: int | None) -> Iterator[None]:
+    """Inside, the kernels run on so many threads; all cores for None."""
     before = numba.get_num_threads()
     if count is not None and count < 1:
         raise InputError(f"the number of threads must be at least 1, not {count}")

@@ -3,332 +3,464 @@
 Parameters of a subset, 12: u ux uy uxx uxy uyy v vx vy vxx vxy vyy, so that a pixel at (dx, dy) from the centre
 (x, y) lies in the current image at x + dx + u + ux dx + uy dy + ½ uxx dx² + uxy dx dy + ½ uyy dy², likewise in y
 (Lu & Cary 2000). First order keeps the second derivatives as they come in (zero, or a known curvature): its free
-parameters are six. Criterion: zero-mean normalised sum of squared differences; the inverse-compositional scheme is
-Baker & Matthews (2004), its second-order composition Gao et al. (2015).
+parameters are six. Criterion: zero-mean normalised sum of squared differences; scheme: Baker & Matthews (2004).
+
+Shape of the code. A subset is packed once into vectors of 16 pixels of one row: weight (the mask, 0 or 1), f, its
+gradient and (dx, dy), so a circle and a mask cost nothing. In an iteration every vector finds its place in the
+current image; while its fractional position t = t0 + s l + q l² stays inside one pixel interval over the lanes
+l = 0 … 15, lane l needs the spline coefficients at base + l + tap: every tap is one contiguous load for all lanes, no
+gather. Where t crosses one whole number there is one tap more and the weights move along by a select; the two axes
+are independent, so there are four cases, and one general case that addresses each pixel on its own. Then one pass
+over the packed pixels sums all that a step needs.
+
+What the speed hangs on: loops of constant length over unsigned indices (signed ones are checked for wrapping round,
+which breaks the vectors), single-precision constants, no array stored per pixel but g. What the digits hang on: t is
+small, so single precision resolves it to 1e-7 px; g is taken about its mean; everything after the sums is double.
 """
 
-# Everything the kernel calls is in this file: numba's cache follows the file of the compiled function alone.
+# Numba's cache follows the file of the compiled function alone: after a change in ``warps`` remove the cache.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from processing.correlation.spline import PAD
+from processing.correlation.warps import cholesky, compose_inverse, compose_inverse_affine, solve
 
 GOOD, NO_CONVERGENCE, OUTSIDE, NO_TEXTURE = 0, 2, 5, 6
 N_PARAMETERS = 12
-_PAD = 3
 _FAST = {"contract", "reassoc", "arcp", "nsz"}
+_F, _U = np.float32, np.uint64
+_LANES = 16
+_L = _U(_LANES)
+_WEIGHT, _REF, _GX, _GY, _DX, _DY, _CUR = range(7)  # rows of a packed subset
+_PAD = PAD
 
 
-@nb.njit(inline="always", fastmath=_FAST)
-def _weights5(t):  # type: ignore[no-untyped-def]
+@nb.njit(forceinline=True, fastmath=_FAST)
+def _cubic(t):  # type: ignore[no-untyped-def]
+    """Cubic B-spline at the taps -1 … 2 for a fraction t, times 6; the last but one by the partition of unity."""
+    s, t2 = _F(1) - t, t * t
+    a, b, d = s * s * s, _F(4) + t2 * (_F(3) * t - _F(6)), t2 * t
+    return a, b, _F(6) - a - b - d, d
+
+
+@nb.njit(forceinline=True, fastmath=_FAST)
+def _cubic_across(t):  # type: ignore[no-untyped-def]
+    """The five taps where t in [0, 2) may cross 1."""
+    k = t >= _F(1)
+    a, b, c, d = _cubic(t - _F(1) if k else t)
+    return _F(0) if k else a, a if k else b, b if k else c, c if k else d, d if k else _F(0)
+
+
+@nb.njit(forceinline=True, fastmath=_FAST)
+def _quintic(t):  # type: ignore[no-untyped-def]
     """Quintic B-spline at the taps -2 … 3 for a fraction t, times 120."""
-    t2 = t * t
-    t3 = t2 * t
-    t4 = t2 * t2
-    t5 = t4 * t
-    s = 1.0 - t
+    s, t2 = _F(1) - t, t * t
     s2 = s * s
+    a, f = s2 * s2 * s, t2 * t2 * t
+    c = _F(66) + t2 * (t2 * (_F(30) - _F(10) * t) - _F(60))
+    d = _F(66) + s2 * (s2 * (_F(30) - _F(10) * s) - _F(60))
+    b = _F(26) + t * (t * (t * (t * (_F(5) * t - _F(20)) + _F(20)) + _F(20)) - _F(50))
+    return a, b, c, d, _F(120) - a - b - c - d - f, f
+
+
+@nb.njit(forceinline=True, fastmath=_FAST)
+def _quintic_across(t):  # type: ignore[no-untyped-def]
+    """The seven taps where t in [0, 2) may cross 1."""
+    k = t >= _F(1)
+    a, b, c, d, e, f = _quintic(t - _F(1) if k else t)
+    zero = _F(0)
+    return zero if k else a, a if k else b, b if k else c, c if k else d, d if k else e, e if k else f, f if k else zero
+
+
+@nb.njit(forceinline=True, fastmath=_FAST)
+def _cubic_slope(t):  # type: ignore[no-untyped-def]
+    """Derivative of _cubic by t."""
+    s = _F(1) - t
+    b = t * (_F(9) * t - _F(12))
+    a, d = -_F(3) * s * s, _F(3) * t * t
+    return a, b, -a - b - d, d
+
+
+@nb.njit(forceinline=True, fastmath=_FAST)
+def _quintic_slope(t):  # type: ignore[no-untyped-def]
+    """Derivative of _quintic by t."""
+    s, t2 = _F(1) - t, t * t
+    a, f = -_F(5) * s * s * s * s, _F(5) * t2 * t2
+    b = -_F(50) + t * (_F(40) + t * (_F(60) + t * (_F(25) * t - _F(80))))
+    c = t * (t2 * (_F(120) - _F(50) * t) - _F(120))
+    d = -s * (s * s * (_F(120) - _F(50) * s) - _F(120))
+    return a, b, c, d, -a - b - c - d - f, f
+
+
+@nb.njit(forceinline=True, fastmath=_FAST)
+def _row4(c, p, w):  # type: ignore[no-untyped-def]
+    return w[0] * c[p] + w[1] * c[p + _U(1)] + w[2] * c[p + _U(2)] + w[3] * c[p + _U(3)]
+
+
+@nb.njit(forceinline=True, fastmath=_FAST)
+def _row5(c, p, w):  # type: ignore[no-untyped-def]
+    return _row4(c, p, w) + w[4] * c[p + _U(4)]
+
+
+@nb.njit(forceinline=True, fastmath=_FAST)
+def _row6(c, p, w):  # type: ignore[no-untyped-def]
+    return _row5(c, p, w) + w[5] * c[p + _U(5)]
+
+
+@nb.njit(forceinline=True, fastmath=_FAST)
+def _row7(c, p, w):  # type: ignore[no-untyped-def]
+    return _row6(c, p, w) + w[6] * c[p + _U(6)]
+
+
+def _make_spans(row: Any, across: Any, weights: Any, long_row: Any, taps: int) -> tuple[Any, ...]:
+    """The vector kernels of one degree: neither axis crosses, x does, y does, both do; and one pixel on its own."""
+
+    def make(weights_x: Any, row_x: Any, weights_y: Any, taps_y: int) -> Any:
+        @nb.njit(forceinline=True, fastmath=_FAST)
+        def span(c, base, stride, tx, sx, qx, ty, sy, qy, g, at):  # type: ignore[no-untyped-def]
+            """g[at … at + 15] of the lanes whose taps begin at base + lane."""
+            for lane in range(_L):
+                e = _F(lane)
+                wx, wy = weights_x(tx + e * (sx + e * qx)), weights_y(ty + e * (sy + e * qy))
+                p = base + lane
+                total = wy[0] * row_x(c, p, wx) + wy[1] * row_x(c, p + stride, wx)
+                total += wy[2] * row_x(c, p + _U(2) * stride, wx) + wy[3] * row_x(c, p + _U(3) * stride, wx)
+                if taps_y > 4:
+                    total += wy[4] * row_x(c, p + _U(4) * stride, wx)
+                if taps_y > 5:
+                    total += wy[5] * row_x(c, p + _U(5) * stride, wx)
+                if taps_y > 6:
+                    total += wy[6] * row_x(c, p + _U(6) * stride, wx)
+                g[at + lane] = total
+
+        return span
+
+    @nb.njit(forceinline=True, fastmath=_FAST)
+    def scattered(c, base, stride, tx, sx, qx, ty, sy, qy, g, at):  # type: ignore[no-untyped-def]
+        """The same for any gradient: every lane finds its own taps."""
+        for lane in range(_L):
+            e = _F(lane)
+            x, y = tx + e * (sx + e * qx), ty + e * (sy + e * qy)
+            i, j = math.floor(y), math.floor(x)
+            wx, wy = weights(x - _F(j)), weights(y - _F(i))
+            p = _U(np.int64(base) + np.int64(lane) + np.int64(i) * np.int64(stride) + np.int64(j))
+            total = wy[0] * row(c, p, wx) + wy[1] * row(c, p + stride, wx)
+            total += wy[2] * row(c, p + _U(2) * stride, wx) + wy[3] * row(c, p + _U(3) * stride, wx)
+            if taps > 4:
+                total += wy[4] * row(c, p + _U(4) * stride, wx) + wy[5] * row(c, p + _U(5) * stride, wx)
+            g[at + lane] = total
+
     return (
-        s2 * s2 * s,
-        26.0 - 50.0 * t + 20.0 * t2 + 20.0 * t3 - 20.0 * t4 + 5.0 * t5,
-        66.0 - 60.0 * t2 + 30.0 * t4 - 10.0 * t5,
-        26.0 + 50.0 * t + 20.0 * t2 - 20.0 * t3 - 20.0 * t4 + 10.0 * t5,
-        1.0 + 5.0 * t + 10.0 * t2 + 10.0 * t3 + 5.0 * t4 - 5.0 * t5,
-        t5,
+        make(weights, row, weights, taps),
+        make(across, long_row, weights, taps),
+        make(weights, row, across, taps + 1),
+        make(across, long_row, across, taps + 1),
+        scattered,
     )
 
 
-@nb.njit(inline="always", fastmath=_FAST)
-def _slopes5(t):  # type: ignore[no-untyped-def]
-    """Derivative of _weights5 by t."""
-    t2 = t * t
-    t3 = t2 * t
-    t4 = t2 * t2
-    s = 1.0 - t
-    s2 = s * s
-    return (
-        -5.0 * s2 * s2,
-        -50.0 + 40.0 * t + 60.0 * t2 - 80.0 * t3 + 25.0 * t4,
-        -120.0 * t + 120.0 * t3 - 50.0 * t4,
-        50.0 + 40.0 * t - 60.0 * t2 - 80.0 * t3 + 50.0 * t4,
-        5.0 + 20.0 * t + 30.0 * t2 + 20.0 * t3 - 25.0 * t4,
-        5.0 * t4,
-    )
+_c0, _cx, _cy, _cxy, _c_any = _make_spans(_row4, _cubic_across, _cubic, _row5, 4)
+_q0, _qx, _qy, _qxy, _q_any = _make_spans(_row6, _quintic_across, _quintic, _row7, 6)
+_STILL, _ACROSS_X, _ACROSS_Y, _ACROSS, _SCATTERED = range(5)
 
 
-@nb.njit(inline="always", fastmath=_FAST)
-def _weights3(t):  # type: ignore[no-untyped-def]
-    """Cubic B-spline at the taps -1 … 2, times 6, with a zero on either side so that both degrees share the loops."""
-    t2 = t * t
-    t3 = t2 * t
-    s = 1.0 - t
-    return (0.0, s * s * s, 4.0 - 6.0 * t2 + 3.0 * t3, 1.0 + 3.0 * t + 3.0 * t2 - 3.0 * t3, t3, 0.0)
-
-
-@nb.njit(inline="always", fastmath=_FAST)
-def _slopes3(t):  # type: ignore[no-untyped-def]
-    """Derivative of _weights3 by t."""
-    t2 = t * t
-    s = 1.0 - t
-    return (0.0, -3.0 * s * s, -12.0 * t + 9.0 * t2, 3.0 + 6.0 * t - 9.0 * t2, 3.0 * t2, 0.0)
-
-
-@nb.njit(inline="always", fastmath=_FAST)
-def _row(c, i, j, a):  # type: ignore[no-untyped-def]
-    """Σ_k a_k c[i, j + k] over the six taps of the quintic."""
-    return (
-        a[0] * c[i, j]
-        + a[1] * c[i, j + np.uint64(1)]
-        + a[2] * c[i, j + np.uint64(2)]
-        + a[3] * c[i, j + np.uint64(3)]
-        + a[4] * c[i, j + np.uint64(4)]
-        + a[5] * c[i, j + np.uint64(5)]
-    )
-
-
-@nb.njit(inline="always", fastmath=_FAST)
-def _row3(c, i, j, a):  # type: ignore[no-untyped-def]
-    """The same over the four taps of the cubic."""
-    return (
-        a[1] * c[i, j + np.uint64(1)]
-        + a[2] * c[i, j + np.uint64(2)]
-        + a[3] * c[i, j + np.uint64(3)]
-        + a[4] * c[i, j + np.uint64(4)]
-    )
-
-
-@nb.njit(inline="always", fastmath=_FAST)
-def _quintic(c, i, j, wx, wy):  # type: ignore[no-untyped-def]
-    return (
-        wy[0] * _row(c, i, j, wx)
-        + wy[1] * _row(c, i + np.uint64(1), j, wx)
-        + wy[2] * _row(c, i + np.uint64(2), j, wx)
-        + wy[3] * _row(c, i + np.uint64(3), j, wx)
-        + wy[4] * _row(c, i + np.uint64(4), j, wx)
-        + wy[5] * _row(c, i + np.uint64(5), j, wx)
-    ) * (1.0 / 14400.0)
-
-
-@nb.njit(inline="always", fastmath=_FAST)
-def _cubic(c, i, j, wx, wy):  # type: ignore[no-untyped-def]
-    return (
-        wy[1] * _row3(c, i + np.uint64(1), j, wx)
-        + wy[2] * _row3(c, i + np.uint64(2), j, wx)
-        + wy[3] * _row3(c, i + np.uint64(3), j, wx)
-        + wy[4] * _row3(c, i + np.uint64(4), j, wx)
-    ) * (1.0 / 36.0)
-
-
-@nb.njit(cache=True)
-def cholesky(H, n):  # type: ignore[no-untyped-def]
-    """H (n, n) to its lower factor in place; False where it is not positive definite."""
-    for i in range(n):
-        for j in range(i + 1):
-            total = H[i, j]
-            for k in range(j):
-                total -= H[i, k] * H[j, k]
-            if i == j:
-                if not total > 1e-14 * abs(H[i, i]):
-                    return False
-                H[i, i] = math.sqrt(total)
+@nb.njit(fastmath=_FAST, nogil=True, cache=True)
+def _interpolate(c, stride, base, case, place, qx, qy, quintic, n, g):  # type: ignore[no-untyped-def]
+    """Grey levels g of n vectors in the current image. place : (4, n) tx, sx, ty, sy."""
+    for v in range(n):
+        at, b, k = _U(v) * _L, base[v], case[v]
+        tx, sx, ty, sy = place[0, v], place[1, v], place[2, v], place[3, v]
+        if quintic:
+            if k == _STILL:
+                _q0(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
+            elif k == _ACROSS_X:
+                _qx(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
+            elif k == _ACROSS_Y:
+                _qy(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
+            elif k == _ACROSS:
+                _qxy(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
             else:
-                H[i, j] = total / H[j, j]
-    return True
+                _q_any(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
+        elif k == _STILL:
+            _c0(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
+        elif k == _ACROSS_X:
+            _cx(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
+        elif k == _ACROSS_Y:
+            _cy(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
+        elif k == _ACROSS:
+            _cxy(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
+        else:
+            _c_any(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
 
 
-@nb.njit(cache=True)
-def solve(L, b, n):  # type: ignore[no-untyped-def]
-    """x of L Lᵀ x = b, in place of b."""
-    for i in range(n):
-        for k in range(i):
-            b[i] -= L[i, k] * b[k]
-        b[i] /= L[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            b[i] -= L[k, i] * b[k]
-        b[i] /= L[i, i]
+@nb.njit(fastmath=_FAST, nogil=True, cache=True)
+def _place(shape, first_tap, x, y, p, corner, ends, n, base, case, place):  # type: ignore[no-untyped-def]
+    """Where n vectors lie in the current image: first tap, fraction, slope and case of each; False if one leaves it.
 
-
-@nb.njit(cache=True)
-def _warp_matrix(p, M):  # type: ignore[no-untyped-def]
-    """The warp as a matrix (6, 6) acting on (x², xy, y², x, y, 1), third powers dropped (Gao et al. 2015)."""
-    u, ux, uy, uxx, uxy, uyy = p[0], 1.0 + p[1], p[2], p[3], p[4], p[5]
-    v, vx, vy, vxx, vxy, vyy = p[6], p[7], 1.0 + p[8], p[9], p[10], p[11]
-    M[0, 0], M[0, 1], M[0, 2] = ux * ux + u * uxx, 2 * (ux * uy + u * uxy), uy * uy + u * uyy
-    M[0, 3], M[0, 4], M[0, 5] = 2 * u * ux, 2 * u * uy, u * u
-    M[1, 0], M[1, 1] = 0.5 * (v * uxx + u * vxx) + ux * vx, v * uxy + u * vxy + ux * vy + uy * vx
-    M[1, 2] = 0.5 * (v * uyy + u * vyy) + uy * vy
-    M[1, 3], M[1, 4], M[1, 5] = v * ux + u * vx, u * vy + v * uy, u * v
-    M[2, 0], M[2, 1], M[2, 2] = vx * vx + v * vxx, 2 * (vx * vy + v * vxy), vy * vy + v * vyy
-    M[2, 3], M[2, 4], M[2, 5] = 2 * v * vx, 2 * v * vy, v * v
-    M[3, 0], M[3, 1], M[3, 2], M[3, 3], M[3, 4], M[3, 5] = 0.5 * uxx, uxy, 0.5 * uyy, ux, uy, u
-    M[4, 0], M[4, 1], M[4, 2], M[4, 3], M[4, 4], M[4, 5] = 0.5 * vxx, vxy, 0.5 * vyy, vx, vy, v
-    M[5, 0], M[5, 1], M[5, 2], M[5, 3], M[5, 4], M[5, 5] = 0.0, 0.0, 0.0, 0.0, 0.0, 1.0
-
-
-@nb.njit(cache=True)
-def compose_inverse(p, d, A, B):  # type: ignore[no-untyped-def]
-    """p ← p ∘ d⁻¹ for small d; False where d cannot be inverted. A, B : (6, 6) scratch.
-
-    The two rows x', y' of W(p) W(d)⁻¹ solve W(d)ᵀ m = rowᵀ.
+    corner : (2, n) dx, dy of lane 0; ends : (2, n) first and last lane that counts.
     """
-    _warp_matrix(d, A)
-    _warp_matrix(p, B)
-    for col in range(6):  # elimination on Aᵀ; near the identity, so no pivoting
-        pivot = A[col, col]
-        if not abs(pivot) > 1e-6:
+    stride = shape[1]
+    last_x, last_y = shape[1] - 2 * _PAD - 1, shape[0] - 2 * _PAD - 1
+    curved = p[3] != 0.0 or p[4] != 0.0 or p[5] != 0.0 or p[9] != 0.0 or p[10] != 0.0 or p[11] != 0.0
+    far = np.float64(_LANES - 1)
+    qx, qy = 0.5 * p[3], 0.5 * p[9]
+    bend_x, bend_y = abs(qx) * 0.25 * far * far, abs(qy) * 0.25 * far * far
+    for v in range(n):
+        dx, dy = np.float64(corner[0, v]), np.float64(corner[1, v])
+        xx = x + p[0] + dx + p[1] * dx + p[2] * dy
+        yy = y + p[6] + dy + p[7] * dx + p[8] * dy
+        sx, sy = p[1], p[7]
+        if curved:
+            xx += qx * dx * dx + p[4] * dx * dy + 0.5 * p[5] * dy * dy
+            yy += qy * dx * dx + p[10] * dx * dy + 0.5 * p[11] * dy * dy
+            sx += p[3] * dx + p[4] * dy
+            sy += p[9] * dx + p[10] * dy
+        e, f = np.float64(ends[0, v]), np.float64(ends[1, v])
+        xe, xf = xx + e + e * (sx + e * qx), xx + f + f * (sx + f * qx)
+        ye, yf = yy + e * (sy + e * qy), yy + f * (sy + f * qy)
+        if not (min(xe, xf) >= 0.0 and max(xe, xf) <= last_x and min(ye, yf) >= 0.0 and max(ye, yf) <= last_y):
             return False
-        for row in range(col + 1, 6):
-            factor = A[col, row] / pivot  # Aᵀ[row, col]
-            for k in range(col, 6):
-                A[k, row] -= factor * A[k, col]
-            B[3, row] -= factor * B[3, col]
-            B[4, row] -= factor * B[4, col]
-    for row in range(5, -1, -1):
-        for r in (3, 4):
-            total = B[r, row]
-            for k in range(row + 1, 6):
-                total -= A[k, row] * B[r, k]
-            B[r, row] = total / A[row, row]
-    p[0], p[1], p[2], p[3], p[4], p[5] = B[3, 5], B[3, 3] - 1.0, B[3, 4], 2 * B[3, 0], B[3, 1], 2 * B[3, 2]
-    p[6], p[7], p[8], p[9], p[10], p[11] = B[4, 5], B[4, 3], B[4, 4] - 1.0, 2 * B[4, 0], B[4, 1], 2 * B[4, 2]
+        x_far, y_far = far * (sx + far * qx), far * (sy + far * qy)
+        x_low, x_high = xx + min(0.0, x_far) - bend_x, xx + max(0.0, x_far) + bend_x
+        y_low, y_high = yy + min(0.0, y_far) - bend_y, yy + max(0.0, y_far) + bend_y
+        # Lanes that do not count reach beyond the image; the padding holds them unless the stretch is extreme.
+        if not (
+            x_low > 4 - _PAD and x_high + far < last_x + _PAD - 4 and y_low > 4 - _PAD and y_high < last_y + _PAD - 4
+        ):
+            return False
+        j, i = math.floor(x_low), math.floor(y_low)
+        wide, high = math.floor(x_high) - j, math.floor(y_high) - i
+        case[v] = _SCATTERED if wide > 1 or high > 1 else wide * _ACROSS_X + high * _ACROSS_Y
+        base[v] = _U((i + _PAD - first_tap) * stride + j + _PAD - first_tap)
+        place[0, v], place[1, v] = _F(xx - j), _F(sx)
+        place[2, v], place[3, v] = _F(yy - i), _F(sy)
     return True
 
 
-@nb.njit(cache=True)
-def compose_inverse_affine(p, d):  # type: ignore[no-untyped-def]
-    """p ← p ∘ d⁻¹ of first order, exactly; second derivatives of p stay. False where d cannot be inverted."""
-    a, b, c, e = 1.0 + d[1], d[2], d[7], 1.0 + d[8]
-    det = a * e - b * c
-    if not abs(det) > 1e-6:
-        return False
-    ia, ib, ic, ie = e / det, -b / det, -c / det, a / det
-    tx, ty = -(ia * d[0] + ib * d[6]), -(ic * d[0] + ie * d[6])
-    ux, uy, vx, vy = 1.0 + p[1], p[2], p[7], 1.0 + p[8]
-    p[0] += ux * tx + uy * ty
-    p[6] += vx * tx + vy * ty
-    p[1], p[2] = ux * ia + uy * ic - 1.0, ux * ib + uy * ie
-    p[7], p[8] = vx * ia + vy * ic, vx * ib + vy * ie - 1.0
-    return True
-
-
-@nb.njit(cache=True, nogil=True, fastmath=_FAST)
-def gather_subset(image, gx, gy, coef, mask, x, y, radius, circle, quintic, px):  # type: ignore[no-untyped-def]
-    """The pixels of a subset about (x, y): rows of px (5, N) become dx, dy, f, ∂f/∂x, ∂f/∂y; returns their number.
+@nb.njit(fastmath=_FAST, nogil=True, cache=True)
+def _pack(image, gx, gy, coef, mask, x, y, radius, circle, quintic, px, corner, ends):  # type: ignore[no-untyped-def]
+    """The pixels of a subset about (x, y), packed into vectors of 16. Returns the numbers of pixels and of vectors.
 
     (dx, dy) is measured from (x, y); at a fractional centre f and its gradient are interpolated. The mask cuts.
     """
+    height, width = image.shape
+    stride = _U(coef.shape[1])
+    flat = coef.ravel()
     jx, iy = math.floor(x + 0.5), math.floor(y + 0.5)
     whole = x == jx and y == iy
-    height, width = image.shape
-    fx, fy = math.floor(x), math.floor(y)
-    if quintic:
-        wx, wy = _weights5(x - fx), _weights5(y - fy)
-        sx, sy = _slopes5(x - fx), _slopes5(y - fy)
-    else:
-        wx, wy = _weights3(x - fx), _weights3(y - fy)
-        sx, sy = _slopes3(x - fx), _slopes3(y - fy)
-    n = 0
+    if not whole:
+        jx, iy = math.floor(x), math.floor(y)
+        height, width = height - 1, width - 1  # taps on both sides
+    turn_x, turn_y = _F(x - jx), _F(y - iy)
+    pixels = n = 0
     for dy in range(-radius, radius + 1):
         i = iy + dy
         if i < 0 or i >= height:
             continue
-        for dx in range(-radius, radius + 1):
-            j = jx + dx
-            if j < 0 or j >= width or not mask[i, j] or (circle and dx * dx + dy * dy > radius * radius):
+        half = int(math.sqrt(radius * radius - dy * dy)) if circle else radius
+        for dx in range(-half, half + 1, _LANES):
+            first, last = _LANES, -1
+            for lane in range(_LANES):
+                j = jx + dx + lane
+                inside = dx + lane <= half and j >= 0 and j < width and mask[i, j]
+                px[_WEIGHT, n * _LANES + lane] = inside
+                if inside:
+                    first, last, pixels = min(first, lane), lane, pixels + 1
+            if last < 0:
                 continue
-            if whole:
-                px[2, n], px[3, n], px[4, n] = image[i, j], gx[i, j], gy[i, j]
+            at = _U(n * _LANES)
+            corner[0, n], corner[1, n], ends[0, n], ends[1, n] = dx, dy, first, last
+            begin = jx + dx
+            if not whole:
+                b = _U((i + _PAD) * np.int64(stride) + begin + _PAD)
+                _between(flat, b, stride, turn_x, turn_y, quintic, px, at)
+            elif begin >= 0 and begin + _LANES <= width:
+                a, b = _U(i), _U(begin)
+                for lane in range(_L):
+                    m = px[_WEIGHT, at + lane]
+                    px[_REF, at + lane] = m * image[a, b + lane]
+                    px[_GX, at + lane] = m * gx[a, b + lane]
+                    px[_GY, at + lane] = m * gy[a, b + lane]
             else:
-                at_i, at_j = fy + dy, fx + dx
-                if at_i < 0 or at_j < 0 or at_i >= height - 1 or at_j >= width - 1:
-                    continue
-                a, b = np.uint64(at_i + _PAD - 2), np.uint64(at_j + _PAD - 2)
-                px[2, n] = _quintic(coef, a, b, wx, wy) if quintic else _cubic(coef, a, b, wx, wy)
-                px[3, n] = _quintic(coef, a, b, sx, wy) if quintic else _cubic(coef, a, b, sx, wy)
-                px[4, n] = _quintic(coef, a, b, wx, sy) if quintic else _cubic(coef, a, b, wx, sy)
-            px[0, n], px[1, n] = dx, dy
+                for lane in range(_LANES):
+                    j, k = min(max(begin + lane, 0), width - 1), n * _LANES + lane
+                    m = px[_WEIGHT, k]
+                    px[_REF, k], px[_GX, k], px[_GY, k] = m * image[i, j], m * gx[i, j], m * gy[i, j]
+            for lane in range(_L):
+                px[_DX, at + lane], px[_DY, at + lane] = _F(dx) + _F(lane), _F(dy)
             n += 1
-    return n
+    return pixels, n
 
 
-@nb.njit(cache=True, nogil=True, fastmath=_FAST)
-def accumulate(px, n, coef, x, y, p, second, quintic, sums):  # type: ignore[no-untyped-def]
-    """One pass over the subset in the current image; False where it leaves the image.
+@nb.njit(fastmath=_FAST, nogil=True, cache=True)
+def _between(c, b, stride, tx, ty, quintic, px, at):  # type: ignore[no-untyped-def]
+    """f and its gradient between the pixels: 16 lanes with the same fraction."""
+    if quintic:
+        b -= _U(2) * stride + _U(2)
+        wx, wy, sx, sy = _quintic(tx), _quintic(ty), _quintic_slope(tx), _quintic_slope(ty)
+        for lane in range(_L):
+            f = fx = fy = _F(0)
+            for k in range(_U(6)):
+                p = b + lane + k * stride
+                level = _row6(c, p, wx)
+                f, fx, fy = f + wy[k] * level, fx + wy[k] * _row6(c, p, sx), fy + sy[k] * level
+            m = px[_WEIGHT, at + lane]
+            px[_REF, at + lane], px[_GX, at + lane], px[_GY, at + lane] = m * f, m * fx, m * fy
+    else:
+        b -= stride + _U(1)
+        vx, vy, rx, ry = _cubic(tx), _cubic(ty), _cubic_slope(tx), _cubic_slope(ty)
+        for lane in range(_L):
+            f = fx = fy = _F(0)
+            for k in range(_U(4)):
+                p = b + lane + k * stride
+                level = _row4(c, p, vx)
+                f, fx, fy = f + vy[k] * level, fx + vy[k] * _row4(c, p, rx), fy + ry[k] * level
+            m = px[_WEIGHT, at + lane]
+            px[_REF, at + lane], px[_GX, at + lane], px[_GY, at + lane] = m * f, m * fx, m * fy
 
-    sums : (16,), Σg, Σg², Σfg, spare, then Σ g ∂f/∂x φ_k (6) and Σ g ∂f/∂y φ_k (6) with φ = 1 dx dy dx²/2 dxdy dy²/2.
+
+@nb.njit(fastmath=_FAST, nogil=True, cache=True)
+def _centre(px, n, pixels):  # type: ignore[no-untyped-def]
+    """f less its mean, in place. Returns the mean and Σ f²."""
+    total = _F(0)
+    for k in range(_U(n)):
+        total += px[_REF, k]
+    mean = _F(total / pixels)
+    for k in range(_U(n)):
+        px[_REF, k] -= mean * px[_WEIGHT, k]
+    squares = _F(0)
+    for k in range(_U(n)):
+        squares += px[_REF, k] * px[_REF, k]
+    return np.float64(mean), np.float64(squares)
+
+
+@nb.njit(fastmath=_FAST, nogil=True, cache=True)
+def _moments(px, n, one, other, out):  # type: ignore[no-untyped-def]
+    """Σ a b dx^i dy^k for i + k ≤ 2, a and b two rows of the packed subset. out : (6+,) in the order 1 x y xx xy yy."""
+    m0 = m1 = m2 = m3 = m4 = m5 = _F(0)
+    for k in range(_U(n)):
+        x, y, q = px[_DX, k], px[_DY, k], px[one, k] * px[other, k]
+        qx, qy = q * x, q * y
+        m0 += q
+        m1 += qx
+        m2 += qy
+        m3 += qx * x
+        m4 += qx * y
+        m5 += qy * y
+    out[0], out[1], out[2], out[3], out[4], out[5] = m0, m1, m2, m3, m4, m5
+
+
+@nb.njit(fastmath=_FAST, nogil=True, cache=True)
+def _high_moments(px, n, one, other, out):  # type: ignore[no-untyped-def]
+    """The same for i + k = 3 and 4, into out[6:15] in the order xxx xxy xyy yyy, xxxx … yyyy."""
+    m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = m8 = _F(0)
+    for k in range(_U(n)):
+        x, y, q = px[_DX, k], px[_DY, k], px[one, k] * px[other, k]
+        xx, xy, yy = x * x, x * y, y * y
+        qxx, qxy, qyy = q * xx, q * xy, q * yy
+        m0 += qxx * x
+        m1 += qxx * y
+        m2 += qyy * x
+        m3 += qyy * y
+        m4 += qxx * xx
+        m5 += qxx * xy
+        m6 += qxx * yy
+        m7 += qyy * xy
+        m8 += qyy * yy
+    out[6], out[7], out[8], out[9] = m0, m1, m2, m3
+    out[10], out[11], out[12], out[13], out[14] = m4, m5, m6, m7, m8
+
+
+# φ = 1 dx dy dx²/2 dxdy dy²/2: exponents of dx and dy, and factor.
+_EX, _EY = np.array([0, 1, 0, 2, 1, 0]), np.array([0, 0, 1, 0, 1, 2])
+_FACTOR = np.array([1.0, 1.0, 1.0, 0.5, 1.0, 0.5])
+
+
+@nb.njit(nogil=True, cache=True)
+def _normal_matrix(px, n, terms, H, sum_J, sum_fJ):  # type: ignore[no-untyped-def]
+    """H = Σ JᵀJ (2 terms, 2 terms), ΣJ and Σ f J of the subset from its moments; J = (∂f/∂x φ, ∂f/∂y φ)."""
+    moments = np.empty(15)
+    for one, other in ((_GX, _GX), (_GX, _GY), (_GY, _GY)):
+        _moments(px, n, one, other, moments)
+        if terms > 3:
+            _high_moments(px, n, one, other, moments)
+        first, second = terms * (one - _GX), terms * (other - _GX)
+        for a in range(terms):
+            for b in range(terms):
+                i, k = _EX[a] + _EX[b], _EY[a] + _EY[b]
+                total = _FACTOR[a] * _FACTOR[b] * moments[(i + k) * (i + k + 1) // 2 + k]
+                H[second + a, first + b] = total
+    for direction in range(2):
+        _moments(px, n, _GX + direction, _WEIGHT, moments)
+        for a in range(terms):
+            sum_J[direction * terms + a] = _FACTOR[a] * moments[a]
+        _moments(px, n, _GX + direction, _REF, moments)
+        for a in range(terms):
+            sum_fJ[direction * terms + a] = _FACTOR[a] * moments[a]
+
+
+@nb.njit(fastmath=_FAST, nogil=True, cache=True)
+def _accumulate(px, n, level, second, sums):  # type: ignore[no-untyped-def]
+    """One pass over the subset, g taken about ``level``.
+
+    sums : (16,), Σg, Σg², Σfg, spare, then Σ g ∂f/∂x φ_k (6) and Σ g ∂f/∂y φ_k (6) with φ as above.
     """
-    last_x, last_y = coef.shape[1] - 2 * _PAD - 1, coef.shape[0] - 2 * _PAD - 1
-    s_g = s_gg = s_fg = a0 = a1 = a2 = a3 = a4 = a5 = b0 = b1 = b2 = b3 = b4 = b5 = 0.0
-    curved = p[3] != 0.0 or p[4] != 0.0 or p[5] != 0.0 or p[9] != 0.0 or p[10] != 0.0 or p[11] != 0.0
-    ux, vy = 1.0 + p[1], 1.0 + p[8]
-    x0, y0 = x + p[0], y + p[6]
-    for k in range(n):
-        dx, dy = px[0, k], px[1, k]
-        xx = x0 + ux * dx + p[2] * dy
-        yy = y0 + p[7] * dx + vy * dy
-        if curved:
-            xx += 0.5 * p[3] * dx * dx + p[4] * dx * dy + 0.5 * p[5] * dy * dy
-            yy += 0.5 * p[9] * dx * dx + p[10] * dx * dy + 0.5 * p[11] * dy * dy
-        if not (xx >= 0.0 and yy >= 0.0 and xx <= last_x and yy <= last_y):
-            return False
-        j, i = int(xx), int(yy)
-        at_i, at_j = np.uint64(i + _PAD - 2), np.uint64(j + _PAD - 2)
-        if quintic:
-            g = _quintic(coef, at_i, at_j, _weights5(xx - j), _weights5(yy - i))
-        else:
-            g = _cubic(coef, at_i, at_j, _weights3(xx - j), _weights3(yy - i))
+    s_g = s_gg = s_fg = a0 = a1 = a2 = a3 = a4 = a5 = b0 = b1 = b2 = b3 = b4 = b5 = _F(0)
+    for k in range(_U(n)):
+        x, y = px[_DX, k], px[_DY, k]
+        g = (px[_CUR, k] - level) * px[_WEIGHT, k]
         s_g += g
         s_gg += g * g
-        s_fg += g * px[2, k]
-        ga, gb = g * px[3, k], g * px[4, k]
+        s_fg += g * px[_REF, k]
+        ga, gb = g * px[_GX, k], g * px[_GY, k]
         a0 += ga
-        a1 += ga * dx
-        a2 += ga * dy
+        a1 += ga * x
+        a2 += ga * y
         b0 += gb
-        b1 += gb * dx
-        b2 += gb * dy
-        if second:
-            q, r, s = 0.5 * dx * dx, dx * dy, 0.5 * dy * dy
-            a3 += ga * q
-            a4 += ga * r
-            a5 += ga * s
-            b3 += gb * q
-            b4 += gb * r
-            b5 += gb * s
+        b1 += gb * x
+        b2 += gb * y
     sums[0], sums[1], sums[2] = s_g, s_gg, s_fg
-    sums[4], sums[5], sums[6], sums[7], sums[8], sums[9] = a0, a1, a2, a3, a4, a5
-    sums[10], sums[11], sums[12], sums[13], sums[14], sums[15] = b0, b1, b2, b3, b4, b5
-    return True
+    sums[4], sums[5], sums[6], sums[10], sums[11], sums[12] = a0, a1, a2, b0, b1, b2
+    if second:
+        for k in range(_U(n)):
+            x, y = px[_DX, k], px[_DY, k]
+            g = px[_CUR, k] - level
+            ga, gb = g * px[_GX, k], g * px[_GY, k]
+            xx, xy, yy = x * x, x * y, y * y
+            a3 += ga * xx
+            a4 += ga * xy
+            a5 += ga * yy
+            b3 += gb * xx
+            b4 += gb * xy
+            b5 += gb * yy
+        half = _F(0.5)
+        sums[7], sums[8], sums[9] = half * a3, a4, half * a5
+        sums[13], sums[14], sums[15] = half * b3, b4, half * b5
 
 
-@nb.njit(cache=True, nogil=True, fastmath=_FAST)
-def normal_matrix(px, n, terms, H, sum_J, sum_fJ):  # type: ignore[no-untyped-def]
-    """H = Σ JᵀJ (2 terms, 2 terms), ΣJ and Σ f J of the subset, J = (∂f/∂x φ, ∂f/∂y φ)."""
-    phi = np.empty(6)
-    H[: 2 * terms, : 2 * terms] = 0.0
-    sum_J[:] = 0.0
-    sum_fJ[:] = 0.0
-    for k in range(n):
-        dx, dy, f, fx, fy = px[0, k], px[1, k], px[2, k], px[3, k], px[4, k]
-        phi[0], phi[1], phi[2] = 1.0, dx, dy
-        phi[3], phi[4], phi[5] = 0.5 * dx * dx, dx * dy, 0.5 * dy * dy
-        for a in range(terms):
-            xa, ya = fx * phi[a], fy * phi[a]
-            sum_J[a] += xa
-            sum_J[terms + a] += ya
-            sum_fJ[a] += f * xa
-            sum_fJ[terms + a] += f * ya
-            for b in range(a + 1):
-                H[a, b] += fx * xa * phi[b]
-                H[terms + a, terms + b] += fy * ya * phi[b]
-            for b in range(terms):
-                H[terms + a, b] += fx * ya * phi[b]
+@nb.njit(cache=True, nogil=True)
+def _step(H, sums, sum_J, sum_fJ, mean_g, ratio, terms, b, d):  # type: ignore[no-untyped-def]
+    """The increment d (12,) of the parameters from one pass; b : (2 terms,) scratch."""
+    for k in range(terms):
+        b[k] = ratio * (sums[4 + k] - mean_g * sum_J[k]) - sum_fJ[k]
+        b[terms + k] = ratio * (sums[10 + k] - mean_g * sum_J[terms + k]) - sum_fJ[terms + k]
+    solve(H, b, 2 * terms)
+    for k in range(terms):
+        d[k], d[6 + k] = b[k], b[terms + k]
+
+
+@nb.njit(cache=True, nogil=True)
+def _length(d, radius):  # type: ignore[no-untyped-def]
+    """Square of the motion of the subset's rim under an increment, px²."""
+    r2 = float(radius * radius)
+    first = d[1] ** 2 + d[2] ** 2 + d[7] ** 2 + d[8] ** 2
+    second = d[3] ** 2 + d[5] ** 2 + d[9] ** 2 + d[11] ** 2 + 4 * (d[4] ** 2 + d[10] ** 2)
+    return d[0] ** 2 + d[6] ** 2 + r2 * first + 0.25 * r2 * r2 * second
 
 
 @nb.njit(cache=True, nogil=True)
@@ -341,50 +473,51 @@ def _refine_point(  # type: ignore[no-untyped-def]
     (x_ref, y_ref) and (x_cur, y_cur) : the centre in the two images' own crops. Returns status, ZNCC, iterations,
     sigma of u and of v (px).
     """
-    full = (2 * radius + 1) ** 2
-    px = np.empty((5, full))
-    n = gather_subset(image, gx, gy, coef_ref, mask, x_ref, y_ref, radius, circle, quintic, px)
-    if n < max(0.15 * full, 6 * terms):
+    side = 2 * radius + 1
+    vectors = side * ((side + _LANES - 1) // _LANES)
+    px = np.empty((7, vectors * _LANES), np.float32)
+    corner, ends = np.empty((2, vectors), np.int32), np.empty((2, vectors), np.int32)
+    base, case = np.empty(vectors, np.uint64), np.empty(vectors, np.int64)
+    place = np.empty((4, vectors), np.float32)
+    pixels, n = _pack(image, gx, gy, coef_ref, mask, x_ref, y_ref, radius, circle, quintic, px, corner, ends)
+    if pixels < max(0.15 * side * side, 6 * terms):
         return NO_TEXTURE, np.nan, 0, np.nan, np.nan
-    mean = np.sum(px[2, :n]) / n
-    px[2, :n] -= mean
-    norm_f = math.sqrt(np.sum(px[2, :n] ** 2))
+    count = n * _LANES
+    level, squares = _centre(px, count, pixels)
+    norm_f = math.sqrt(squares)
     size = 2 * terms
-    H, sum_J, sum_fJ = np.empty((size, size)), np.empty(size), np.empty(size)
-    normal_matrix(px, n, terms, H, sum_J, sum_fJ)
+    H, sum_J, sum_fJ = np.zeros((size, size)), np.empty(size), np.empty(size)
+    _normal_matrix(px, count, terms, H, sum_J, sum_fJ)
     half_trace = 0.5 * (H[0, 0] + H[terms, terms])
     spread = math.sqrt((0.5 * (H[0, 0] - H[terms, terms])) ** 2 + H[terms, 0] ** 2)
-    if not half_trace - spread > n * texture * texture or not norm_f > 0.0 or not cholesky(H, size):
+    if not half_trace - spread > pixels * texture * texture or not norm_f > 0.0 or not cholesky(H, size):
         return NO_TEXTURE, np.nan, 0, np.nan, np.nan
 
     sums, b, d = np.empty(16), np.empty(size), np.zeros(12)
     A, B = np.empty((6, 6)), np.empty((6, 6))
+    flat, stride, first_tap = coef.ravel(), _U(coef.shape[1]), 2 if quintic else 1
     second = terms == 6
     status, zncc, iterations = NO_CONVERGENCE, np.nan, 0
     for _ in range(max_iterations):
         iterations += 1
-        if not accumulate(px, n, coef, x_cur, y_cur, p, second, quintic, sums):
+        if not _place(coef.shape, first_tap, x_cur, y_cur, p, corner, ends, n, base, case, place):
             return OUTSIDE, np.nan, iterations, np.nan, np.nan
-        mean_g = sums[0] / n
-        variance = sums[1] - n * mean_g * mean_g
-        if not variance > 1e-9 * n:
+        _interpolate(flat, stride, base, case, place, _F(0.5 * p[3]), _F(0.5 * p[9]), quintic, n, px[_CUR])
+        level = np.float64(_F(level))
+        _accumulate(px, count, _F(level), second, sums)
+        mean_g = sums[0] / pixels
+        variance = sums[1] - pixels * mean_g * mean_g
+        if not variance > 1e-9 * pixels:
             return NO_TEXTURE, np.nan, iterations, np.nan, np.nan
-        ratio = norm_f / math.sqrt(variance)
-        zncc = sums[2] / norm_f / math.sqrt(variance)
-        for k in range(terms):
-            b[k] = ratio * (sums[4 + k] - mean_g * sum_J[k]) - sum_fJ[k]
-            b[terms + k] = ratio * (sums[10 + k] - mean_g * sum_J[terms + k]) - sum_fJ[terms + k]
-        solve(H, b, size)
-        for k in range(terms):
-            d[k], d[6 + k] = b[k], b[terms + k]
-        norm = d[0] ** 2 + d[6] ** 2 + radius**2 * (d[1] ** 2 + d[2] ** 2 + d[7] ** 2 + d[8] ** 2)
-        if second:
-            norm += 0.25 * radius**4 * (d[3] ** 2 + d[5] ** 2 + d[9] ** 2 + d[11] ** 2 + 4 * (d[4] ** 2 + d[10] ** 2))
-        if not norm < 4.0 * radius * radius:
+        zncc = min(sums[2] / norm_f / math.sqrt(variance), 1.0)
+        _step(H, sums, sum_J, sum_fJ, mean_g, norm_f / math.sqrt(variance), terms, b, d)
+        level += mean_g
+        moved = _length(d, radius)
+        if not moved < 4.0 * radius * radius:
             break
         if not (compose_inverse(p, d, A, B) if second else compose_inverse_affine(p, d)):
             break
-        if norm < tolerance * tolerance:
+        if moved < tolerance * tolerance:
             status = GOOD
             break
     if status != GOOD:
@@ -392,7 +525,7 @@ def _refine_point(  # type: ignore[no-untyped-def]
     # Residual variance f' - r g' holds both images' noise: √2 σ.
     scatter = math.sqrt(2.0) * noise
     if not noise > 0.0:
-        scatter = norm_f * math.sqrt(max(2.0 * (1.0 - zncc), 0.0) / (n - size - 2))
+        scatter = norm_f * math.sqrt(max(2.0 * (1.0 - zncc), 0.0) / (pixels - size - 2))
     b[:] = 0.0
     b[0] = 1.0
     solve(H, b, size)

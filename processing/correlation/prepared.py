@@ -13,6 +13,7 @@ from processing.correlation.spline import coefficients, gradients
 from processing.errors import InputError
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 Box = tuple[int, int, int, int]
 
 
@@ -26,10 +27,10 @@ class Reference:
 
     image: NDArray = field(repr=False)
     origin: Array
-    grey: Array = field(repr=False)
-    gx: Array = field(repr=False)
-    gy: Array = field(repr=False)
-    coef: Array = field(repr=False)
+    grey: Single = field(repr=False)
+    gx: Single = field(repr=False)
+    gy: Single = field(repr=False)
+    coef: Single = field(repr=False)
     mask: NDArray[np.bool_] = field(repr=False)
     grey_range: float
     seconds: float = 0.0
@@ -46,7 +47,7 @@ class Current:
 
     image: NDArray = field(repr=False)
     origin: Array
-    coef: Array = field(repr=False)
+    coef: Single = field(repr=False)
     degree: int
     seconds: float = 0.0
 
@@ -126,8 +127,8 @@ def _clip(box: Box, shape: tuple[int, ...]) -> Box:
     return max(int(box[0]), 0), max(int(box[1]), 0), min(int(box[2]), shape[1]), min(int(box[3]), shape[0])
 
 
-def _crop(image: NDArray, box: Box) -> Array:
-    return np.ascontiguousarray(image[box[1] : box[3], box[0] : box[2]], dtype=np.float64)
+def _crop(image: NDArray, box: Box) -> Single:
+    return np.ascontiguousarray(image[box[1] : box[3], box[0] : box[2]], dtype=np.float32)
 
 
 def _check_image(image: NDArray, name: str) -> None:

@@ -12,12 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Levels = NDArray[np.floating]
 
 _SAMPLES = {3: np.array([1.0, 4.0, 1.0]) / 6.0, 5: np.array([1.0, 26.0, 66.0, 26.0, 1.0]) / 120.0}
+WEIGHT_SCALE = {
+    3: 36.0,
+    5: 14400.0,
+}  # the kernels' weights are whole-number polynomials, a product of two too large by this
 # β'(k) at the integers k = -2 ... 2 (cubic: -1 ... 1).
 _SLOPES = {3: np.array([0.5, 0.0, -0.5]), 5: np.array([1.0, 10.0, 0.0, -10.0, -1.0]) / 24.0}
-_REACH = {3: 18, 5: 28}  # taps on either side: pole ** reach < 1e-10
-PAD = 3  # coefficients kept outside the image, so that every position inside has its taps
+_REACH = {3: 12, 5: 18}  # taps on either side: pole ** reach < 3e-7, the last digit of single precision
+PAD = 32  # coefficients kept outside the image, so that every position inside has its taps, and a vector its lanes
 
 
 def prefilter_taps(degree: int) -> Array:
@@ -37,18 +42,22 @@ def gradient_taps(degree: int) -> Array:
     return np.convolve(prefilter_taps(degree), _SLOPES[degree])[::-1].copy()
 
 
-def coefficients(image: Array, degree: int) -> Array:
-    """Spline coefficients of an image (h, w), with PAD more on every side. (h + 2 PAD, w + 2 PAD)."""
-    taps = prefilter_taps(degree)
-    inner = cv2.sepFilter2D(image, cv2.CV_64F, taps, taps, borderType=cv2.BORDER_REFLECT_101)
-    return np.ascontiguousarray(cv2.copyMakeBorder(inner, PAD, PAD, PAD, PAD, cv2.BORDER_REFLECT_101), dtype=np.float64)
+def coefficients(image: Levels, degree: int) -> Levels:
+    """Spline coefficients of an image (h, w), with PAD more on every side. (h + 2 PAD, w + 2 PAD).
+
+    In the kernels' scale: times WEIGHT_SCALE they are the coefficients of the normalised B-spline. Single precision
+    of a float32 image, else double.
+    """
+    taps = prefilter_taps(degree) / np.sqrt(WEIGHT_SCALE[degree])
+    inner = cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_REFLECT_101)
+    return np.asarray(cv2.copyMakeBorder(inner, PAD, PAD, PAD, PAD, cv2.BORDER_REFLECT_101))
 
 
-def gradients(image: Array, degree: int) -> tuple[Array, Array]:
+def gradients(image: Levels, degree: int) -> tuple[Levels, Levels]:
     """∂/∂x and ∂/∂y of the spline at the samples of an image (h, w). Two (h, w), grey levels a pixel."""
     slope, one = gradient_taps(degree), np.ones(1)
     border = cv2.BORDER_REFLECT_101
     return (
-        np.asarray(cv2.sepFilter2D(image, cv2.CV_64F, slope, one, borderType=border), dtype=np.float64),
-        np.asarray(cv2.sepFilter2D(image, cv2.CV_64F, one, slope, borderType=border), dtype=np.float64),
+        np.asarray(cv2.sepFilter2D(image, -1, slope, one, borderType=border)),
+        np.asarray(cv2.sepFilter2D(image, -1, one, slope, borderType=border)),
     )
