@@ -141,9 +141,7 @@ def export(
 
 @app.command()
 def bench(
-    data: Annotated[
-        Path | None, typer.Option(help="Folder multidic_rig of the reference data; else synthetic.")
-    ] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of the MultiDIC rig; else synthetic.")] = None,
     repeats: Annotated[int, typer.Option(min=1, help="Runs of which the best counts.")] = 5,
     interpolation: Annotated[str, typer.Option(help="cubic or quintic.")] = "cubic",
     compare: Annotated[Path | None, typer.Option(help="An earlier result (JSON) to compare with.")] = None,

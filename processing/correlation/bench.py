@@ -134,7 +134,7 @@ def _measure(
     reference: Image, current: Image, mask: NDArray[np.bool_], xy: NDArray[np.float64],
     settings: CorrelationSettings, threads: int, repeats: int,
 ) -> dict[str, Any]:  # fmt: skip
-    wholes, results, kernels = [], [], []
+    wholes, results, kernels, cpu = [], [], [], []
     for _ in range(repeats):
         began = time.perf_counter()
         prepared = prepare_reference(reference, mask, settings), prepare_current(current, None, settings)
@@ -143,15 +143,17 @@ def _measure(
     start, n = _start_off(results[0]), len(xy)
     with on_threads(threads):
         for _ in range(2 * repeats):
-            began = time.perf_counter()
+            began, worked = time.perf_counter(), time.process_time()
             _, _, iterations, _, _ = refine(*prepared, xy, start, settings)
             kernels.append(time.perf_counter() - began)
+            cpu.append(time.process_time() - worked)
     stages = {name: min(r.seconds[name] for r in results) for name in ("prepare", "start", "refine")}
     return {
         "radius": settings.radius,
         "order": settings.order,
         "threads": threads,
         "kernel_points_per_second": n / min(kernels),
+        "kernel_points_per_cpu_second": n / min(cpu),  # what a core does when other programs leave it alone
         "refine_points_per_second": n / stages["refine"],
         "seconds": {**stages, "whole": min(wholes)},
         "iterations": float(iterations.mean()),

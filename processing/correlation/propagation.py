@@ -152,23 +152,24 @@ class Field:
 def bare_points(reference: Reference, xy: Array, settings: CorrelationSettings) -> NDArray[np.bool_]:
     """Points (n,) with clearly too little texture about them, seen at once for all: no start value is sought there.
 
-    The weaker eigenvalue of the structure tensor over the square about the point; the kernel judges the subset itself.
+    The weaker eigenvalue of the structure tensor over the square about the point, from a sample of its pixels; the
+    kernel judges the subset itself.
     """
-    size = (2 * settings.radius + 1,) * 2
-    inside = reference.mask.astype(np.float64)
-    at = np.rint(xy - reference.origin).astype(np.int64)
+    thin = max(settings.radius // 8, 1)
+    size = (2 * (settings.radius // thin) + 1,) * 2
+    sampled = np.s_[::thin, ::thin]
+    inside = reference.mask[sampled].astype(np.float32)
+    gx, gy = reference.gx[sampled] * inside, reference.gy[sampled] * inside
+    at = np.rint((xy - reference.origin) / thin).astype(np.int64)
     h, w = inside.shape
     column, row = np.clip(at[:, 0], 0, w - 1), np.clip(at[:, 1], 0, h - 1)
 
-    def mean(values: Array) -> Array:
-        filtered = cv2.boxFilter(values * inside, cv2.CV_64F, size, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray(filtered, dtype=np.float64)[row, column]
+    def mean(values: NDArray[np.float32]) -> Array:
+        filtered = cv2.boxFilter(values, -1, size, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(filtered[row, column], dtype=np.float64)
 
-    share = np.maximum(mean(inside), 1e-9)
-    xx, xy_, yy = (
-        mean(a * b) / share
-        for a, b in ((reference.gx, reference.gx), (reference.gx, reference.gy), (reference.gy, reference.gy))
-    )
+    share = np.maximum(mean(inside), 1e-6)
+    xx, xy_, yy = mean(gx * gx) / share, mean(gx * gy) / share, mean(gy * gy) / share
     weakest = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy_**2)
     limit = 0.7 * settings.texture_min * reference.grey_range / 255.0
     return np.asarray(weakest < limit**2)
@@ -202,7 +203,7 @@ def refine(
         reference.gx,
         reference.gy,
         reference.coef,
-        reference.mask,
+        reference.mask.view(np.uint8),
         reference.origin,
         current.coef,
         current.origin,

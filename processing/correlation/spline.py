@@ -18,11 +18,11 @@ _SAMPLES = {3: np.array([1.0, 4.0, 1.0]) / 6.0, 5: np.array([1.0, 26.0, 66.0, 26
 WEIGHT_SCALE = {
     3: 36.0,
     5: 14400.0,
-}  # the kernels' weights are whole-number polynomials, a product of two too large by this
+}  # of a product of two of the kernels' weights
 # β'(k) at the integers k = -2 ... 2 (cubic: -1 ... 1).
 _SLOPES = {3: np.array([0.5, 0.0, -0.5]), 5: np.array([1.0, 10.0, 0.0, -10.0, -1.0]) / 24.0}
 _REACH = {3: 12, 5: 18}  # taps on either side: pole ** reach < 3e-7, the last digit of single precision
-PAD = 32  # coefficients kept outside the image, so that every position inside has its taps, and a vector its lanes
+PAD = 32  # coefficients outside the image: a position inside has its taps, a vector its lanes
 
 
 def prefilter_taps(degree: int) -> Array:
