@@ -92,11 +92,13 @@ def correlate(
     with on_threads(threads):
         load_kernels()
         points = Field(reference, current, xy, settings, progress)
-        seconds = {"prepare": reference.seconds + current.seconds, "start": 0.0, "refine": 0.0}
+        seconds = {"prepare": reference.seconds, "start": 0.0, "refine": 0.0}
         if start is None:
             _match_automatically(points, seconds)
         else:
             _match_from(points, _parameters(start, len(xy)), seconds)
+    seconds["prepare"] += points.filtering
+    seconds["refine"] -= points.filtering
     return _result(points, seconds)
 
 
@@ -128,11 +130,13 @@ def _match_automatically(points: Field, seconds: dict[str, float]) -> None:
         trial = _try_seeds(points, seeds, method)
         share = float(trial.good.sum() / max((trial.status != Status.NO_TEXTURE).sum(), 1))
         log.debug("%s: %d of %d seeds hold", name, int(trial.good.sum()), len(seeds))
-        seconds["start"] += time.perf_counter() - began
+        seconds["start"] += time.perf_counter() - began - trial.filtering
+        seconds["prepare"] += trial.filtering
         if share < _TRUSTED:
             doubtful.append((share, seeds, trial))
             continue
         points.adopt(seeds, trial)
+        points.region = points.region or trial.region
         _carry_on(points, seconds)
     for _, seeds, trial in sorted(doubtful, key=lambda entry: -entry[0]):
         if len(_open(points)) > (1.0 - _ENOUGH) * _worth(points):

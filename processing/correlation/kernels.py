@@ -40,6 +40,7 @@ GOOD, NO_CONVERGENCE, OUTSIDE, NO_TEXTURE = 0, 2, 5, 6
 N_PARAMETERS = 12
 _F, _U = np.float32, np.uint64
 _WEIGHT, _REF, _GX, _GY, _CUR = range(5)  # rows of a packed subset
+_LAST_DIGIT = 1e-5  # px; steps below it that shrink no more are the rounding of single precision
 _CHUNK = 64  # points that share their scratch memory
 _PAD = PAD
 
@@ -356,7 +357,7 @@ def _refine_point(  # type: ignore[no-untyped-def]
 
     stride, first_tap = _U(shape[1]), 2 if quintic else 1
     second = terms == 6
-    status, zncc, iterations = NO_CONVERGENCE, np.nan, 0
+    status, zncc, iterations, previous = NO_CONVERGENCE, np.nan, 0, np.inf
     for _ in range(max_iterations):
         iterations += 1
         if not _place(shape, first_tap, x_cur, y_cur, p, radius, corner, px[_WEIGHT], n, base, case, place):
@@ -376,9 +377,10 @@ def _refine_point(  # type: ignore[no-untyped-def]
             break
         if not (compose_inverse(p, d, A, B) if second else compose_inverse_affine(p, d)):
             break
-        if moved < tolerance * tolerance:
+        if moved < tolerance * tolerance or previous <= moved < _LAST_DIGIT * _LAST_DIGIT:
             status = GOOD
             break
+        previous = moved
     if status != GOOD:
         return status, zncc, iterations, np.nan, np.nan
     # Residual variance f' - r g' holds both images' noise: √2 σ.

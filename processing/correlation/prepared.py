@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.correlation.settings import CorrelationSettings
-from processing.correlation.spline import coefficients, gradients
+from processing.correlation.spline import PAD, REACH, coefficients, gradients
 from processing.errors import InputError
 
 Array = NDArray[np.float64]
@@ -43,18 +44,43 @@ class Reference:
 
 @dataclass(frozen=True)
 class Current:
-    """A current image: padded coefficients of a box of it, the box's origin (x, y), and the image as it came."""
+    """A current image as it came, and the box (x0, y0, x1, y1) of it where matches can lie, filtered when needed."""
 
     image: NDArray = field(repr=False)
-    origin: Array
-    coef: Single = field(repr=False)
+    box: Box
     degree: int
-    seconds: float = 0.0
 
     @property
     def shape(self) -> tuple[int, int]:
         """(height, width) of the whole image, px."""
         return self.image.shape[0], self.image.shape[1]
+
+    @property
+    def origin(self) -> Array:
+        """(x, y) px of the box in the image."""
+        return np.array(self.box[:2], dtype=np.float64)
+
+    @cached_property
+    def coef(self) -> Single:
+        """Padded coefficients of the box, those of the whole image: the filter sees the pixels around."""
+        x0, y0, x1, y1 = self.box
+        wider = _clip((x0 - REACH, y0 - REACH, x1 + REACH, y1 + REACH), self.image.shape)
+        left, top = x0 - wider[0], y0 - wider[1]
+        filtered = coefficients(_crop(self.image, wider), self.degree)
+        cut = filtered[top : top + y1 - y0 + 2 * PAD, left : left + x1 - x0 + 2 * PAD]
+        return np.ascontiguousarray(cut, dtype=np.float32)
+
+    def around(self, positions: Array, margin: float) -> Current:
+        """The same with the box no larger than the positions (k, 2) px and a margin about them."""
+        low, high = np.floor(positions.min(axis=0) - margin), np.ceil(positions.max(axis=0) + margin) + 1
+        x0, y0, x1, y1 = self.box
+        box = (
+            max(x0, min(int(low[0]), x1 - 8)), max(y0, min(int(low[1]), y1 - 8)),
+            min(x1, max(int(high[0]), x0 + 8)), min(y1, max(int(high[1]), y0 + 8)),
+        )  # fmt: skip
+        if (box[2] - box[0]) * (box[3] - box[1]) > 0.7 * (x1 - x0) * (y1 - y0):
+            return self
+        return Current(self.image, box, self.degree)
 
 
 def prepare_reference(
@@ -95,18 +121,16 @@ def prepare_reference(
 
 
 def prepare_current(image: NDArray, roi: Box | None = None, settings: CorrelationSettings | None = None) -> Current:
-    """Filter the current image (h, w), or a box (x0, y0, x1, y1; ends exclusive) of it where matches can lie.
+    """The current image (h, w), or a box (x0, y0, x1, y1; ends exclusive) of it where matches can lie.
 
     A subset that leaves the box is lost as if it left the image.
     """
     settings = settings or CorrelationSettings()
-    began = time.perf_counter()
     _check_image(image, "current")
     box = _clip(roi or (0, 0, image.shape[1], image.shape[0]), image.shape)
     if box[2] - box[0] < 8 or box[3] - box[1] < 8:
         raise InputError(f"the box {roi} of the current image is empty or lies outside it")
-    coef = coefficients(_crop(image, box), settings.degree)
-    return Current(image, np.array(box[:2], dtype=np.float64), coef, settings.degree, time.perf_counter() - began)
+    return Current(image, box, settings.degree)
 
 
 def as_8_bit(image: NDArray) -> NDArray[np.uint8]:

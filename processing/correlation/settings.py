@@ -18,7 +18,8 @@ class CorrelationSettings:
     order : 1 for affine shape functions, 2 for quadratic ones.
     subset : "circle" or "square"; always cut by the mask.
     interpolation : "quintic" or "cubic" B-spline of the current image.
-    tolerance : px; iteration stops when no pixel at the subset's rim moves by more, in the root mean square sense.
+    tolerance : px; iteration stops when no pixel at the subset's rim moves by more, in the root mean square sense,
+        or below 1e-5 px shrinks no more (single precision).
     max_iterations : after so many the point is lost.
     zncc_min : below this a point is lost.
     texture_min : least root-mean-square gradient along the weakest direction, in 1/255 of the grey range a pixel;

@@ -22,6 +22,7 @@ WEIGHT_SCALE = {
 # β'(k) at the integers k = -2 ... 2 (cubic: -1 ... 1).
 _SLOPES = {3: np.array([0.5, 0.0, -0.5]), 5: np.array([1.0, 10.0, 0.0, -10.0, -1.0]) / 24.0}
 _REACH = {3: 12, 5: 18}  # taps on either side: pole ** reach < 3e-7, the last digit of single precision
+REACH = max(_REACH.values())
 PAD = 32  # coefficients outside the image: a position inside has its taps, a vector its lanes
 
 
