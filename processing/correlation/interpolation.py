@@ -113,13 +113,18 @@ def _make_spans(row: Any, across: Any, weights: Any, long_row: Any, taps: int) -
                 p = base + lane
                 total = wy[0] * row_x(c, p, wx) + wy[1] * row_x(c, p + stride, wx)
                 total += wy[2] * row_x(c, p + _U(2) * stride, wx) + wy[3] * row_x(c, p + _U(3) * stride, wx)
-                if taps_y > 4:
+                if taps_y == 5:
                     total += wy[4] * row_x(c, p + _U(4) * stride, wx)
-                if taps_y > 5:
-                    total += wy[5] * row_x(c, p + _U(5) * stride, wx)
-                if taps_y > 6:
-                    total += wy[6] * row_x(c, p + _U(6) * stride, wx)
                 g[at + lane] = total
+            if taps_y > 5:  # in two loops: one with as many rows is not vectorised
+                for lane in range(_L):
+                    e = _F(lane)
+                    wx, wy = weights_x(tx + e * (sx + e * qx)), weights_y(ty + e * (sy + e * qy))
+                    p = base + lane + _U(4) * stride
+                    total = g[at + lane] + wy[4] * row_x(c, p, wx) + wy[5] * row_x(c, p + stride, wx)
+                    if taps_y > 6:
+                        total += wy[6] * row_x(c, p + _U(2) * stride, wx)
+                    g[at + lane] = total
 
         return span
 
