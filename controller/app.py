@@ -17,7 +17,8 @@ from processing.errors import RingdicError
 STATIC = Path(__file__).parent / "web" / "static"
 _NO_PAGE = (
     "<!doctype html><title>RingDIC</title><p>The page is not part of this installation: it was made with "
-    "RINGDIC_SKIP_PAGE set. Install again without it. The HTTP interface works: see <a href='/docs'>/docs</a>."
+    "RINGDIC_SKIP_PAGE set. Install again without it. The HTTP interface works: see "
+    "<a href='/openapi.json'>/openapi.json</a>."
 )
 
 
@@ -28,6 +29,8 @@ def create_app(desk: Desk, static: Path = STATIC) -> FastAPI:
         version="1",
         description="Captures, sessions, processing jobs and results of a ring of cameras. "
         "Everything the page can do, a script can do.",
+        docs_url=None,  # their viewers are loaded from another host; the running system needs none
+        redoc_url=None,
     )
     app.state.desk = desk
     api = APIRouter(prefix="/api/v1", responses={404: {"description": "Not there"}, 409: {"description": "Refused"}})

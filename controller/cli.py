@@ -25,13 +25,13 @@ app = typer.Typer(
 )
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
-Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="A setting; repeatable.")]
+Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="GROUP.NAME=VALUE", help="Repeatable.")]
 SettingsFile = Annotated[Path | None, typer.Option("--settings", help="Settings as a TOML file.")]
 
 
 @app.command()
 def demo(
-    cameras: Annotated[int, typer.Option(min=4, max=30, help="Cameras on the ring.")] = 12,
+    cameras: Annotated[int, typer.Option(min=4, max=30, help="Cameras on the ring; use 6 or more.")] = 12,
     scale: Annotated[float, typer.Option(min=0.1, max=1.0, help="Image size; 1 is 2464 x 3280 px.")] = 0.25,
     steps: Annotated[int, typer.Option(min=1, max=20, help="Deformed steps after the reference.")] = 3,
     no_serve: Annotated[bool, typer.Option("--no-serve", help="End after the table.")] = False,
@@ -82,12 +82,13 @@ def process(
     as_json: AsJson = False,
 ) -> None:
     """Calibrate, correlate, triangulate and compute strain, with nothing to click."""
-    from processing.pipeline import process_session
     from processing.settings import load_settings
 
     if cluster is not None:
         raise InputError("--cluster: computing on a cluster is not available in this version; leave the option out")
     chosen = load_settings(settings, set_ or [])
+    from processing.pipeline import process_session  # takes a while: what was typed is checked first
+
     with narrated() as report:
         run = process_session(session, chosen, report)
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))

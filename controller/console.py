@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bars
 from rich.table import Table
@@ -53,13 +54,13 @@ def show_table(title: str, rows: Sequence[Mapping[str, str]]) -> None:
     for i, name in enumerate(rows[0]):
         table.add_column(name, justify="left" if i == 0 else "right")
     for row in rows:
-        table.add_row(*(str(row[name]) for name in rows[0]))
+        table.add_row(*(escape(str(row[name])) for name in rows[0]))
     (_console if _console.is_terminal else Console(stderr=True, width=120)).print(table)
 
 
 def say(sentence: str) -> None:
     """One sentence on standard error."""
-    _console.print(sentence, highlight=False, soft_wrap=True)
+    _console.print(sentence, highlight=False, soft_wrap=True, markup=False)
 
 
 def _lines() -> Report:
@@ -69,7 +70,8 @@ def _lines() -> Report:
         tenth = int(progress.done * 10)
         if progress.stage != last["stage"] or tenth != last["tenth"]:
             last.update(stage=progress.stage, tenth=tenth)
-            left = "" if progress.left_s is None else f", {progress.left_s:.0f} s left"
-            say(f"{progress.done:4.0%}  {progress.stage}  {progress.message} {progress.rate}{left}")
+            left = "" if progress.left_s is None else f"{progress.left_s:.0f} s left"
+            told = (progress.stage, progress.message, progress.rate, left)
+            say(f"{progress.done:4.0%}  {'  '.join(part for part in told if part)}")
 
     return report

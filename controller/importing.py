@@ -123,7 +123,10 @@ def _target(src: Path, camera: str) -> Path:
     found = [folder / f"{camera}{suffix}" for suffix in SUFFIXES if (folder / f"{camera}{suffix}").is_file()]
     found += [p for s in SUFFIXES if (p := folder / f"{camera}{s.upper()}").is_file() and p not in found]
     if not found:
-        raise InputError(f"{folder}: no image of the calibration object for camera '{camera}' ({camera}.png or so)")
+        raise InputError(
+            f"{folder}: no image of the calibration object for camera '{camera}'; "
+            f"put it there as {camera}.png, .jpg or .tif"
+        )
     if len(found) > 1:
         names = ", ".join(path.name for path in found)
         raise InputError(f"{folder}: more than one image for camera '{camera}' ({names}); keep one")
@@ -148,8 +151,8 @@ def _check_images(views: Sequence[_View], progress: Progress) -> dict[str, tuple
         first.setdefault(view.camera, view.path)
         if known != (height, width):
             raise InputError(
-                f"{view.path}: {width} x {height} px, but {first[view.camera].name} of the same camera "
-                f"'{view.camera}' has {known[1]} x {known[0]} px; all images of a camera must have one size"
+                f"{view.path}: {width} x {height} px, but {first[view.camera]} of the same "
+                f"camera '{view.camera}' has {known[1]} x {known[0]} px; all images of a camera must have one size"
             )
     progress(len(views), len(views), "")
     return sizes

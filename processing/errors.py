@@ -19,6 +19,6 @@ class InputError(RingdicError, ValueError):
 
 
 class ComputationError(RingdicError, RuntimeError):
-    """Sound input that does not determine the answer: too few dots, no common view."""
+    """Sound input that does not determine the answer: no texture in common, a board seen from one side only."""
 
     exit_code = 3

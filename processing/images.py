@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from processing.errors import InputError
 
+# What OpenCV finds wrong with a file is said in a sentence that names the file; its own lines do not.
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
 # Grey = 0.298936 R + 0.587043 G + 0.114021 B (ITU-R BT.601), in millionths: exact in whole numbers.
 _RED, _GREEN, _BLUE = 298936, 587043, 114021
 _MILLION = 1_000_000
@@ -30,10 +33,12 @@ def read_gray(path: Path) -> NDArray:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    if not data:
+        raise InputError(f"{path}: the image file is empty; copy or capture it again")
     if not _is_whole(data):
         raise InputError(f"{path}: the image file is truncated; copy or capture it again")
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise InputError(f"{path}: not a readable image ({error.err}); use JPEG, PNG, PGM or TIFF") from error
     if image is None:
@@ -63,7 +68,8 @@ def read_mask(path: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
     mask = read_gray(path) > 0
     if mask.shape != tuple(shape):
         raise InputError(
-            f"{path}: the mask is {mask.shape[1]} x {mask.shape[0]} px but its image is {shape[1]} x {shape[0]} px"
+            f"{path}: the mask is {mask.shape[1]} x {mask.shape[0]} px but its image is {shape[1]} x {shape[0]} px; "
+            "draw it on the reference image"
         )
     if not mask.any():
         raise InputError(f"{path}: the mask marks no pixel; paint the region of interest white")

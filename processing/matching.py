@@ -155,9 +155,11 @@ def _find_region(stereo: _Stereo, image: Image, current: Current, mask: Mask | N
         xyz = np.where(good[..., None], xyz, np.nan)
         good &= well_seen(xyz, stereo.cameras, stereo.search.incidence)
     if good.sum() < 4:
+        where = "" if mask is None else f" inside the mask of camera {first.id}"
+        covered = "" if mask is None else ", that the mask covers it"
         raise ComputationError(
-            f"cameras {first.id} and {second.id}: no textured surface that both see was found; check that the "
-            "specimen is speckled, stands where the target stood, and that the images are in focus"
+            f"cameras {first.id} and {second.id}: no textured surface that both see was found{where}; check that the "
+            f"specimen is speckled and stands where the target stood{covered}, and that the images are in focus"
         )
     region = mask if mask is not None else paint(points, good, first.size)
     return region, px[good.ravel()], warps[good.ravel()]

@@ -52,11 +52,12 @@ def process_session(path: Path, settings: Settings, report: Report = silent) -> 
     load_kernels()
     stages.at("calibrate", 0.0)
     ring = calibrate_ring(session, settings.calibration, lambda done, who: stages.at("calibrate", done, who))
-    pairs, warnings = _usable_pairs(session, ring, steps)
-    errors = {pair: control_points(*(ring.cameras[id_] for id_ in pair)) for pair in pairs}
-    surfaces, more_warnings = _surfaces(session, ring, pairs, steps, settings, stages)
+    errors, warnings = _usable_pairs(session, ring, steps)
+    surfaces, more_warnings = _surfaces(session, ring, tuple(errors), steps, settings, stages)
     results = _join(session, ring, surfaces, steps, settings)
     found = summary.summarise(results, ring, errors, surfaces, (*ring.warnings, *warnings, *more_warnings))
+    for warning in found["warnings"]:
+        log.warning("%s", warning)
     return _keep(session, results, found, ring, errors, settings, stages, began)
 
 
@@ -69,9 +70,10 @@ def _specimen_steps(session: Session) -> tuple[Capture, ...]:
 
 def _usable_pairs(
     session: Session, ring: Ring, steps: tuple[Capture, ...]
-) -> tuple[tuple[tuple[str, str], ...], tuple[str, ...]]:
-    """Pairs of calibrated cameras with a reference image, and a sentence for each pair left out."""
-    usable, warnings = [], []
+) -> tuple[dict[tuple[str, str], ReconstructionError], tuple[str, ...]]:
+    """Pairs of calibrated cameras with a reference image and how well they agree; a sentence for each left out."""
+    usable: dict[tuple[str, str], ReconstructionError] = {}
+    warnings: list[str] = []
     for pair in session.rig.pairs:
         missing = [id_ for id_ in pair if id_ not in ring.cameras]
         blind = [id_ for id_ in pair if id_ not in steps[0].images]
@@ -82,10 +84,13 @@ def _usable_pairs(
                 f"pair {pair[0]}-{pair[1]} is left out: camera {' and '.join(blind)} has no image in {steps[0].id}"
             )
         else:
-            usable.append(pair)
+            try:
+                usable[pair] = control_points(ring.cameras[pair[0]], ring.cameras[pair[1]])
+            except ComputationError as error:
+                warnings.append(str(error))
     if not usable:
-        raise InputError(f"{session.path}: no camera pair can be used. {'; '.join(warnings)}")
-    return tuple(usable), tuple(warnings)
+        raise InputError(f"{session.path}: no camera pair can be used: {'; '.join(warnings)}")
+    return usable, tuple(warnings)
 
 
 def _surfaces(
@@ -120,13 +125,12 @@ def _surfaces(
             found = match_pair(cameras, image, len(steps), _mask(session, cameras[0]), search, correlation, progress)
             surfaces.append(pair_surface(cameras, found, correlation.step, settings.surface.sigma_max_px))
         except ComputationError as error:
-            log.warning("%s", error)
             warnings.append(str(error))
             continue
         refined += _matches_made(found)
         seconds += found.matches.seconds["refine"]
     if not surfaces:
-        raise ComputationError(f"{session.path}: no camera pair gave a surface. {'; '.join(warnings)}")
+        raise ComputationError(f"{session.path}: no camera pair gave a surface: {'; '.join(warnings)}")
     stages.at("triangulate", 1.0)
     return surfaces, warnings
 

@@ -130,11 +130,13 @@ def read_rig(path: Path) -> Rig:
     """The rig described by a TOML file; InputError names the file and the key at fault."""
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path}: no such file; a folder of images needs a rig.toml beside the images")
+        raise InputError(f"{path}: no such file; it must describe the target, the board and the cameras")
     try:
         return parse_rig(path.read_text(encoding="utf-8"))
-    except (InputError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except InputError as error:
         raise InputError(f"{path}: {error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not readable as TOML ({error})") from error
 
 
 def parse_rig(text: str) -> Rig:
@@ -145,7 +147,7 @@ def parse_rig(text: str) -> Rig:
         _require(name in tables, f"[{name}] is missing")
     rig = _table(tables["rig"], "[rig]")
     _refuse_unknown(rig, {"name"}, "[rig] ")
-    _require("name" in rig, "[rig] name is missing")
+    _require(bool(rig.get("name")), "[rig] name is missing")
     entries = tables["cameras"]
     _require(isinstance(entries, list), "cameras must be one [[cameras]] table a camera, with two pairs of brackets")
     cameras = tuple(_build(RigCamera, entry, f"[[cameras]] number {i + 1} ") for i, entry in enumerate(entries))

@@ -1,7 +1,8 @@
 """All cameras of a session calibrated, and how well they agree on the control points.
 
-A calibration depends on the images of board and target, the rig and the settings alone. It is kept in the session
-under a key made of these, so that a later run, or a run after one more capture, need not repeat it.
+Each camera is calibrated alone, by the direct linear transformation; the bundle adjustment starts from there. A
+calibration depends on the images of board and target, the rig and the settings alone. It is kept in the session under
+a key made of these, so that a later run, or a run after one more capture, need not repeat it.
 """
 
 from __future__ import annotations
@@ -9,14 +10,18 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from processing.calibration.bundle import BundleFit, TargetPrior, adjust_ring
 from processing.calibration.camera_calibration import CameraCalibration, calibrate_camera
 from processing.calibration.intrinsics import read_intrinsics
 from processing.calibration.quality import ReconstructionError, reconstruction_error
@@ -28,15 +33,21 @@ from processing.triangulation import triangulate
 
 log = logging.getLogger(__name__)
 
-_VERSION = 1  # of what a kept calibration means; raise it when the method changes
+_VERSION = 2  # of what a kept calibration means; raise it when the method changes
+#: A lens this much further from the board's than its uncertainty tells of a fault of board or target.
+_LENS_CHI2 = 25.0
 
 
 @dataclass(frozen=True)
 class Ring:
-    """Calibrated cameras by id, and one sentence for each camera that could not take part."""
+    """Calibrated cameras by id, and one sentence for each that could not take part or whose images disagree.
+
+    bundle : of the adjustment of all cameras together, None where each was calibrated alone.
+    """
 
     cameras: dict[str, CameraCalibration]
     warnings: tuple[str, ...]
+    bundle: BundleFit | None = None
 
 
 def calibrate_ring(
@@ -58,17 +69,27 @@ def calibrate_ring(
     )
     done = 0
     calibrated: dict[str, CameraCalibration] = {}
+    keys: list[str] = []
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         futures = {id_: pool.submit(_calibrated, session, id_, target.images[id_], settings) for id_ in taking_part}
         for id_, future in futures.items():
-            calibrated[id_] = future.result()
+            calibrated[id_], key = future.result()
+            keys.append(key)
             done += 1
             progress(done / len(taking_part), f"camera {id_}")
-    return Ring(calibrated, warnings)
+    if settings.method == "dlt":
+        return Ring(calibrated, warnings)
+    progress(1.0, "all cameras together")
+    adjusted, fit = _adjusted(session, calibrated, keys, settings)
+    return Ring(adjusted, (*warnings, *_contradictions(fit)), fit)
 
 
 def control_points(first: CameraCalibration, second: CameraCalibration) -> ReconstructionError:
-    """Reconstruction error of the dots that two cameras both see (Solav et al. 2018, eq. 10-11)."""
+    """Reconstruction error of the dots that two cameras both see (Solav et al. 2018, eq. 10-11).
+
+    True are the places that the calibration takes the dots to have: after a bundle adjustment the print errors found
+    are in them.
+    """
     seen = [
         {(int(row), int(column)): i for i, (row, column) in enumerate(zip(dots.rows, dots.columns, strict=True))}
         for dots in (first.dots, second.dots)
@@ -77,40 +98,95 @@ def control_points(first: CameraCalibration, second: CameraCalibration) -> Recon
     if not common:
         raise ComputationError(
             f"cameras {first.camera.id} and {second.camera.id} have no dot of the target in common; "
-            "check their azimuths in rig.toml"
+            "check that nothing hides the target, and their azimuths in rig.toml"
         )
     chosen = [[places[dot] for dot in common] for places in seen]
-    px = np.stack([first.dots.px[chosen[0]], second.dots.px[chosen[1]]])
+    px = np.stack([first.dot_centres[chosen[0]], second.dot_centres[chosen[1]]])
     return reconstruction_error(first.dots.xyz[chosen[0]], triangulate([first.camera, second.camera], px))
 
 
-def _calibrated(session: Session, camera_id: str, target: Path, settings: CalibrationGroup) -> CameraCalibration:
-    """One camera's calibration, from the session's folder if it is there, else made and kept."""
+def _calibrated(
+    session: Session, camera_id: str, target: Path, settings: CalibrationGroup
+) -> tuple[CameraCalibration, str]:
+    """One camera's calibration and its key, from the session's folder if it is there, else made and kept."""
     boards = [capture.images[camera_id] for capture in session.of_kind("board") if camera_id in capture.images]
     lens_file = session.rig.camera(camera_id).intrinsics
     key = _key(session, camera_id, [target, *boards], settings)
     kept = session.path / "calibration" / f"{camera_id}-{key}.json"
     if kept.is_file():
-        return CameraCalibration.from_dict(json.loads(kept.read_text(encoding="utf-8")))
+        return CameraCalibration.from_dict(json.loads(kept.read_text(encoding="utf-8"))), key
+    images = _of_one_size(camera_id, [target, *boards] if settings.distortion and lens_file is None else [target])
     calibration = calibrate_camera(
         session.rig,
         camera_id,
-        [read_gray(path) for path in boards] if settings.distortion and lens_file is None else [],
-        read_gray(target),
+        images[1:],
+        images[0],
         distortion=settings.distortion,
         intrinsics=None if lens_file is None else read_intrinsics(session.path / lens_file),
         drop_percentile=settings.drop_percentile,
     )
-    kept.parent.mkdir(exist_ok=True)
-    aside = kept.with_suffix(".partial")
-    aside.write_text(json.dumps(calibration.to_dict()), encoding="utf-8")
-    aside.replace(kept)
-    return calibration
+    _keep(kept, calibration.to_dict())
+    return calibration, key
+
+
+def _adjusted(
+    session: Session, calibrated: dict[str, CameraCalibration], keys: list[str], settings: CalibrationGroup
+) -> tuple[dict[str, CameraCalibration], BundleFit]:
+    """The cameras adjusted together, from the session's folder if they are there, else made and kept."""
+    digest = hashlib.sha256(f"{_VERSION} {keys} {settings}".encode()).hexdigest()[:16]
+    kept = session.path / "calibration" / f"bundle-{digest}.json"
+    if kept.is_file():
+        values = json.loads(kept.read_text(encoding="utf-8"))
+        cameras = [CameraCalibration.from_dict(each) for each in values["cameras"]]
+        return {each.camera.id: each for each in cameras}, BundleFit.from_dict(values["fit"])
+    prior = TargetPrior(
+        dots=settings.print_error_mm,
+        radius=settings.radius_error_mm,
+        pitch=settings.pitch_error_mm,
+        tilt=math.radians(settings.tilt_error_deg),
+    )
+    adjusted, fit = adjust_ring(calibrated, session.rig.target, prior)
+    _keep(kept, {"cameras": [each.to_dict() for each in adjusted.values()], "fit": fit.to_dict()})
+    return adjusted, fit
+
+
+def _contradictions(fit: BundleFit) -> tuple[str, ...]:
+    """A sentence where the lenses that the target asks for are not those of the boards."""
+    off = [id_ for id_, chi2 in zip(fit.cameras, fit.lens_chi2, strict=True) if chi2 > _LENS_CHI2]
+    if not off:
+        return ()
+    worst = math.sqrt(float(np.nanmax(fit.lens_chi2)))
+    return (
+        f"camera {', '.join(off)}: the lens that fits the target is up to {worst:.0f} standard errors from the one "
+        "that fits the checkerboard, so the board counted less; check that the board is flat and its squares true, "
+        "that rig.toml describes the target, and that no lens was touched in between",
+    )
+
+
+def _keep(path: Path, values: dict[str, Any]) -> None:
+    path.parent.mkdir(exist_ok=True)
+    aside = path.with_suffix(".partial")
+    aside.write_text(json.dumps(values), encoding="utf-8")
+    aside.replace(path)
+
+
+def _of_one_size(camera_id: str, paths: list[Path]) -> list[NDArray]:
+    """The images, grey; InputError names the first whose size differs from that of the first image."""
+    images = [read_gray(path) for path in paths]
+    height, width = images[0].shape
+    for path, image in zip(paths, images, strict=True):
+        if image.shape != (height, width):
+            raise InputError(
+                f"{path}: {image.shape[1]} x {image.shape[0]} px, but {paths[0]} of the same camera '{camera_id}' has "
+                f"{width} x {height} px; capture board, target and specimen at one size"
+            )
+    return images
 
 
 def _key(session: Session, camera_id: str, images: list[Path], settings: CalibrationGroup) -> str:
     digest = hashlib.sha256()
-    digest.update(f"{_VERSION} {camera_id} {session.rig.target} {session.rig.board} {settings}".encode())
+    alone = f"{settings.distortion} {settings.drop_percentile}"
+    digest.update(f"{_VERSION} {camera_id} {session.rig.target} {session.rig.board} {alone}".encode())
     digest.update(repr(session.rig.camera(camera_id)).encode())
     for image in images:
         digest.update(hashlib.sha256(image.read_bytes()).digest())

@@ -12,8 +12,10 @@
         0002-target/ …
         0003-specimen/ …          the first specimen capture is the reference, the others are the steps
       mask/<camera>.png           optional region of interest on the reference image
+      calibration/                cameras as calibrated, kept under a key of what they rest on
       results/
-        0001/ …                   one folder a processing run, written aside and renamed
+        0001/ …                   one folder a processing run, written aside and renamed: results.h5, settings.toml,
+                                  calibration.json, summary.json
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ from processing.errors import InputError
 from processing.rig import Rig, read_rig
 
 KINDS = ("board", "target", "specimen", "static")
+_MEND = "copy it back, or import the session again"
 _CAPTURE_NAME = re.compile(r"(\d{4,})-(board|target|specimen|static)")
 
 
@@ -72,13 +75,7 @@ class Session:
 def read_session(path: Path) -> Session:
     """The session of a folder; InputError says what is missing."""
     path = Path(path)
-    if not path.is_dir():
-        raise InputError(f"{path}: no such session folder")
-    if not (path / "session.json").is_file():
-        raise InputError(
-            f"{path}: not a session (no session.json); "
-            f"a folder of images becomes one with 'ringdic import {path} SESSION'"
-        )
+    _require_session(path)
     header = _read_json(path / "session.json")
     captures = sorted(_captures(path / "captures"), key=lambda capture: capture.number)
     return Session(path, str(header.get("session", path.name)), read_rig(path / "rig.toml"), tuple(captures))
@@ -96,6 +93,7 @@ def newest_results(path: Path) -> Path:
     """The results file of the newest run; InputError if the session has not been processed."""
     finished = runs(path)
     if not finished:
+        _require_session(Path(path))
         raise InputError(f"{path}: no results yet; run 'ringdic process {path}' first")
     return finished[-1] / "results.h5"
 
@@ -136,6 +134,16 @@ def new_run(path: Path) -> Iterator[NewRun]:
         raise
 
 
+def _require_session(path: Path) -> None:
+    if not path.is_dir():
+        raise InputError(f"{path}: no such session folder")
+    if not (path / "session.json").is_file():
+        raise InputError(
+            f"{path}: not a session (no session.json); "
+            f"a folder of images becomes one with 'ringdic import {path} SESSION'"
+        )
+
+
 def _captures(folder: Path) -> Iterator[Capture]:
     if not folder.is_dir():
         return
@@ -144,21 +152,24 @@ def _captures(folder: Path) -> Iterator[Capture]:
         if not match or not (path / "capture.json").is_file():
             continue
         record = _read_json(path / "capture.json")
-        images = {
-            camera_id: path / frame["file"]
-            for camera_id, frame in record.get("cameras", {}).items()
-            if frame.get("file")
-        }
+        frames = record.get("cameras", {})
+        if not isinstance(frames, dict) or not all(isinstance(frame, dict) for frame in frames.values()):
+            raise InputError(f"{path / 'capture.json'}: 'cameras' must have one record a camera; {_MEND}")
+        images = {camera_id: path / frame["file"] for camera_id, frame in frames.items() if frame.get("file")}
         for camera_id, image in images.items():
             if not image.is_file():
                 raise InputError(
-                    f"{image}: the record of {path.name} names this image of camera {camera_id}, but it is not there"
+                    f"{image}: the record of {path.name} names this image of camera {camera_id}, but it is not there; "
+                    f"{_MEND}"
                 )
         yield Capture(path.name, int(match[1]), match[2], path, images, record)
 
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
+        value = json.loads(path.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error})") from error
+        raise InputError(f"{path}: not readable as JSON ({error}); {_MEND}") from error
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: not a record of a session; {_MEND}")
+    return value

@@ -47,22 +47,23 @@ class CorrelationGroup(_Group):
 
 
 class CalibrationGroup(_Group):
-    """Cameras: the direct linear transformation, with or without the lens measured on the checkerboard.
+    """Cameras: the direct linear transformation (dlt), or from there the adjustment of all together (bundle).
 
+    distortion : the lens is measured on the checkerboard and corrected.
     drop_percentile : checkerboard views whose error lies above it are dropped and the rest is fitted again; 100 keeps
     all views.
+    print_error_mm, radius_error_mm, pitch_error_mm, tilt_error_deg : of the bundle: how far, as standard deviations,
+    the dots, the target's radius, its columns' spacing and the turn of the sheet on it may be from what rig.toml
+    says; 0 holds them.
     """
 
     method: Literal["dlt", "bundle"] = "dlt"
     distortion: bool = True
     drop_percentile: float = Field(default=80.0, gt=0, le=100)
-
-    @field_validator("method")
-    @classmethod
-    def _available(cls, value: str) -> str:
-        if value == "bundle":
-            raise ValueError("'bundle' is not available in this version; use 'dlt'")
-        return value
+    print_error_mm: float = Field(default=0.03, ge=0, le=5)
+    radius_error_mm: float = Field(default=0.0, ge=0, le=5)
+    pitch_error_mm: float = Field(default=0.0, ge=0, le=5)
+    tilt_error_deg: float = Field(default=0.0, ge=0, le=5)
 
 
 class SurfaceGroup(_Group):
@@ -164,6 +165,15 @@ def _toml(value: Any) -> str:
     return f'"{value}"' if isinstance(value, str) else repr(value)
 
 
+_WANTED = {
+    "int": "a whole number",
+    "float": "a number",
+    "bool": "true or false",
+    "string": "text",
+    "model": "a group of settings",
+}
+
+
 def _sentence(error: Any) -> str:
     where = ".".join(str(part) for part in error["loc"])
     if error["type"] == "extra_forbidden":
@@ -174,4 +184,6 @@ def _sentence(error: Any) -> str:
         return f"unknown group of settings '{where}'; known are {', '.join(Settings.model_fields)}"
     if error["type"] == "value_error":
         return f"{where}: {error['ctx']['error']}"
-    return f"{where}: {error['msg'][0].lower()}{error['msg'][1:]}, not {error['input']!r}"
+    wanted = _WANTED.get(error["type"].split("_")[0])
+    must = f"must be {wanted}" if wanted else error["msg"].replace("Input should be", "must be")
+    return f"{where} {must}, not {error['input']!r}"

@@ -1,17 +1,26 @@
 """Fixtures of the whole suite."""
 
 import os
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any, NoReturn
 
 import pytest
+from playwright.sync_api import Browser, sync_playwright
 
 
-def _skip_or_fail(reason: str) -> None:
+def _skip_or_fail(reason: str) -> NoReturn:
     """Skip with a clear reason; where everything is required (CI), fail with it."""
     if os.environ.get("RINGDIC_REQUIRE_DATA"):
         pytest.fail(reason)
     pytest.skip(reason)
+
+
+@pytest.fixture(scope="session")
+def skip_or_fail() -> Callable[[str], NoReturn]:
+    """Call it with what is wanting: the test is skipped; where everything is required (CI), it fails."""
+    return _skip_or_fail
 
 
 @pytest.fixture(scope="session")
@@ -22,6 +31,68 @@ def shared_data() -> Path:
     if not (path / "multidic_rig" / "reference.npz").is_file():
         _skip_or_fail(f"SKIPPED FOR WANT OF DATA: no shared reference data at {path}")
     return path
+
+
+_TARGET_AND_BOARD = """
+[target]
+kind = "dot-cylinder"
+radius_mm = 57.0
+rows = 20
+row_spacing_mm = 12.0
+first_row_z_mm = 10.0
+columns = 14
+column_spacing_mm = 12.0
+dot_size_mm = 4.0
+[board]
+kind = "checkerboard"
+squares = [15, 20]
+square_mm = 10.0
+"""
+
+
+@pytest.fixture(scope="session")
+def rig_toml() -> Callable[[str, Sequence[str]], str]:
+    """Call it with a rig's name and its cameras' ids, evenly spread round the ring: the text of a whole rig.toml.
+
+    It ends with the cameras; a further table may be written behind it.
+    """
+
+    def text(name: str, cameras: Sequence[str]) -> str:
+        entries = (
+            f'[[cameras]]\nid = "{camera}"\nazimuth_deg = {360.0 * i / len(cameras)}\n'
+            for i, camera in enumerate(cameras)
+        )
+        return f'[rig]\nname = "{name}"{_TARGET_AND_BOARD}' + "".join(entries)
+
+    return text
+
+
+@pytest.fixture(scope="session")
+def chromium() -> dict[str, Any]:
+    """How Chromium is launched: the one on the path, or RINGDIC_CHROMIUM; it asks nobody on the network."""
+    path = os.environ.get("RINGDIC_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+    if path is None:
+        _skip_or_fail("SKIPPED FOR WANT OF A BROWSER: install the package 'chromium'")
+    arguments = [
+        "--disable-gpu",
+        "--disable-quic",
+        "--no-first-run",
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+    ]
+    if hasattr(os, "geteuid") and os.geteuid() == 0:
+        arguments.append("--no-sandbox")  # root's Chromium has none
+    return {"executable_path": path, "args": arguments, "timeout": 60_000}
+
+
+@pytest.fixture(scope="module")
+def browser(chromium: dict[str, Any]) -> Iterator[Browser]:
+    """A running Chromium. It ends with the module: Playwright's event loop holds the thread of the tests."""
+    with sync_playwright() as playwright:
+        launched = playwright.chromium.launch(**chromium)
+        yield launched
+        launched.close()
 
 
 _FIGURES = pytest.StashKey[list[tuple[str, str, str]]]()

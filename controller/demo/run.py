@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import signal
 import time
 from datetime import datetime
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from controller.console import narrated, say, show_table
@@ -20,6 +22,7 @@ from processing.rig import parse_rig
 from processing.session import newest_results
 
 BOARDS = 8  # views of the checkerboard a camera
+_START = 300.0  # seconds for all nodes to load their renderer on a busy machine
 _JOB = 3600.0  # seconds that processing may take
 
 
@@ -29,19 +32,20 @@ def run_demo(folder: Path, *, cameras: int, scale: float, steps: int, serve: boo
     Every run makes a folder of its own inside. With ``serve`` the page stays up until Ctrl-C.
     """
     began = time.monotonic()
+    signal.signal(signal.SIGTERM, _leave)
     setting = Setting(_new_folder(folder), cameras, scale)
     rig = paper_rig(cameras, scale, setting.seed)
     say(f"a simulated ring of {cameras} cameras of {rig.cameras[0].width} x {rig.cameras[0].height} px")
-    _warm_up(cameras)
+    warm_up(cameras)
     write_truth(rig, setting.folder)
     name = parse_rig(rig.rig_toml()).name
     ids = [camera.id for camera in rig.cameras]
     with (
-        running_controller(setting, rig.rig_toml(), _settings(scale)) as (address, endpoint),
+        running_controller(setting, rig.rig_toml(), settings_for(scale)) as (address, endpoint),
         running_nodes(setting, name, ids, endpoint) as nodes,
     ):
         client = Client(address)
-        client.wait_for_nodes(ids, 120.0, lambda: check_alive(nodes, setting.folder))
+        client.wait_for_nodes(ids, _START, lambda: check_alive(nodes, setting.folder))
         say(f"{cameras} nodes and the controller are up; the page is at {address}")
         session = client.post("/sessions", {"name": "demo"})["name"]
         with narrated() as report:
@@ -54,7 +58,12 @@ def run_demo(folder: Path, *, cameras: int, scale: float, steps: int, serve: boo
     return comparison
 
 
-def _warm_up(cameras: int) -> None:
+def _leave(signum: int, _: FrameType | None) -> None:
+    """End as Ctrl-C does, through the exits that stop the processes of the rig."""
+    raise SystemExit(128 + signum)
+
+
+def warm_up(cameras: int) -> None:
     """Compile the renderer once here, so that the nodes find it compiled."""
     tiny = paper_rig(cameras, 0.05).cameras[0]
     for kind in ("board", "target", "specimen"):
@@ -103,7 +112,7 @@ def _compare(setting: Setting, session: str, rig: VirtualRig, began: float) -> d
     return comparison
 
 
-def _settings(scale: float) -> str:
+def settings_for(scale: float) -> str:
     """The paper's radius 20 and step 10 px at full scale; at a smaller one no fewer pixels than a subset needs."""
     radius, step = max(10, round(20 * scale)), max(5, round(10 * scale))
     return f"[correlation]\nradius_px = {radius}\nstep_px = {step}\n"

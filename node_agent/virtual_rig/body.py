@@ -18,6 +18,9 @@ CYLINDER, LIMB = 0.0, 1.0
 MIDDLE = 125.0  # mm, half the height of the body
 # At load 1: bulge, twist over half the height (rad), axial stretch, its waviness (mm), bend at the ends (mm).
 _BULGE, _TWIST, _STRETCH, _WAVE, _BEND = 0.10, 0.10, 0.05, 3.0, 5.0
+_BULGE_Z, _BULGE_WIDTH = 140.0, 70.0  # mm
+_SPAN = 8.0  # mm along a ray over which its clearance from the limb is like a parabola
+_FAR = 8.0  # mm clear of the section nearest to the axis: more than the surface's slopes make up for along a ray
 _BEND_X, _BEND_Y = math.cos(0.7), math.sin(0.7)
 
 
@@ -42,13 +45,13 @@ def point(theta, z, p):  # type: ignore[no-untyped-def]
         return r * c + p[2], r * s + p[3], z + p[4], -r * s, r * c, 0.0, 0.0, 0.0, 1.0
     q = p[5]
     r0, r0_t, r0_z = _profile(theta, z)
-    w = (z - 140.0) / 70.0
+    w = (z - _BULGE_Z) / _BULGE_WIDTH
     swell = _BULGE * q * math.exp(-w * w)
     lobe = 1.0 + 0.3 * math.cos(theta - 2.0)
     grow = 1.0 + swell * lobe
     r = r0 * grow
     r_t = r0_t * grow - r0 * swell * 0.3 * math.sin(theta - 2.0)
-    r_z = r0_z * grow - r0 * swell * lobe * 2.0 * w / 70.0
+    r_z = r0_z * grow - r0 * swell * lobe * 2.0 * w / _BULGE_WIDTH
     zeta = (z - MIDDLE) / MIDDLE
     a = theta + _TWIST * q * zeta
     c, s = math.cos(a), math.sin(a)
@@ -68,6 +71,69 @@ def point(theta, z, p):  # type: ignore[no-untyped-def]
         r_z * s + r * c * a_z + bend_z * _BEND_Y,
         height_z,
     )
+
+
+@nb.njit(cache=True, nogil=True)
+def approach(o, d, p):  # type: ignore[no-untyped-def]
+    """How near a ray o + t d comes to the limb: clearance, and theta, z, t near where it first meets the surface.
+
+    The clearance (mm, negative inside) is the radius less the section's radius at the same angle and height, where
+    that is least along the ray.
+    """
+    speed = math.sqrt(d[0] * d[0] + d[1] * d[1])
+    t = -(o[0] * d[0] + o[1] * d[1]) / (speed * speed)
+    least, reach, sag = 0.0, _SPAN / speed, 1.0
+    for _ in range(2):  # the vertex of a parabola, twice
+        at = _clearance(o, d, t, p)
+        if at > _FAR:
+            return at, 0.0, 0.0, t
+        before, after = _clearance(o, d, t - reach, p), _clearance(o, d, t + reach, p)
+        sag = max(before - 2.0 * at + after, 1e-3)
+        shift = min(2.0, max(-2.0, 0.5 * (before - after) / sag))
+        t += shift * reach
+        least = at - 0.5 * sag * shift * shift
+        if abs(shift) < 0.05:
+            break
+    if least < 0.0:
+        t -= reach * math.sqrt(-2.0 * least / sag)
+    theta, z, _ = _section(o, d, t, p)
+    return least, theta, z, t
+
+
+@nb.njit(cache=True, nogil=True)
+def _clearance(o, d, t, p):  # type: ignore[no-untyped-def]
+    """Radius of a point of the ray about the limb's axis less that of the surface at its angle and height."""
+    theta, z, rho = _section(o, d, t, p)
+    return rho - _radius(theta, z, p[5])
+
+
+@nb.njit(cache=True, nogil=True)
+def _section(o, d, t, p):  # type: ignore[no-untyped-def]
+    """theta, z of the section on which a point of the ray lies, and its distance from the axis."""
+    q = p[5]
+    z = _height_before(o[2] + t * d[2], q)
+    zeta = (z - MIDDLE) / MIDDLE
+    bend = _BEND * q * zeta * zeta
+    x, y = o[0] + t * d[0] - bend * _BEND_X, o[1] + t * d[1] - bend * _BEND_Y
+    return math.atan2(y, x) - _TWIST * q * zeta, z, math.sqrt(x * x + y * y)
+
+
+@nb.njit(cache=True, nogil=True)
+def _height_before(height, q):  # type: ignore[no-untyped-def]
+    """The z of the reference that load q lifts to this height."""
+    z = MIDDLE + (height - MIDDLE) / (1.0 + _STRETCH * q)
+    for _ in range(2):
+        zeta = (z - MIDDLE) / MIDDLE
+        lifted = MIDDLE + (z - MIDDLE) * (1.0 + _STRETCH * q) + _WAVE * q * math.sin(math.pi * zeta)
+        z -= (lifted - height) / (1.0 + _STRETCH * q + _WAVE * q * math.pi / MIDDLE * math.cos(math.pi * zeta))
+    return z
+
+
+@nb.njit(cache=True, nogil=True)
+def _radius(theta, z, q):  # type: ignore[no-untyped-def]
+    """Radius of the limb's section at load q."""
+    w = (z - _BULGE_Z) / _BULGE_WIDTH
+    return _profile(theta, z)[0] * (1.0 + _BULGE * q * math.exp(-w * w) * (1.0 + 0.3 * math.cos(theta - 2.0)))
 
 
 @nb.njit(cache=True, nogil=True)

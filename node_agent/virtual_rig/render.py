@@ -7,25 +7,32 @@ surface. Radiance is linear, 1 saturates.
 from __future__ import annotations
 
 import math
+import zlib
+from collections.abc import Callable
+from pathlib import Path
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from node_agent.virtual_rig.body import CYLINDER, point
+from node_agent.virtual_rig.body import CYLINDER, approach, point
 from node_agent.virtual_rig.lens import VirtualCamera, ideal
 from node_agent.virtual_rig.scenes import Board, Scene, Specimen, Target
 from node_agent.virtual_rig.scenes.board import MARGIN, SQUARE, SQUARES
 from node_agent.virtual_rig.sensor import expose
-from node_agent.virtual_rig.texture import RADIUS, checker, dots, speckle
+from node_agent.virtual_rig.texture import RADIUS, checker, covered, dots, speckle
 
 Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
 
 SAMPLES = 2
+# A compiled kernel is kept on disk under this stamp too, so it is rebuilt when any file of the renderer changes
+# (the compiler itself looks at this file alone).
+_STAMP = zlib.crc32(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.rglob("*.py"))))
 _WHITE, _BLACK, _SKIN, _BASE = 0.80, 0.05, 0.30, 0.03  # reflectance times exposure
 _TARGET_TOP, _BASE_RADIUS, _BASE_BOTTOM = 250.0, 66.0, -35.0  # mm
 _PRINT_SPECKLE, _PRINT_DOTS = 0, 1
+_GRAZING = 0.02  # mm, by which the estimated clearance of a ray that meets the limb may be wrong
 
 
 def render(camera: VirtualCamera, scene: Scene, seed: int = 0) -> NDArray[np.uint8]:
@@ -38,14 +45,14 @@ def radiance(camera: VirtualCamera, scene: Scene) -> Radiance:
     out = np.zeros((camera.height, camera.width), np.float32)
     if isinstance(scene, Board):
         R, t = scene.pose(camera)
-        _render_board(camera.lens, camera.R, camera.centre, R, t, out)
+        _board_kernel(camera.lens, camera.R, camera.centre, R, t, out)
         return out
     if isinstance(scene, Target):
-        look = np.array([_PRINT_DOTS, 0.0, 0.0, 0.0, _TARGET_TOP])
+        look = np.array([_PRINT_DOTS, 0.0, 0.0, 0.0, _TARGET_TOP, _widest(scene)])
     else:
-        look = np.array([_PRINT_SPECKLE, *scene.band, *_extent(scene)])
+        look = np.array([_PRINT_SPECKLE, *scene.band, *_extent(scene), _widest(scene)])
     seed = scene.seed if isinstance(scene, Specimen) else 0
-    _render_body(camera.lens, camera.R, camera.centre, scene.body(), look, seed, out)
+    _body_kernel(camera.lens, camera.R, camera.centre, scene.body(), look, seed, out)
     return out
 
 
@@ -54,34 +61,44 @@ def _extent(scene: Specimen) -> tuple[float, float]:
     return (0.0, _TARGET_TOP) if scene.body()[0] == CYLINDER else (-120.0, 420.0)
 
 
-@nb.njit(cache=True, nogil=True)
-def _background(o, d):  # type: ignore[no-untyped-def]
-    """A dark room with rings of LED strips at the cameras' radius."""
+def _widest(scene: Specimen | Target) -> float:
+    """Radius about the z axis beyond which there is neither body nor base at the heights that cameras see, mm."""
+    if isinstance(scene, Target) or scene.body()[0] == CYLINDER:
+        return _BASE_RADIUS + math.hypot(*scene.body()[2:4])
+    theta, z = np.meshgrid(np.linspace(0.0, 2.0 * math.pi, 73), np.linspace(-120.0, 370.0, 50))
+    xyz = scene.surface.position(theta, z, scene.step)
+    return float(np.hypot(xyz[..., 0], xyz[..., 1]).max()) + 1.0
+
+
+@nb.njit(nogil=True)
+def _background(o, d, per):  # type: ignore[no-untyped-def]
+    """A dark room with rings of LED strips at the cameras' radius. per : width of a pixel at distance 1."""
     a = d[0] * d[0] + d[1] * d[1]
     b = o[0] * d[0] + o[1] * d[1]
     c = o[0] * o[0] + o[1] * o[1] - 380.0 * 380.0
     t = (-b + math.sqrt(max(b * b - a * c, 0.0))) / a
     h = o[2] + t * d[2]
     arc = 380.0 * math.atan2(o[1] + t * d[1], o[0] + t * d[0])
+    wide = t * per
     value = 0.010 + 0.00002 * max(0.0, 300.0 - abs(h - 60.0))
+    value += 0.02 * (1.0 - covered(-40.0 - h, wide)) * (1.0 + 0.3 * math.sin(0.35 * h + 0.02 * arc))
     for centre in (-12.0, 40.0, 150.0, 165.0, 215.0):
         off = abs(h - centre)
-        if off < 5.0:
-            value = 1.1 if off < 3.0 and math.sin(arc * 0.9) > -0.6 else 0.75
-        else:
-            value += 0.03 / (1.0 + ((off - 5.0) / 6.0) ** 2)
-    if h < -40.0:
-        value += 0.02 * (1.0 + 0.3 * math.sin(0.35 * h + 0.02 * arc))
+        if off > 50.0:
+            continue
+        value += 0.03 / (1.0 + (max(off - 5.0, 0.0) / 6.0) ** 2)
+        lamp = covered(off - 3.0, wide) * covered(-0.6 - math.sin(0.9 * arc), 0.9 * wide)
+        value = max(value, covered(off - 5.0, wide) * (0.75 + 0.35 * lamp))
     return value
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(nogil=True)
 def _lit(cosine):  # type: ignore[no-untyped-def]
     """How bright a surface is under light from all around, by the cosine of its incidence."""
     return 0.40 + 0.60 * cosine
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(nogil=True)
 def _on_cylinder(o, d, radius, x, y):  # type: ignore[no-untyped-def]
     """Distance along the ray to the nearer wall of an upright cylinder about (x, y), or -1."""
     ox, oy = o[0] - x, o[1] - y
@@ -91,58 +108,84 @@ def _on_cylinder(o, d, radius, x, y):  # type: ignore[no-untyped-def]
     return (-b - math.sqrt(root)) / a if root > 0.0 else -1.0
 
 
-@nb.njit(cache=True, nogil=True)
-def _newton(o, d, p, theta, z, t):  # type: ignore[no-untyped-def]
-    """Where the ray meets the body near a start: theta, z, t and whether it does, from the front."""
-    for _ in range(12):
-        x, y, h, tx, ty, tz, zx, zy, zz = point(theta, z, p)
-        ex, ey, ez = o[0] + t * d[0] - x, o[1] + t * d[1] - y, o[2] + t * d[2] - h
-        # Solve [T Z -d] (dtheta, dz, dt) = e by Cramer's rule.
-        nx, ny, nz = ty * zz - tz * zy, tz * zx - tx * zz, tx * zy - ty * zx
-        det = -(nx * d[0] + ny * d[1] + nz * d[2])
-        if det == 0.0:
-            return theta, z, t, False
-        dt = (nx * ex + ny * ey + nz * ez) / det
-        fx, fy, fz = ex + dt * d[0], ey + dt * d[1], ez + dt * d[2]
-        a, b, c = tx * tx + ty * ty + tz * tz, tx * zx + ty * zy + tz * zz, zx * zx + zy * zy + zz * zz
-        g, k = tx * fx + ty * fy + tz * fz, zx * fx + zy * fy + zz * fz
-        area = a * c - b * b
-        dtheta, dz = (c * g - b * k) / area, (a * k - b * g) / area
-        dtheta = min(0.5, max(-0.5, dtheta))
-        theta += dtheta
-        z += dz
-        t += dt
-        if abs(dtheta) < 1e-10 and abs(dz) < 1e-8:
-            return theta, z, t, det > 0.0 and t > 0.0
+@nb.njit(nogil=True)
+def _corrected(o, d, frame, theta, z, t):  # type: ignore[no-untyped-def]
+    """One step of Newton's method for the ray's meeting with the body, from theta, z, whose place and tangents are
+    frame: theta, z, t, and whether they have settled on a side that faces the camera."""
+    x, y, h, tx, ty, tz, zx, zy, zz = frame
+    ex, ey, ez = o[0] + t * d[0] - x, o[1] + t * d[1] - y, o[2] + t * d[2] - h
+    # Solve [T Z -d] (dtheta, dz, dt) = e by Cramer's rule.
+    nx, ny, nz = ty * zz - tz * zy, tz * zx - tx * zz, tx * zy - ty * zx
+    det = -(nx * d[0] + ny * d[1] + nz * d[2])
+    if det == 0.0:
+        return theta, z, t, False
+    dt = (nx * ex + ny * ey + nz * ez) / det
+    fx, fy, fz = ex + dt * d[0], ey + dt * d[1], ez + dt * d[2]
+    a, b, c = tx * tx + ty * ty + tz * tz, tx * zx + ty * zy + tz * zz, zx * zx + zy * zy + zz * zz
+    f, g = tx * fx + ty * fy + tz * fz, zx * fx + zy * fy + zz * fz
+    area = a * c - b * b
+    dtheta, dz = (c * f - b * g) / area, (a * g - b * f) / area
+    dtheta = min(0.5, max(-0.5, dtheta))
+    # Quadratic convergence: a step so small leaves less than 1e-6 mm.
+    settled = det > 0.0 and abs(dtheta) < 2e-5 and abs(dz) < 1e-3
+    return theta + dtheta, z + dz, t + dt, settled
+
+
+@nb.njit(nogil=True)
+def _place(theta, z, p, frame):  # type: ignore[no-untyped-def]
+    """The body's place and tangents at theta, z, written to frame: x y z, d/dtheta x y z, d/dz x y z."""
+    values = point(theta, z, p)
+    for i in range(9):
+        frame[i] = values[i]
+
+
+@nb.njit(nogil=True)
+def _newton(o, d, p, theta, z, t, frame):  # type: ignore[no-untyped-def]
+    """Where the ray meets the limb near a start: theta, z, t and whether it does, from the front. Fills frame."""
+    for k in range(10):
+        _place(theta, z, p, frame)
+        before = theta
+        theta, z, t, settled = _corrected(o, d, frame, theta, z, t)
+        if settled:
+            return theta, z, t, t > 0.0
+        if k > 4 and abs(theta - before) > 0.02:  # wanders: the ray passes by
+            break
     return theta, z, t, False
 
 
-@nb.njit(cache=True, nogil=True)
-def _meet(o, d, p, near, theta, z, t):  # type: ignore[no-untyped-def]
-    """Where a ray meets the body first. near : whether theta, z, t are those of a ray close by."""
-    if p[0] == CYLINDER:
-        t = _on_cylinder(o, d, p[1], p[2], p[3])
-        if t < 0.0:
-            return theta, z, t, False
-        return math.atan2(o[1] + t * d[1] - p[3], o[0] + t * d[0] - p[2]), o[2] + t * d[2] - p[4], t, True
+@nb.njit(nogil=True)
+def _on_limb(o, d, p, near, theta, z, t, frame):  # type: ignore[no-untyped-def]
+    """Where a ray meets the limb first, and by how much it clears it if not. near : theta, z, t are of a ray close by.
+
+    Returns theta, z, t, met, clearance (mm, 0 if met). Fills frame where it meets.
+    """
     if near:
-        theta, z, t, met = _newton(o, d, p, theta, z, t)
+        theta, z, t, met = _newton(o, d, p, theta, z, t, frame)
         if met:
-            return theta, z, t, True
-    for radius in (70.0, 60.0, 50.0):
-        t = _on_cylinder(o, d, radius, 0.0, 0.0)
-        if t > 0.0:
-            theta = math.atan2(o[1] + t * d[1], o[0] + t * d[0])
-            theta, z, t, met = _newton(o, d, p, theta, o[2] + t * d[2], t)
-            if met:
-                return theta, z, t, True
-    return theta, z, t, False
+            return theta, z, t, True, 0.0
+    clearance, theta, z, t = approach(o, d, p)
+    if clearance > _GRAZING:
+        return theta, z, t, False, clearance
+    theta, z, t, met = _newton(o, d, p, theta, z, t, frame)
+    return theta, z, t, met, max(clearance, 0.0)
 
 
-@nb.njit(cache=True, nogil=True)
-def _shade(o, d, p, look, seed, theta, z, t, per_x, per_y):  # type: ignore[no-untyped-def]
+@nb.njit(nogil=True)
+def _on_round(o, d, p, frame):  # type: ignore[no-untyped-def]
+    """Where a ray meets the cylinder: theta, z, t and whether it does. Fills frame where it meets."""
+    t = _on_cylinder(o, d, p[1], p[2], p[3])
+    if t < 0.0:
+        return 0.0, 0.0, t, False
+    theta = math.atan2(o[1] + t * d[1] - p[3], o[0] + t * d[0] - p[2])
+    z = o[2] + t * d[2] - p[4]
+    _place(theta, z, p, frame)
+    return theta, z, t, True
+
+
+@nb.njit(nogil=True)
+def _shade(o, d, p, look, seed, theta, z, t, frame, per_x, per_y):  # type: ignore[no-untyped-def]
     """Brightness of the body where a ray meets it. per_x, per_y : width of a sample at distance 1."""
-    _, _, _, tx, ty, tz, zx, zy, zz = point(theta, z, p)
+    _, _, _, tx, ty, tz, zx, zy, zz = frame
     nx, ny, nz = ty * zz - tz * zy, tz * zx - tx * zz, tx * zy - ty * zx
     size = math.sqrt(nx * nx + ny * ny + nz * nz)
     length = math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
@@ -169,20 +212,21 @@ def _shade(o, d, p, look, seed, theta, z, t, per_x, per_y):  # type: ignore[no-u
     return light * (_WHITE + dark * (_BLACK - _WHITE))
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(nogil=True)
 def _to_world(R, x, y, d):  # type: ignore[no-untyped-def]
     """The direction (x, y, 1) of the camera's frame in the world, written to d."""
     for i in range(3):
         d[i] = R[0, i] * x + R[1, i] * y + R[2, i]
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(nogil=True)
 def _render_body(lens, R, o, p, look, seed, out):  # type: ignore[no-untyped-def]
-    """A body on its base before the room. look : print, band from, to, bottom, top."""
+    """A body on its base before the room. look : print, band from, to, bottom, top, widest radius."""
     height, width = out.shape
-    d = np.empty(3)
+    d, middle, frame = np.empty(3), np.empty(9), np.empty(9)
     share = 1.0 / SAMPLES
     per_x, per_y = share / lens[0], share / lens[1]
+    round_body = p[0] == CYLINDER
     first_x, first_y = -lens[3] / lens[0], -lens[4] / lens[1]  # the first pixel, were there no distortion
     for v in range(height):
         theta = z = t = 0.0
@@ -193,8 +237,12 @@ def _render_body(lens, R, o, p, look, seed, out):  # type: ignore[no-untyped-def
             if u == 0:
                 first_x, first_y = x, y
             _to_world(R, x, y, d)
-            if _on_cylinder(o, d, 95.0, 0.0, 0.0) < 0.0:  # far beside the body
-                out[v, u] = _background(o, d)
+            beside = _on_cylinder(o, d, look[5], 0.0, 0.0) < 0.0
+            if not beside and not round_body:
+                theta, z, t, near, clearance = _on_limb(o, d, p, near, theta, z, t, middle)
+                beside = clearance > 2.0 * SAMPLES * per_x * t
+            if beside:  # one sample of the room will do
+                out[v, u] = _background(o, d, SAMPLES * per_x)
                 near = False
                 continue
             total = 0.0
@@ -202,32 +250,48 @@ def _render_body(lens, R, o, p, look, seed, out):  # type: ignore[no-untyped-def
                 a = (k % SAMPLES + 0.5) * share - 0.5
                 b = (k // SAMPLES + 0.5) * share - 0.5
                 _to_world(R, x + a * xu + b * xv, y + a * yu + b * yv, d)
-                theta, z, t, near = _meet(o, d, p, near, theta, z, t)
-                if near and look[3] <= z <= look[4]:
-                    total += _shade(o, d, p, look, seed, theta, z, t, per_x, per_y)
+                if round_body:
+                    theta_k, z_k, t_k, met = _on_round(o, d, p, frame)
                 else:
-                    total += _behind(o, d, p)
+                    theta_k, z_k, t_k, met = _on_limb_beside(o, d, p, near, theta, z, t, middle, frame)
+                if met and look[3] <= z_k <= look[4]:
+                    total += _shade(o, d, p, look, seed, theta_k, z_k, t_k, frame, per_x, per_y)
+                else:
+                    total += _behind(o, d, p, per_x)
             out[v, u] = total * share * share
 
 
-@nb.njit(cache=True, nogil=True)
-def _behind(o, d, p):  # type: ignore[no-untyped-def]
+@nb.njit(nogil=True)
+def _on_limb_beside(o, d, p, near, theta, z, t, middle, frame):  # type: ignore[no-untyped-def]
+    """Where a sample's ray meets the limb: from where its pixel's middle does, two steps are mostly enough."""
+    if near:
+        theta_k, z_k, t_k, _ = _corrected(o, d, middle, theta, z, t)
+        _place(theta_k, z_k, p, frame)
+        theta_k, z_k, t_k, settled = _corrected(o, d, frame, theta_k, z_k, t_k)
+        if settled:
+            return theta_k, z_k, t_k, True
+    theta_k, z_k, t_k, met, _ = _on_limb(o, d, p, near, theta, z, t, frame)
+    return theta_k, z_k, t_k, met
+
+
+@nb.njit(nogil=True)
+def _behind(o, d, p, per):  # type: ignore[no-untyped-def]
     """The base below a cylinder, else the room."""
     if p[0] == CYLINDER:
-        t = _on_cylinder(o, d, _BASE_RADIUS, 0.0, 0.0)
+        t = _on_cylinder(o, d, _BASE_RADIUS, p[2], p[3])
         if t > 0.0:
             h = o[2] + t * d[2]
             if _BASE_BOTTOM < h < 0.0:
                 return _BASE
             if h >= 0.0 and d[2] < 0.0:  # onto the top of the base
                 t = -o[2] / d[2]
-                x, y = o[0] + t * d[0], o[1] + t * d[1]
+                x, y = o[0] + t * d[0] - p[2], o[1] + t * d[1] - p[3]
                 if x * x + y * y < _BASE_RADIUS * _BASE_RADIUS:
                     return 2.0 * _BASE
-    return _background(o, d)
+    return _background(o, d, per)
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(nogil=True)
 def _board_sample(x, y, o, R, d, Rb, tb, per_x, per_y):  # type: ignore[no-untyped-def]
     """Brightness along one ray (x, y, 1) of the camera's frame, and how far outside the sheet it passes, squares."""
     slope = Rb[0, 2] * x + Rb[1, 2] * y + Rb[2, 2]
@@ -240,7 +304,7 @@ def _board_sample(x, y, o, R, d, Rb, tb, per_x, per_y):  # type: ignore[no-untyp
     )
     if outside > 0.0 or depth < 0.0:
         _to_world(R, x, y, d)
-        return _background(o, d), outside
+        return _background(o, d, SAMPLES * per_x), outside
     # Footprint of the sample: derivatives of the board's coordinates by x and y.
     across = Rb[0, 0] * x + Rb[1, 0] * y + Rb[2, 0]
     along = Rb[0, 1] * x + Rb[1, 1] * y + Rb[2, 1]
@@ -252,7 +316,7 @@ def _board_sample(x, y, o, R, d, Rb, tb, per_x, per_y):  # type: ignore[no-untyp
     return _lit(cosine) * (_WHITE + checker(bx, by, wx, wy) * (_BLACK - _WHITE)), outside
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(nogil=True)
 def _render_board(lens, R, o, Rb, tb, out):  # type: ignore[no-untyped-def]
     """The sheet with the checkerboard before the room; Rb, tb take the board's frame to the camera's."""
     height, width = out.shape
@@ -277,3 +341,22 @@ def _render_board(lens, R, o, Rb, tb, out):  # type: ignore[no-untyped-def]
                 value, _ = _board_sample(x + a * xu + b * xv, y + a * yu + b * yv, o, R, d, Rb, tb, per_x, per_y)
                 total += value
             out[v, u] = total * share * share
+
+
+def _kept(stamp: int) -> tuple[Callable[..., None], Callable[..., None]]:
+    """The two kernels, compiled and kept on disk under a stamp."""
+
+    @nb.njit(cache=True, nogil=True)
+    def body(lens, R, o, p, look, seed, out):  # type: ignore[no-untyped-def]
+        if stamp >= 0:  # named, so that it is part of the key under which the kernel is kept
+            _render_body(lens, R, o, p, look, seed, out)
+
+    @nb.njit(cache=True, nogil=True)
+    def board(lens, R, o, Rb, tb, out):  # type: ignore[no-untyped-def]
+        if stamp >= 0:
+            _render_board(lens, R, o, Rb, tb, out)
+
+    return body, board
+
+
+_body_kernel, _board_kernel = _kept(_STAMP)

@@ -31,6 +31,29 @@ def covered(distance, width):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
+def _disk(x, y, radius, ws, wz):  # type: ignore[no-untyped-def]
+    """Dark share of a sample at (x, y) from the centre of a disk that is larger than the sample.
+
+    Exact for a straight rim (the sample's chords across it are a box convolved with a box); the rim's curvature
+    enters to first order, as half the curvature times the sample's variance along the rim.
+    """
+    length = math.sqrt(x * x + y * y)
+    if length < 0.3 * radius:  # no rim near by; the direction means nothing at the centre
+        return 1.0 if ws + wz < 1.2 * radius else covered(length - radius, 0.5 * (ws + wz))
+    a, b = abs(x) / length, abs(y) / length
+    distance = length - radius + (b * b * ws * ws + a * a * wz * wz) / (24.0 * radius)
+    wide, narrow = max(a * ws, b * wz), min(a * ws, b * wz)
+    off = abs(distance)
+    if off >= 0.5 * (wide + narrow):
+        outer = 0.0
+    elif off <= 0.5 * (wide - narrow):
+        outer = 0.5 - off / wide
+    else:
+        outer = (0.5 * (wide + narrow) - off) ** 2 / (2.0 * wide * narrow)
+    return outer if distance > 0.0 else 1.0 - outer
+
+
+@nb.njit(cache=True, nogil=True)
 def _random(i, j, k, seed):  # type: ignore[no-untyped-def]
     """A number in [0, 1) that belongs to a cell."""
     h = np.uint64(i) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(j) * np.uint64(0xC2B2AE3D27D4EB4F)
@@ -60,13 +83,7 @@ def speckle(s, z, ws, wz, seed):  # type: ignore[no-untyped-def]
             x = (i + 0.5 + 0.7 * (_random(key, row, 0, seed) - 0.5)) * _CELL
             y = (j + 0.5 + 0.7 * (_random(key, row, 1, seed) - 0.5)) * _CELL
             r = 0.5 + 0.3 * _random(key, row, 2, seed)
-            a, b = s - x, z - y
-            length = math.sqrt(a * a + b * b)
-            if length > 1e-9:
-                width = (abs(a) * ws + abs(b) * wz) / length
-            else:
-                width = 0.5 * (ws + wz)
-            dark = max(dark, covered(length - r, width))
+            dark = min(1.0, dark + _disk(s - x, z - y, r, ws, wz))
     return dark
 
 
@@ -115,9 +132,7 @@ def dots(s, z, ws, wz):  # type: ignore[no-untyped-def]
     if 0 <= row < _ROWS:
         dark = _box(a, z - 10.0 - row * _SPACING, _DOT / 2, _DOT / 2, ws, wz)
     if abs(z - _MARK_Z) < 3.0 and abs(s - _SPACING / 2) < 3.0:
-        x, y = s - _SPACING / 2, z - _MARK_Z
-        length = math.sqrt(x * x + y * y)
-        dark = max(dark, covered(length - _MARK_RADIUS, (abs(x) * ws + abs(y) * wz) / max(length, 1e-9)))
+        dark = max(dark, _disk(s - _SPACING / 2, z - _MARK_Z, _MARK_RADIUS, ws, wz))
     if z > _DIGIT_Z - 1.0:
         number = column + 1
         if number < 10:

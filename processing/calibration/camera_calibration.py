@@ -41,7 +41,9 @@ class CameraCalibration:
     dots : the dots of the target that were used.
     residuals : (n, 2) measured minus projected, undistorted px.
     left_out : number of dots recognised but left out as gross errors.
-    fit : the fit of the lens, or None where it was given or distortion is not corrected.
+    fit : the fit of the lens to the board, or None where it was given or distortion is not corrected.
+    centroid_shift : (n, 2) centroid of a dot's image minus the image of its centre, px, as far as it is modelled: zero
+        after the direct linear transformation, which takes the one for the other.
     """
 
     camera: Camera
@@ -49,10 +51,16 @@ class CameraCalibration:
     residuals: Array
     left_out: int
     fit: IntrinsicsFit | None
+    centroid_shift: Array
 
     def __post_init__(self) -> None:
-        if self.residuals.shape != (len(self.dots), 2):
-            raise ValueError("a calibration needs one residual for each dot")
+        if self.residuals.shape != (len(self.dots), 2) or self.centroid_shift.shape != (len(self.dots), 2):
+            raise ValueError("a calibration needs one residual and one shift of the centroid for each dot")
+
+    @property
+    def dot_centres(self) -> Array:
+        """Images of the dots' centres, measured. (n, 2) px."""
+        return self.dots.px - self.centroid_shift
 
     @property
     def residual_rms(self) -> float:
@@ -71,6 +79,7 @@ class CameraCalibration:
             "dots": self.dots.to_dict(),
             "residuals": self.residuals.tolist(),
             "left_out": self.left_out,
+            "centroid_shift": self.centroid_shift.tolist(),
         }
 
     @classmethod
@@ -89,6 +98,7 @@ class CameraCalibration:
             np.array(values["residuals"], dtype=float).reshape(-1, 2),
             int(values["left_out"]),
             None if fit is None else IntrinsicsFit.from_dict(fit),
+            np.array(values["centroid_shift"], dtype=float).reshape(-1, 2),
         )
 
 
@@ -208,4 +218,5 @@ def _place(
         residuals=dlt.residuals(L, used.xyz, undistorted[kept]),
         left_out=int((~kept).sum()),
         fit=fit,
+        centroid_shift=np.zeros((len(used), 2)),
     )

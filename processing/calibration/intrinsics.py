@@ -28,6 +28,8 @@ PARAMETERS = ("fx", "fy", "s", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 K3_SIGMA_LIMIT = 0.2
 #: With fewer views than this no view is dropped for being above the percentile.
 VIEWS_FOR_DROPPING = 10
+#: No corner is better than this, px.
+_CORNER_FLOOR = 1e-6
 #: Views without which a camera with free skew, focal lengths and centre is not determined.
 VIEWS_NEEDED = 3
 
@@ -40,6 +42,7 @@ class IntrinsicsFit:
     view_errors : (n,), RMS distance of each given view's corners after the fit, px; also of the views left out.
     kept : (n,), which views the fit rests on.
     rms : RMS distance over the kept views, px.
+    covariance : (10, 10) of the same parameters; rows and columns of held ones are 0.
     """
 
     intrinsics: Intrinsics
@@ -47,6 +50,7 @@ class IntrinsicsFit:
     view_errors: Array
     kept: NDArray[np.bool_]
     rms: float
+    covariance: Array
 
     def to_dict(self) -> dict[str, Any]:
         """The fit as JSON values."""
@@ -56,6 +60,7 @@ class IntrinsicsFit:
             "view_errors": self.view_errors.tolist(),
             "kept": self.kept.tolist(),
             "rms": self.rms,
+            "covariance": self.covariance.tolist(),
         }
 
     @classmethod
@@ -67,6 +72,7 @@ class IntrinsicsFit:
             np.array(values["view_errors"], dtype=float),
             np.array(values["kept"], dtype=bool),
             float(values["rms"]),
+            np.array(values["covariance"], dtype=float),
         )
 
 
@@ -129,16 +135,16 @@ def calibrate_intrinsics(
     free = np.array([True, True, skew, True, True, True, True, tangential, tangential, radial != 2])
 
     start = _start(px, board, size)
-    state, sigma = _refine(start, px, board, free)
-    if radial is None and sigma[9] > K3_SIGMA_LIMIT:
+    state, covariance = _refine(start, px, board, free)
+    if radial is None and covariance[9, 9] > K3_SIGMA_LIMIT**2:
         free[9] = False
-        state, sigma = _refine(start, px, board, free)
+        state, covariance = _refine(start, px, board, free)
     errors = _view_errors(state, px, board)
     kept = _views_to_keep(errors, drop_percentile)
     if not kept.all():
         inner, rotations, translations = state
         inner_state = (inner, rotations[kept], translations[kept])
-        (inner, rotations_kept, translations_kept), sigma = _refine(inner_state, px[kept], board, free)
+        (inner, rotations_kept, translations_kept), covariance = _refine(inner_state, px[kept], board, free)
         rotations, translations = rotations.copy(), translations.copy()
         rotations[kept], translations[kept] = rotations_kept, translations_kept
         state = (inner, *_poses_refined(inner, rotations, translations, px, board))
@@ -146,7 +152,7 @@ def calibrate_intrinsics(
     intrinsics = _intrinsics(state[0], size)
     rms = float(np.sqrt(np.mean(errors[kept] ** 2)))
     log.info("intrinsics from %d of %d views, RMS %.3f px", kept.sum(), len(views), rms)
-    return IntrinsicsFit(intrinsics, sigma, errors, kept, rms)
+    return IntrinsicsFit(intrinsics, np.sqrt(np.diag(covariance)), errors, kept, rms, covariance)
 
 
 State = tuple[Array, Array, Array]  # inner (10,), rotations (views, 3, 3), translations (views, 3)
@@ -242,7 +248,7 @@ def _jacobians(state: State, board: Array) -> tuple[Array, Array, Array]:
 
 
 def _refine(state: State, px: Array, board: Array, free: NDArray[np.bool_]) -> tuple[State, Array]:
-    """Levenberg-Marquardt to convergence; the state and the standard errors (10,)."""
+    """Levenberg-Marquardt to convergence; the state and the covariance of the inner parameters (10, 10)."""
     damping = 1e-3
     projected, by_inner, by_pose = _jacobians(state, board)
     cost = float(np.sum((px - projected) ** 2))
@@ -262,16 +268,17 @@ def _refine(state: State, px: Array, board: Array, free: NDArray[np.bool_]) -> t
         projected, by_inner, by_pose = _jacobians(state, board)
         if converged:
             break
-    sigma = np.zeros(10)
+    covariance = np.zeros((10, 10))
     if not free.any():
-        return state, sigma
+        return state, covariance
     A, B, C, _, _ = _normal_equations(px - projected, by_inner[..., free], by_pose)
     degrees = max(px.size - int(free.sum()) - 6 * len(px), 1)
     S = A - np.einsum("vij,vjk,vlk->il", B, np.linalg.inv(C), B)
     scale = np.sqrt(np.diag(A))
-    covariance = np.linalg.pinv(S / np.outer(scale, scale)) / np.outer(scale, scale) * cost / degrees
-    sigma[free] = np.sqrt(np.diag(covariance))
-    return state, sigma
+    inverse = np.linalg.pinv(S / np.outer(scale, scale)) / np.outer(scale, scale)
+    # Corners are never exact; without this a perfect world would claim an infinite weight.
+    covariance[np.ix_(free, free)] = inverse * max(cost / degrees, _CORNER_FLOOR**2)
+    return state, covariance
 
 
 def _normal_equations(r: Array, by_inner: Array, by_pose: Array) -> tuple[Array, Array, Array, Array, Array]:

@@ -188,8 +188,9 @@ def _middle(size: tuple[int, int]) -> Array:
 
 def _require_dots(camera: str, dots: int, columns: int) -> None:
     if dots < DOTS_NEEDED or columns < COLUMNS_NEEDED:
+        found = f"{dots} dots in {columns} column{'' if columns == 1 else 's'}"
         raise InputError(
-            f"camera {camera}: {dots} dots in {columns} columns of the calibration target were recognised; at least "
+            f"camera {camera}: {found} of the calibration target were recognised; at least "
             f"{DOTS_NEEDED} in {COLUMNS_NEEDED} columns are needed. Check that the image shows the whole target, "
             "upright, evenly lit and sharp, and that [target] in rig.toml describes it"
         )

@@ -40,6 +40,8 @@ def correlate_files(
     out = Path(out)
     if not out.resolve().parent.is_dir():
         raise InputError(f"{out}: the folder does not exist; make it first")
+    if out.is_dir():
+        raise InputError(f"{out}: is a folder; give the name of a file, such as {out / 'points.npz'}")
     load_kernels()
     began = time.perf_counter()
     ref, cur = read_gray(reference), read_gray(current)
@@ -51,8 +53,12 @@ def correlate_files(
     region = read_mask(mask, ref.shape) if mask is not None else None
     xy, faces = grid(_inner(ref.shape, settings.radius) if region is None else region, settings.step)
     if not len(xy):
-        where = f"{mask}: the mask" if mask is not None else f"{reference}: the image less the subset radius"
-        raise InputError(f"{where} contains no point of the {settings.step} px grid; choose a smaller step")
+        raise InputError(
+            f"{mask}: the mask contains no point of the {settings.step} px grid; mark more or choose a smaller step"
+            if mask is not None
+            else f"{reference}: {ref.shape[1]} x {ref.shape[0]} px leave no point of the {settings.step} px grid whose "
+            f"subset of radius {settings.radius} px lies inside; choose a smaller radius or step"
+        )
     prepared = prepare_reference(ref, region, settings), prepare_current(cur, None, settings)
     preparing = time.perf_counter() - began
     result = correlate(*prepared, xy, settings, threads=threads, progress=progress)
@@ -76,19 +82,22 @@ def write_points(path: Path, result: Correlation, faces: NDArray[np.int32]) -> N
     """Write a correlation as ``points.npz``, aside first, so that a half-written file never bears the name."""
     path = Path(path)
     partial = path.with_name(f".{path.name}.partial")
-    with partial.open("wb") as file:
-        np.savez(
-            file,
-            xy=result.xy,
-            uv=result.uv,
-            gradient=result.gradient,
-            zncc=result.zncc,
-            iterations=result.iterations,
-            status=result.status,
-            sigma=result.sigma,
-            faces=faces,
-        )
-    os.replace(partial, path)
+    try:
+        with partial.open("wb") as file:
+            np.savez(
+                file,
+                xy=result.xy,
+                uv=result.uv,
+                gradient=result.gradient,
+                zncc=result.zncc,
+                iterations=result.iterations,
+                status=result.status,
+                sigma=result.sigma,
+                faces=faces,
+            )
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def _inner(shape: tuple[int, ...], radius: int) -> NDArray[np.bool_]:

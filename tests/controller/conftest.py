@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,23 +21,6 @@ from processing.errors import ComputationError
 
 CAMERAS = ("01", "02", "03", "04")
 STAND_IN = [sys.executable, str(Path(__file__).with_name("stand_in_processing.py"))]
-RIG_TOML = """
-[rig]
-name = "test-ring"
-[target]
-kind = "dot-cylinder"
-radius_mm = 57.0
-rows = 20
-row_spacing_mm = 12.0
-first_row_z_mm = 10.0
-columns = 14
-column_spacing_mm = 12.0
-dot_size_mm = 4.0
-[board]
-kind = "checkerboard"
-squares = [15, 20]
-square_mm = 10.0
-""" + "".join(f'[[cameras]]\nid = "{name}"\nazimuth_deg = {90.0 * i}\n' for i, name in enumerate(CAMERAS))
 
 
 class StandInRing:
@@ -86,9 +69,10 @@ def image_of(session: str, capture_id: str, camera: str, kind: str, time_ns: int
 
 
 @pytest.fixture
-def desk(tmp_path: Path) -> Iterator[Desk]:
+def desk(tmp_path: Path, rig_toml: Callable[[str, Sequence[str]], str]) -> Iterator[Desk]:
     """A desk whose processing is the stand-in."""
-    made = Desk(tmp_path / "archive", lambda session: [*STAND_IN, str(session)], RIG_TOML)
+    rig = rig_toml("test-ring", CAMERAS)
+    made = Desk(tmp_path / "archive", lambda session: [*STAND_IN, str(session)], rig)
     made.connect(Archive(tmp_path / "archive"), StandInRing(made.on_event))
     yield made
     made.close()

@@ -236,3 +236,9 @@ def test_without_a_bundled_page_the_reason_is_told(desk, tmp_path) -> None:
         answer = client.get("/")
         assert answer.status_code == 503
         assert "RINGDIC_SKIP_PAGE" in answer.text
+
+
+def test_nothing_is_fetched_from_another_host(client) -> None:
+    assert client.get("/openapi.json").json()["info"]["title"] == "RingDIC controller"
+    for viewer in ("/docs", "/redoc"):  # their pages would load scripts from elsewhere
+        assert client.get(viewer).status_code == 404

@@ -14,29 +14,6 @@ from controller.importing import import_folder, natural_order
 from processing.errors import InputError
 from processing.session import read_session
 
-RIG = """
-[rig]
-name = "pair"
-[target]
-kind = "dot-cylinder"
-radius_mm = 57.0
-rows = 20
-row_spacing_mm = 12.0
-first_row_z_mm = 10.0
-columns = 14
-column_spacing_mm = 12.0
-dot_size_mm = 4.0
-[board]
-kind = "checkerboard"
-squares = [15, 20]
-square_mm = 10.0
-[[cameras]]
-id = "201"
-azimuth_deg = 61.0
-[[cameras]]
-id = "202"
-azimuth_deg = 92.0
-"""
 SIZE = (24, 32)
 
 
@@ -47,11 +24,11 @@ def write_image(path, seed: int, size=SIZE) -> None:
 
 
 @pytest.fixture
-def src(tmp_path):
+def src(tmp_path, rig_toml):
     """Two cameras: 3 and 2 boards, a target, 11 steps; a mask for one."""
     folder = tmp_path / "src"
     folder.mkdir()
-    (folder / "rig.toml").write_text(RIG)
+    (folder / "rig.toml").write_text(rig_toml("pair", ["201", "202"]))
     for n, camera in enumerate(("201", "202")):
         for k in range(3 - n):
             write_image(folder / "board" / camera / f"view{k}.png", 100 * n + k)
@@ -113,7 +90,8 @@ def spoil_mask_size(src):
 
 
 def spoil_rig(src):
-    (src / "rig.toml").write_text(RIG.replace("square_mm", "square_cm"))
+    path = src / "rig.toml"
+    path.write_text(path.read_text().replace("square_mm", "square_cm"))
 
 
 def spoil_steps(src):
@@ -140,7 +118,7 @@ def remove(*parts):
         (spoil_text, "target/201.jpg"),
         (spoil_size, "step4.jpg: 30 x 24 px.*'201' has 32 x 24 px"),
         (spoil_mask, "mask/201.png: the mask marks no pixel"),
-        (spoil_mask_size, "mask/201.png"),
+        (spoil_mask_size, "mask/201.png: the mask is 5 x 5 px but its image is 32 x 24 px"),
         (spoil_rig, "unknown key 'square_cm'"),
         (spoil_steps, "different numbers of steps .201 11, 202 10"),
     ],

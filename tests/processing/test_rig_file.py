@@ -1,5 +1,6 @@
 """rig.toml: what is accepted, what is derived, and what the operator reads when something is wrong."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -8,14 +9,16 @@ from processing.errors import InputError
 from processing.rig import parse_rig, read_rig
 
 RIG = (Path(__file__).parents[1] / "rigs" / "multidic_pair" / "rig.toml").read_text(encoding="utf-8")
+Ring = Callable[[int], str]
 
 
-def ring(count: int) -> str:
-    entries = "".join(f'[[cameras]]\nid = "c{i}"\nazimuth_deg = {360.0 * i / count}\n' for i in range(count))
-    return RIG.split("[[cameras]]")[0] + entries
+@pytest.fixture
+def ring(rig_toml: Callable[[str, Sequence[str]], str]) -> Ring:
+    """Call it with a number of cameras: a rig.toml of a ring of c0, c1, …"""
+    return lambda count: rig_toml("ring", [f"c{i}" for i in range(count)])
 
 
-def test_adjacent_pairs_close_when_the_ring_does() -> None:
+def test_adjacent_pairs_close_when_the_ring_does(ring: Ring) -> None:
     assert parse_rig(ring(12)).pairs[-1] == ("c11", "c0")
     assert len(parse_rig(ring(12)).pairs) == 12
 
@@ -27,7 +30,7 @@ def test_two_cameras_are_one_pair() -> None:
     assert rig.target.column_angle == pytest.approx(12.0 / 57.0)
 
 
-def test_given_pairs_replace_the_adjacent_ones() -> None:
+def test_given_pairs_replace_the_adjacent_ones(ring: Ring) -> None:
     assert parse_rig(ring(6) + '[pairs]\npairs = [["c0", "c2"]]\n').pairs == (("c0", "c2"),)
 
 
@@ -54,5 +57,5 @@ def test_a_fault_is_named(tmp_path: Path, change: tuple[str, str], sentence: str
 
 
 def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"needs a rig\.toml"):
+    with pytest.raises(InputError, match=r"must describe the target"):
         read_rig(tmp_path / "rig.toml")

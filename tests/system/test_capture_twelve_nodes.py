@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,34 +26,11 @@ from node_agent.cli import main as node_command
 from processing.errors import InputError
 from processing.session import read_session
 
+RigToml = Callable[[str, Sequence[str]], str]
 WIDTH, HEIGHT = 640, 480
+EXPOSURE = "[capture]\nexposure_us = 4000\n"
 # A loaded test machine needs more lead than a rig; the other waits are short so that failures show soon.
 TIMING = Timing(lead=1500 * MS, collect=25 * SECOND, pull_after=2 * SECOND, pull_every=1 * SECOND)
-
-
-def rig_toml(cameras: list[str]) -> str:
-    """A complete rig file for these cameras."""
-    head = """
-[rig]
-name = "test-ring"
-[target]
-kind = "dot-cylinder"
-radius_mm = 57.0
-rows = 20
-row_spacing_mm = 12.0
-first_row_z_mm = 10.0
-columns = 14
-column_spacing_mm = 12.0
-dot_size_mm = 4.0
-[board]
-kind = "checkerboard"
-squares = [15, 20]
-square_mm = 10.0
-"""
-    head += "[capture]\nexposure_us = 4000\n"
-    return head + "".join(
-        f'[[cameras]]\nid = "{camera}"\nazimuth_deg = {360.0 * i / len(cameras)}\n' for i, camera in enumerate(cameras)
-    )
 
 
 def expected_file(camera: str, kind: str, scene: int) -> bytes:
@@ -143,7 +120,7 @@ def assert_archived(session: SessionWriter, capture_id: str, camera: str, kind: 
     assert entry["exposure_us"] == 4000.0, "the cameras hold what rig.toml asks for"
 
 
-def test_a_node_killed_in_the_middle_of_a_capture(twelve: Ring, tmp_path: Path):
+def test_a_node_killed_in_the_middle_of_a_capture(twelve: Ring, tmp_path: Path, rig_toml: RigToml):
     archive = Archive(tmp_path / "archive")
     victim, others = "cam_05", [camera for camera in twelve.cameras if camera != "cam_05"]
     events: list[dict] = []
@@ -152,7 +129,7 @@ def test_a_node_killed_in_the_middle_of_a_capture(twelve: Ring, tmp_path: Path):
         "test-ring", twelve.cameras, twelve.endpoint, archive, events.append, timing=TIMING, reconcile_s=1.0
     ) as rig:
         assert rig.wait_for_nodes(60) == []
-        session = archive.create_session("kill", rig_toml(twelve.cameras))
+        session = archive.create_session("kill", rig_toml("test-ring", twelve.cameras) + EXPOSURE)
 
         whole = rig.capture(session, "board")
         assert {c: e["status"] for c, e in whole["cameras"].items()} == dict.fromkeys(twelve.cameras, "ok")
@@ -218,9 +195,9 @@ with RigLink("test-ring", ["a", "b", "c"], endpoint, archive, lambda event: None
 """
 
 
-def test_a_controller_and_a_node_killed_in_a_burst_lose_nothing(three: Ring, tmp_path: Path):
+def test_a_controller_and_a_node_killed_in_a_burst_lose_nothing(three: Ring, tmp_path: Path, rig_toml: RigToml):
     root = tmp_path / "archive"
-    session = Archive(root).create_session("burst", rig_toml(three.cameras))
+    session = Archive(root).create_session("burst", rig_toml("test-ring", three.cameras) + EXPOSURE)
     # Nodes come up first, try in vain for a while, and must find the controller when it appears.
     assert until(lambda: all("serves" in three.log(camera) for camera in three.cameras), 30)
     time.sleep(1.5)
@@ -244,6 +221,8 @@ def test_a_controller_and_a_node_killed_in_a_burst_lose_nothing(three: Ring, tmp
             session.captures()
         )
         assert until(lambda: not any(three.spooled(camera) for camera in three.cameras), 10)
+    # Killed in the third capture; the fourth had at most begun.
+    assert [record["capture_id"] for record in session.captures()][:3] == [f"000{n}-specimen" for n in (1, 2, 3)]
     assert all(record["state"] == "closed" for record in session.captures())
     for record in session.captures():
         for camera in three.cameras:
@@ -251,14 +230,16 @@ def test_a_controller_and_a_node_killed_in_a_burst_lose_nothing(three: Ring, tmp
     assert verify(session.path) == []
 
 
-def test_a_capture_is_refused_while_a_camera_is_absent_unless_the_operator_overrides(three: Ring, tmp_path: Path):
+def test_a_capture_is_refused_while_a_camera_is_absent_unless_the_operator_overrides(
+    three: Ring, tmp_path: Path, rig_toml: RigToml
+):
     archive = Archive(tmp_path / "archive")
     cameras = [*three.cameras, "ghost"]
     timing = replace(TIMING, arm=5 * SECOND, arm_retry=1 * SECOND)
     with RigLink("test-ring", cameras, three.endpoint, archive, lambda event: None, timing=timing) as rig:
         assert rig.wait_for_nodes(0.1) != []
         assert until(lambda: sum(node["alive"] for node in rig.roster()) == 3, 30)
-        session = archive.create_session("gap", rig_toml(cameras))
+        session = archive.create_session("gap", rig_toml("test-ring", cameras) + EXPOSURE)
         with pytest.raises(CaptureRefusedError, match="ghost: not armed: the node is not connected") as caught:
             rig.capture(session, "board")
         assert list(caught.value.reasons) == ["ghost"]
@@ -275,7 +256,9 @@ def test_a_capture_is_refused_while_a_camera_is_absent_unless_the_operator_overr
             rig.capture(session, "board", override=True, settings={"iso": 100})
 
         # One host, one clock: the offsets seen are the errors of the measurement.
-        assert all(abs(node["clock_offset_ms"]) < 500 for node in rig.roster() if node["alive"])
+        offsets = [node["clock_offset_ms"] for node in rig.roster() if node["alive"]]
+        assert len(offsets) == 3
+        assert max(map(abs, offsets)) < 500
         assert node_command(["check", "--config", str(three.folder / "a.toml")]) == 0
         assert rig.preview("a") is not None
         assert rig.preview("ghost", timeout=0.5) is None

@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import os
-import shutil
 import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import cv2
 import httpx
 import numpy as np
 import pytest
 import uvicorn
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
 from controller.app import STATIC, create_app
 from controller.config import ControllerConfig
@@ -34,31 +32,6 @@ CAMERAS = ("01", "02", "03", "04")
 STAND_IN = Path(__file__).parents[1] / "controller" / "stand_in_processing.py"
 PACE = 1.0  # seconds that the stand-in's processing takes
 WAIT = 30_000  # ms; a loaded machine is slow
-ARGUMENTS = [
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
-RIG_TOML = """
-[rig]
-name = "page-ring"
-[target]
-kind = "dot-cylinder"
-radius_mm = 57.0
-rows = 20
-row_spacing_mm = 12.0
-first_row_z_mm = 10.0
-columns = 14
-column_spacing_mm = 12.0
-dot_size_mm = 4.0
-[board]
-kind = "checkerboard"
-squares = [15, 20]
-square_mm = 10.0
-""" + "".join(f'[[cameras]]\nid = "{name}"\nazimuth_deg = {90.0 * i}\n' for i, name in enumerate(CAMERAS))
 
 
 @dataclass
@@ -110,11 +83,15 @@ class Station:
 
 
 @pytest.fixture(scope="module")
-def station(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Station]:
+def station(
+    tmp_path_factory: pytest.TempPathFactory,
+    rig_toml: Callable[[str, Sequence[str]], str],
+    skip_or_fail: Callable[[str], NoReturn],
+) -> Iterator[Station]:
     if not (STATIC / "index.html").is_file():
-        _skip_or_fail("the page is not bundled: install again without RINGDIC_SKIP_PAGE")
+        skip_or_fail("the page is not bundled: install again without RINGDIC_SKIP_PAGE")
     folder = tmp_path_factory.mktemp("station")
-    (folder / "rig.toml").write_text(RIG_TOML)
+    (folder / "rig.toml").write_text(rig_toml("page-ring", CAMERAS))
     config = free_endpoint(ControllerConfig(archive=folder / "archive", rig=folder / "rig.toml"))
 
     def command(session: Path) -> list[str]:
@@ -144,25 +121,11 @@ def station(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Station]:
                     process.kill()
 
 
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Browser]:
-    path = shutil.which("chromium") or shutil.which("chromium-browser")
-    if path is None:
-        _skip_or_fail("no Chromium on this machine: install the package 'chromium'")
-    as_root = hasattr(os, "geteuid") and os.geteuid() == 0
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=path, args=ARGUMENTS + ["--no-sandbox"] * as_root, timeout=60_000
-        )
-        yield browser
-        browser.close()
-
-
 @pytest.fixture
-def page(chromium: Browser, station: Station) -> Iterator[Page]:
+def page(browser: Browser, station: Station) -> Iterator[Page]:
     """The page, opened; whatever the browser complains about fails the test."""
     complaints: list[str] = []
-    context = chromium.new_context(viewport={"width": 1440, "height": 900})
+    context = browser.new_context(viewport={"width": 1440, "height": 900})
     context.set_default_timeout(WAIT)
     opened = context.new_page()
     opened.on("pageerror", lambda error: complaints.append(str(error)))
@@ -177,12 +140,6 @@ def page(chromium: Browser, station: Station) -> Iterator[Page]:
     assert not unexpected, unexpected
     strangers = [address for address in asked if not address.startswith((station.address, "data:"))]
     assert not strangers, strangers  # the page needs nobody but its controller
-
-
-def _skip_or_fail(reason: str) -> None:
-    if os.environ.get("RINGDIC_REQUIRE_DATA"):
-        pytest.fail(reason)
-    pytest.skip(reason)
 
 
 def drawn(page: Page) -> np.ndarray:

@@ -1,7 +1,6 @@
 """Twelve cameras from a renderer that is not this project's: a deforming limb, imported and processed with no click."""
 
-import subprocess
-import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,12 +58,12 @@ def _splines(theta: np.ndarray, z: np.ndarray, positions: np.ndarray) -> list[Re
 
 
 @pytest.fixture(scope="module")
-def results(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Results:
+def results(ringdic: Callable, shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Results:
     session = tmp_path_factory.mktemp("limb") / "session"
     source = shared_data / "rendered_ring" / "limb"
     settings = ["--set", "correlation.radius_px=12", "--set", "correlation.step_px=6"]
-    for words in (["import", str(source), str(session)], ["process", str(session), *settings]):
-        subprocess.run([sys.executable, "-m", "controller", *words], check=True, timeout=500)
+    ringdic("import", source, session, timeout_s=500)
+    ringdic("process", session, *settings, timeout_s=500)
     return read_results(newest_results(session))
 
 

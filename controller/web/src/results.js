@@ -97,31 +97,32 @@ async function openRun() {
   facesOf = opened;
   shownPoints = null;
   showFigures();
-  if ((await show()) && viewedSession !== opened.session) {
-    viewedSession = opened.session;
-    surface.resetView();
-  }
+  await show();
 }
 
-/** Load what the controls ask for, and draw it; true unless something else was asked for meanwhile. */
+/** Load what the controls ask for and draw it, unless something else was asked for meanwhile. A session's first
+ * drawing sets the view. */
 async function show() {
   const field = chosenField();
   const step = Number(byId("step").value);
   const request = ++wanted;
   const [points, values] = await Promise.all([bytes("positions", step), bytes("fields", field.name, step)]);
-  if (request !== wanted || facesOf !== header) return false;
+  if (request !== wanted || facesOf !== header) return;
   const scale = SCALES[field.centre === null ? "sequential" : "diverging"];
   const [low, high] = limitsByHand ?? automaticLimits(field);
   if (points !== shownPoints) surface.setPositions(new Float32Array(points));
   shownPoints = points;
   surface.setField(new Float32Array(values), field.location, scale, low, high);
+  if (viewedSession !== header.session) {
+    viewedSession = header.session;
+    surface.resetView();
+  }
   showLegend(field, scale, low, high);
   const name = step === 0 ? `${header.steps[0]} (reference)` : header.steps[step];
   byId("step-name").textContent = `${step} of ${header.steps.length - 1}: ${name}`;
   byId("step").setAttribute("aria-valuetext", name);
   byId("rigid").title = field.rigid ? "" : "This field is the same with and without; the shape moves.";
   byId("surface").dataset.shown = `${field.name}/${step}/${removed()}`;
-  return true;
 }
 
 // Colours ----------------------------------------------------------------------------------------

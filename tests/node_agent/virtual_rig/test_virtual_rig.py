@@ -4,11 +4,13 @@ import cv2
 import numpy as np
 import pytest
 
+from node_agent.virtual_rig.body import approach
 from node_agent.virtual_rig.lens import VirtualCamera, distort, ideal
 from node_agent.virtual_rig.render import radiance, render
 from node_agent.virtual_rig.rig import paper_rig, write_truth
 from node_agent.virtual_rig.scenes import Cylinder, Limb, Specimen, Target, scene
 from node_agent.virtual_rig.sensor import FULL_WELL, READ_NOISE, expose
+from node_agent.virtual_rig.texture import speckle
 
 SCALE = 0.25
 RIG = paper_rig(12, SCALE, seed=3)
@@ -98,10 +100,11 @@ def test_a_point_off_the_surface_is_named_and_measured(surface: Cylinder | Limb)
     np.testing.assert_allclose(found[2], 0.8, atol=1e-9)
 
 
-def test_the_dots_are_where_their_centres_project() -> None:
-    image = linear(render(CAMERA, Target(), 5))
-    centres = Target().dots()
-    outwards = centres * [1, 1, 0] / 57.0
+@pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (5.0, 0.0, 0.0)])
+def test_the_dots_are_where_their_centres_project(offset: tuple[float, float, float]) -> None:
+    image = linear(render(CAMERA, Target(offset), 5))
+    centres = Target(offset).dots()
+    outwards = (centres - offset) * [1, 1, 0] / 57.0
     towards = CAMERA.centre - centres
     frontal = np.sum(outwards * towards, axis=-1) / np.linalg.norm(towards, axis=-1) > np.cos(np.radians(35))
     assert frontal.sum() > 60
@@ -125,6 +128,63 @@ def test_the_corners_are_where_the_board_truth_says() -> None:
     error = found - truth
     assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.08
     assert np.linalg.norm(error.mean(axis=0)) < 0.02  # no shift of the whole image
+
+
+@pytest.mark.parametrize("step", [0, 5])
+def test_every_material_point_of_the_limb_is_shown_where_its_truth_projects(step: int) -> None:
+    limb = Limb()
+    rng = np.random.default_rng(step)
+    theta, z = rng.uniform(0, 2 * np.pi, 20000), rng.uniform(8, 242, 20000)
+    dark = np.array([speckle(57.0 * a, b, 0.9, 0.9, 3) for a, b in zip(theta, z, strict=True)])
+    xyz, tangents = limb.position(theta, z, step), limb.tangents(theta, z, step)
+    normals = np.cross(tangents[:, 0], tangents[:, 1])
+    towards = CAMERA.centre - xyz
+    cosine = np.sum(normals * towards, axis=1) / np.linalg.norm(normals, axis=1) / np.linalg.norm(towards, axis=1)
+    clear = (cosine > 0.7) & ((dark == 1.0) | (dark == 0.0))  # 0.9 mm about the point all dark or all white
+    x, y = np.rint(CAMERA.project(xyz[clear])).astype(int).T
+    seen = radiance(CAMERA, Specimen(limb, step, seed=3))[y, x] / (0.40 + 0.60 * cosine[clear])
+    assert clear.sum() > 400
+    assert (dark[clear] == 1.0).sum() > 50
+    np.testing.assert_array_equal(seen < 0.35, dark[clear] == 1.0)
+
+
+@pytest.mark.parametrize("step", [0, 5])
+def test_a_ray_that_grazes_the_limb_is_told_from_one_that_misses(step: int) -> None:
+    limb = Limb()
+    theta, z = np.meshgrid(np.linspace(0, 6, 25), np.linspace(0, 250, 11))
+    xyz, tangents = (f(theta.ravel(), z.ravel(), step) for f in (limb.position, limb.tangents))
+    along = tangents[:, 0] / np.linalg.norm(tangents[:, 0], axis=1, keepdims=True)
+    normals = np.cross(along, tangents[:, 1])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    for height in (0.3, -0.3):  # of the ray above the surface where it is parallel to it
+        origins = xyz + height * normals - 300.0 * along
+        clearances = [approach(o, d, limb.parameters(step))[0] for o, d in zip(origins, along, strict=True)]
+        np.testing.assert_allclose(clearances, height, atol=0.06)  # along the radius, not along the normal
+
+
+@pytest.mark.parametrize(("ws", "wz"), [(0.2, 0.2), (0.4, 0.2)])
+def test_a_sample_of_the_speckles_is_the_mean_over_its_area(ws: float, wz: float) -> None:
+    rng = np.random.default_rng(1)
+    parts = (np.arange(12) + 0.5) / 12 - 0.5
+    errors = []
+    for s, z in rng.uniform([0, 10], [350, 240], (2000, 2)):
+        fine = np.mean([speckle(s + ws * a, z + wz * b, ws / 12, wz / 12, 4) for a in parts for b in parts])
+        errors.append(speckle(s, z, ws, wz, 4) - fine)
+    assert abs(np.mean(errors)) < 0.002
+    assert np.std(errors) < 0.012  # overlapping disks and corners between them; edges alone are exact
+
+
+def test_the_views_of_the_board_fill_the_image() -> None:
+    for camera in RIG.cameras:
+        boards = [scene("board", index, seed=3) for index in range(8)]
+        px = np.concatenate([board.corners(camera) for board in boards])
+        assert (px > 0).all()
+        assert (px < [camera.width - 1, camera.height - 1]).all()
+        counts, _, _ = np.histogram2d(*px.T, bins=(6, 8), range=((0, camera.width), (0, camera.height)))
+        assert (counts > 0).mean() > 0.8
+        tilts = [np.degrees(np.arccos(abs(board.pose(camera)[0][2, 2]))) for board in boards]
+        assert min(tilts) > 20  # tilt is what tells focal length from distance
+        assert max(tilts) < 50
 
 
 def test_a_moved_cylinder_moves_in_the_image_as_projected() -> None:

@@ -1,0 +1,379 @@
+"""All cameras adjusted together: exact on a perfect world, as uncertain as stated, without the DLT's bias.
+
+A ring of twelve full-scale cameras is made of numbers, no images. Centroids come from the outline of each dot, by
+Green's theorem: nothing of the model under test.
+"""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from processing.calibration import dlt
+from processing.calibration.bundle import BundleFit, TargetPrior, adjust_ring, centroid_shift
+from processing.calibration.camera_calibration import CameraCalibration
+from processing.calibration.intrinsics import IntrinsicsFit, calibrate_intrinsics
+from processing.calibration.patch import Sheet, Views, nodes, patch_jacobians, project_patches, sheet_points
+from processing.calibration.target import DotObservations, dot_points
+from processing.camera import Camera, Intrinsics
+from processing.errors import ComputationError
+from processing.rig import Target
+from processing.triangulation import triangulate
+
+TARGET = Target("dot-cylinder", 57.0, 20, 12.0, 10.0, 30, 12.0, 4.0)
+SIZE = (2464, 3280)
+BOARD = np.stack(np.meshgrid(np.arange(14) * 10.0, np.arange(19) * 10.0), axis=-1).reshape(-1, 2)
+NAMES = [f"c{number:02d}" for number in range(1, 13)]
+
+
+def turned(omega: np.ndarray) -> np.ndarray:
+    return cv2.Rodrigues(np.asarray(omega, dtype=float))[0]
+
+
+def camera_on_the_ring(name: str, azimuth_deg: float, rng: np.random.Generator) -> Camera:
+    """A camera of the paper's kind, 350 mm from the axis, set up by hand."""
+    azimuth = np.deg2rad(azimuth_deg)
+    centre = np.array([350 * np.cos(azimuth), 350 * np.sin(azimuth), 124]) + rng.normal(0, 3, 3)
+    z = np.array([0, 0, 124.0]) - centre
+    x = np.cross(z, [0, 0, 1])
+    axes = np.array([x / np.linalg.norm(x), np.cross(z, x) / np.linalg.norm(np.cross(z, x)), z / np.linalg.norm(z)])
+    R = turned(rng.normal(0, np.deg2rad(1.5), 3)) @ axes
+    K = np.array([[2611.7, -1.37, 1246.5], [0, 2615.4, 1627.7], [0, 0, 1]])
+    K[:2] += [[rng.normal(0, 6), 0, rng.normal(0, 30)], [0, rng.normal(0, 6), rng.normal(0, 15)]]
+    lens = Intrinsics(K, np.array([rng.normal(0.18, 0.01), -0.295, 1.5e-4, 6.8e-4, -0.05]), SIZE)
+    P = lens.K_undistorted @ np.column_stack([R, -R @ centre])
+    return Camera(name, P / P[2, 3], SIZE, lens)
+
+
+def lens_from_boards(lens: Intrinsics, noise: float, rng: np.random.Generator) -> IntrinsicsFit:
+    board = np.column_stack([BOARD - BOARD.mean(axis=0), np.zeros(len(BOARD))])
+    views = []
+    for _ in range(10):
+        R = turned(rng.uniform(-1, 1, 3) * [0.6, 0.6, 0.3])
+        points = board @ R.T + rng.uniform(-1, 1, 3) * [20, 30, 40] + [0, 0, 320]
+        px = lens.distort_normalised(points[:, :2] / points[:, 2:]) @ lens.K[:2, :2].T + lens.K[:2, 2]
+        views.append(px + noise * rng.normal(size=px.shape))
+    return calibrate_intrinsics(views, BOARD, SIZE, radial=3, drop_percentile=100)
+
+
+def outline_centroids(
+    camera: Camera, sz: np.ndarray, radius: float, shape: str, size: float, points: int = 400
+) -> np.ndarray:
+    """Centroids of the images of dots round (s, z) (n, 2) on a cylinder, from the points of each outline."""
+    side = np.linspace(-0.5, 0.5, points // 4, endpoint=False)
+    half = np.full(points // 4, 0.5)
+    parts = [(side, -half), (half, side), (-side, half), (-half, -side)]
+    outline = size * np.concatenate([np.column_stack(part) for part in parts])
+    if shape == "circle":
+        angle = np.arange(points) * 2 * np.pi / points
+        outline = 0.5 * size * np.column_stack([np.cos(angle), np.sin(angle)])
+    around = sz[:, None] + outline
+    angle = around[..., 0] / radius
+    px = camera.project(np.stack([radius * np.cos(angle), radius * np.sin(angle), around[..., 1]], axis=-1))
+    origin = px.mean(axis=1)
+    p = px - origin[:, None]
+    q = np.roll(p, -1, axis=1)
+    area = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
+    return origin + np.sum((p + q) * area[..., None], axis=1) / (3 * area.sum(axis=1)[:, None])
+
+
+def observed(
+    camera: Camera,
+    lens: Intrinsics | None,
+    fit: IntrinsicsFit | None,
+    noise: float,
+    rng: np.random.Generator,
+    *,
+    target: Target = TARGET,
+    sheet: Sheet | None = None,
+    print_errors: np.ndarray | None = None,
+    points: int = 400,
+) -> CameraCalibration:
+    """The paper's calibration of a camera that sees the target as it truly is: the start of the adjustment."""
+    sheet = sheet or Sheet.nominal(target)
+    rows, columns = (axis.ravel() for axis in np.mgrid[1 : target.rows + 1, 1 : target.columns + 1])
+    xyz = dot_points(target, rows, columns)
+    seen = camera.incidence_cosine(xyz, xyz * [1 / 57, 1 / 57, 0]) > np.cos(np.deg2rad(55))
+    rows, columns, xyz = rows[seen], columns[seen], xyz[seen]
+    sz = sheet_points(target, sheet, rows, columns)
+    if print_errors is not None:
+        sz = sz + print_errors[rows - 1, columns - 1]
+    px = outline_centroids(camera, sz, sheet.radius, target.dot_shape, target.dot_size_mm, points)
+    px = px + noise * rng.normal(size=px.shape)
+    flat = px if lens is None else lens.to_undistorted(px)
+    L = dlt.solve_dlt(xyz, flat)
+    dots = DotObservations(camera.id, rows, columns, px, xyz, 0.0, float("inf"))
+    found = Camera(camera.id, dlt.to_projection(L), SIZE, lens)
+    return CameraCalibration(found, dots, dlt.residuals(L, xyz, flat), 0, fit, np.zeros_like(px))
+
+
+@pytest.fixture(scope="module")
+def true_cameras() -> dict[str, Camera]:
+    rng = np.random.default_rng(1)
+    return {name: camera_on_the_ring(name, 30.0 * number, rng) for number, name in enumerate(NAMES)}
+
+
+@pytest.fixture(scope="module")
+def half_ring(true_cameras) -> dict[str, Camera]:
+    return {name: true_cameras[name] for name in NAMES[:6]}
+
+
+@pytest.fixture(scope="module")
+def fits(true_cameras) -> dict[str, IntrinsicsFit]:
+    """Every lens as ten views of the board give it."""
+    rng = np.random.default_rng(2)
+    return {name: lens_from_boards(camera.intrinsics, 0.03, rng) for name, camera in true_cameras.items()}
+
+
+def seen_by_all(true_cameras, fits, seed: int, noise: float = 0.01, print_error: float = 0.0, **options) -> dict:
+    rng = np.random.default_rng(seed)
+    errors = print_error * rng.normal(size=(TARGET.rows, TARGET.columns, 2))
+    return {
+        name: observed(camera, fits[name].intrinsics, fits[name], noise, rng, print_errors=errors, **options)
+        for name, camera in true_cameras.items()
+    }
+
+
+def diameter_error(true_cameras: dict[str, Camera], cameras: dict[str, CameraCalibration]) -> float:
+    """Diameter of a cylinder of 114 mm seen exactly and triangulated by neighbours, minus 114. mm."""
+    angle, z = (a.ravel() for a in np.meshgrid(np.arange(0, 2 * np.pi, np.pi / 60), np.linspace(15, 235, 12)))
+    normals = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    xyz = 57 * normals + np.outer(z, [0, 0, 1])
+    names, points = list(true_cameras), []
+    following = [*names[1:], *(names[:1] if len(names) == 12 else [])]
+    for a, b in zip(names, following, strict=False):
+        pair = [true_cameras[a], true_cameras[b]]
+        both = np.min([camera.incidence_cosine(xyz, normals) for camera in pair], axis=0) > 0.5
+        px = np.stack([camera.project(xyz[both]) for camera in pair])
+        points.append(triangulate([cameras[a].camera, cameras[b].camera], px))
+    cloud = np.concatenate(points)
+
+    def misfit(q: np.ndarray) -> np.ndarray:
+        axis = np.array([q[2], q[3], 1.0]) / np.linalg.norm([q[2], q[3], 1.0])
+        offset = cloud - [q[0], q[1], 124.0]
+        return np.linalg.norm(offset - np.outer(offset @ axis, axis), axis=1) - q[4]
+
+    return 2 * (least_squares(misfit, [0, 0, 0, 0, 57.0], x_scale=[1, 1, 0.01, 0.01, 1]).x[4] - 57.0)
+
+
+def lens_values(lens: Intrinsics) -> np.ndarray:
+    return np.array([lens.K[0, 0], lens.K[1, 1], lens.K[0, 1], lens.K[0, 2], lens.K[1, 2], *lens.distortion])
+
+
+def pose(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    M = np.linalg.solve(camera.intrinsics.K_undistorted, camera.P)
+    M = M / np.cbrt(np.linalg.det(M[:, :3]))
+    return M[:, :3], M[:, 3]
+
+
+def pulls(true: Camera, found: Camera, sigma: np.ndarray) -> np.ndarray:
+    """Errors of the sixteen parameters in stated standard errors."""
+    (R, t), (R_true, t_true) = pose(found), pose(true)
+    omega = cv2.Rodrigues(R @ R_true.T)[0].ravel()
+    lens = lens_values(found.intrinsics) - lens_values(true.intrinsics)
+    return np.concatenate([lens, omega, t - turned(omega) @ t_true + (turned(omega) - np.eye(3)) @ t_true]) / sigma
+
+
+@pytest.mark.parametrize("shape", ["square", "circle"])
+def test_the_centroid_of_a_patch_is_that_of_its_outline(true_cameras, shape) -> None:
+    camera = true_cameras["c01"]
+    sz = np.column_stack([np.linspace(-52, 52, 9), np.linspace(10, 238, 9)])  # up to 52° round the cylinder
+    R, t = pose(camera)
+    inner = np.tile(lens_values(camera.intrinsics), (9, 1))
+    views = Views(inner, np.tile(R, (9, 1, 1)), np.tile(t, (9, 1)), sz, 57.0)
+    outline = outline_centroids(camera, sz, 57.0, shape, 4.0)
+    assert np.abs(project_patches(views, shape, 4.0) - outline).max() < 2e-5
+    angle = sz[:, 0] / 57
+    centre = camera.project(np.column_stack([57 * np.cos(angle), 57 * np.sin(angle), sz[:, 1]]))
+    assert 0.15 < np.linalg.norm(outline - centre, axis=1).max() < 0.6
+    assert nodes(shape, 4.0)[1].sum() == pytest.approx(1.0)
+
+
+def test_centroids_of_a_moved_target_are_known_too(true_cameras) -> None:
+    camera, rows, columns = true_cameras["c03"], np.array([1, 8, 20]), np.array([4, 6, 8])
+    R, t = turned(np.array([0.01, -0.02, 0.03])), np.array([5.0, 1.0, -2.0])
+    sz = sheet_points(TARGET, Sheet.nominal(TARGET), rows, columns)
+    M = np.column_stack([R, t])
+    moved = Camera("moved", camera.P @ np.vstack([M, [0, 0, 0, 1]]), SIZE, camera.intrinsics)
+    centre = camera.project(dot_points(TARGET, rows, columns) @ R.T + t)
+    truth = outline_centroids(moved, sz, 57.0, "square", 4.0) - centre
+    found = centroid_shift(camera, TARGET, rows, columns, rotation=R, translation=t)
+    assert np.allclose(found, truth, rtol=0, atol=2e-5)
+    still = centroid_shift(camera, TARGET, rows, columns)
+    assert np.abs(still - found).max() > 1e-3
+    bare = replace(camera, intrinsics=None)
+    flat = outline_centroids(bare, sz, 57.0, "square", 4.0) - bare.project(dot_points(TARGET, rows, columns))
+    assert np.allclose(centroid_shift(bare, TARGET, rows, columns), flat, rtol=0, atol=2e-5)
+
+
+def test_derivatives_of_a_patch_are_those_of_differences(true_cameras) -> None:
+    R, t = pose(true_cameras["c02"])
+    values = lens_values(true_cameras["c02"].intrinsics)
+
+    def centroid(x: np.ndarray) -> np.ndarray:
+        views = Views(
+            (values + x[:10])[None],
+            (turned(x[10:13]) @ R)[None],
+            (t + x[13:16])[None],
+            np.array([[30.0, 60.0]]) + x[16:18],
+            57.0 + x[18],
+        )
+        return project_patches(views, "square", 4.0)[0]
+
+    views = Views(values[None], R[None], t[None], np.array([[30.0, 60.0]]), 57.0)
+    px, inner, by_pose, by_sz, by_radius = patch_jacobians(views, "square", 4.0)
+    exact = np.concatenate([inner, by_pose, by_sz, by_radius], axis=-1)[0]
+    steps = np.concatenate([np.full(5, 1e-2), np.full(5, 1e-4), np.full(3, 1e-5), np.full(6, 1e-3)])
+    for k, h in enumerate(steps):
+        x = np.zeros(19)
+        x[k] = h
+        difference = (centroid(x) - centroid(-x)) / (2 * h)
+        assert np.allclose(exact[:, k], difference, rtol=1e-6, atol=1e-6), k
+    assert np.allclose(px[0], centroid(np.zeros(19)), rtol=0, atol=1e-9)
+
+
+def test_a_perfect_world_comes_back(true_cameras) -> None:
+    rng = np.random.default_rng(3)
+    some = {name: true_cameras[name] for name in NAMES[:4]}
+    perfect = {name: lens_from_boards(camera.intrinsics, 0.0, rng) for name, camera in some.items()}
+    start = seen_by_all(some, perfect, 4, noise=0.0, points=8000)
+    cameras, fit = adjust_ring(start, TARGET)
+    for name, true in some.items():
+        # The outline and the rule of sixteen nodes agree to 5e-8 px.
+        assert np.linalg.norm(cameras[name].camera.centre - true.centre) < 1e-6
+        error = lens_values(cameras[name].camera.intrinsics) - lens_values(true.intrinsics)
+        assert np.abs(error).max() < 1e-5
+        assert np.abs(cameras[name].residuals).max() < 2e-7
+        assert np.linalg.norm(start[name].camera.centre - true.centre) > 0.2  # the DLT's own answer
+    assert np.abs(fit.offsets).max() < 1e-6
+    shift = cameras["c01"].dots.px - true_cameras["c01"].project(cameras["c01"].dots.xyz)
+    assert np.allclose(cameras["c01"].centroid_shift, shift, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("shape", ["square", "circle"])
+def test_the_diameter_is_right_where_the_dlt_s_is_not(request, fits, shape, figures) -> None:
+    true_cameras = request.getfixturevalue("true_cameras" if shape == "square" else "half_ring")
+    target = replace(TARGET, dot_shape=shape)
+    start = seen_by_all(true_cameras, fits, 5, target=target)
+    cameras, fit = adjust_ring(start, target)
+    before, after = diameter_error(true_cameras, start), diameter_error(true_cameras, cameras)
+    figures(f"diameter bias, {shape} dots: DLT, bundle, µm", f"{before * 1e3:.1f}, {after * 1e3:.2f}", "> 50, 3")
+    assert 0.05 < before < 0.12
+    assert abs(after) < 0.003
+    assert fit.px_sigma == pytest.approx(0.01, rel=0.1)
+    assert fit.print_sigma < 0.002
+
+
+def test_print_errors_are_found_and_leave_the_diameter_alone(true_cameras, fits, figures) -> None:
+    start = seen_by_all(true_cameras, fits, 6, print_error=0.03)
+    cameras, fit = adjust_ring(start, TARGET)
+    after = diameter_error(true_cameras, cameras)
+    figures("diameter bias, prints off by 0.03 mm, bundle, µm", f"{after * 1e3:.2f}", "5")
+    assert abs(after) < 0.005
+    assert fit.print_sigma == pytest.approx(0.03, rel=0.12)
+    assert fit.px_sigma == pytest.approx(0.01, rel=0.12)
+    truth = np.random.default_rng(6).normal(size=(20, 30, 2))[fit.rows - 1, fit.columns - 1] * 0.03
+    error = fit.offsets - truth
+    # But for the motion of the whole print, which nothing can tell from one of the world.
+    assert np.sqrt(np.mean((error - error.mean(axis=0)) ** 2)) < 0.004
+    assert np.abs(error / fit.offsets_sigma).max() < 5
+
+
+def test_a_target_of_another_size_is_measured_where_that_is_allowed(half_ring, fits) -> None:
+    sheet = Sheet(57.02, 12.01, 0.001)
+    start = seen_by_all(half_ring, fits, 7, print_error=0.01, sheet=sheet)
+    cameras, fit = adjust_ring(start, TARGET, TargetPrior(radius=0.1, pitch=0.05, tilt=0.01))
+    error = np.array([fit.sheet.radius, fit.sheet.pitch, fit.sheet.tilt]) - [57.02, 12.01, 0.001]
+    assert (np.abs(error) < 4 * fit.sheet_sigma).all()
+    assert fit.sheet_sigma[0] < 0.004
+    assert fit.sheet.seam(TARGET) == pytest.approx(2 * np.pi * 57.02 - 29 * 12.01, abs=0.02)
+    assert abs(diameter_error(half_ring, cameras)) < 0.005
+    held, _ = adjust_ring(start, TARGET)
+    assert diameter_error(half_ring, held) < -0.03  # a radius believed 0.02 too small makes everything so
+
+
+def test_stated_uncertainties_are_true(true_cameras) -> None:
+    found, prints = [], []
+    some = {name: true_cameras[name] for name in NAMES[:4]}
+    for seed in range(6):
+        rng = np.random.default_rng(100 + seed)
+        fits = {name: lens_from_boards(camera.intrinsics, 0.03, rng) for name, camera in some.items()}
+        cameras, fit = adjust_ring(seen_by_all(some, fits, 200 + seed, print_error=0.02), TARGET)
+        found += [
+            pulls(true, cameras[name].camera, sigma)
+            for (name, true), sigma in zip(some.items(), fit.camera_sigma, strict=True)
+        ]
+        prints.append(fit.print_sigma)
+    # Six independent draws of sixty-four correlated numbers.
+    assert 0.75 < np.sqrt(np.mean(np.square(found))) < 1.25
+    assert np.abs(found).max() < 5
+    assert np.mean(prints) == pytest.approx(0.02, rel=0.08)
+
+
+def test_gross_errors_are_left_out_and_counted(half_ring, fits) -> None:
+    start = seen_by_all(half_ring, fits, 8)
+    clean, _ = adjust_ring(start, TARGET)
+    px = start["c03"].dots.px.copy()
+    px[[5, 50, 90]] += [0.6, -0.5]
+    start["c03"] = replace(start["c03"], dots=replace(start["c03"].dots, px=px))
+    cameras, _ = adjust_ring(start, TARGET)
+    assert cameras["c03"].left_out - clean["c03"].left_out == 3
+    assert len(cameras["c03"].dots) == len(px) - cameras["c03"].left_out
+    assert np.linalg.norm(cameras["c03"].camera.centre - clean["c03"].camera.centre) < 0.02
+
+
+def test_a_lens_that_contradicts_the_target_is_told(half_ring, fits) -> None:
+    rng = np.random.default_rng(9)
+    lens = half_ring["c04"].intrinsics
+    K = lens.K.copy()
+    K[:2, :2] *= 1.004  # refocused after the boards
+    other = {**fits, "c04": lens_from_boards(replace(lens, K=K), 0.03, rng)}
+    _, fit = adjust_ring(seen_by_all(half_ring, other, 10), TARGET)
+    assert fit.cameras[int(np.argmax(fit.lens_chi2))] == "c04"
+    assert fit.lens_chi2.max() > 10
+    _, good = adjust_ring(seen_by_all(half_ring, fits, 10), TARGET)
+    assert good.lens_chi2.max() < 4
+
+
+def test_a_given_lens_is_held_and_a_bare_camera_needs_none(true_cameras) -> None:
+    rng = np.random.default_rng(11)
+    some = {name: true_cameras[name] for name in NAMES[:3]}
+    start = {name: observed(camera, camera.intrinsics, None, 0.01, rng) for name, camera in some.items()}
+    cameras, fit = adjust_ring(start, TARGET)
+    for name, true in some.items():
+        assert np.array_equal(lens_values(cameras[name].camera.intrinsics), lens_values(true.intrinsics))
+        assert np.linalg.norm(cameras[name].camera.centre - true.centre) < 0.03
+    assert np.isnan(fit.lens_chi2).all()
+    assert not fit.camera_sigma[:, :10].any()
+
+    pinholes = {}
+    for name, camera in some.items():
+        lens = Intrinsics(camera.intrinsics.K_undistorted, np.zeros(5), SIZE)
+        pinholes[name] = observed(replace(camera, intrinsics=lens), None, None, 0.001, rng)
+    cameras, _ = adjust_ring(pinholes, TARGET)
+    for name, true in some.items():
+        assert cameras[name].camera.intrinsics is None
+        assert np.linalg.norm(cameras[name].camera.centre - true.centre) < 0.1
+        assert np.linalg.norm(pinholes[name].camera.centre - true.centre) > 0.2
+
+
+def test_a_camera_that_is_none_is_refused(half_ring, fits) -> None:
+    start = seen_by_all(half_ring, fits, 12)
+    nonsense = np.random.default_rng(13).normal(0, 20, start["c02"].dots.px.shape)
+    start["c02"] = replace(start["c02"], dots=replace(start["c02"].dots, px=start["c02"].dots.px + nonsense))
+    with pytest.raises(ComputationError, match="camera c02: only"):
+        adjust_ring(start, TARGET)
+
+
+def test_the_adjustment_survives_json(true_cameras, fits) -> None:
+    start = seen_by_all({name: true_cameras[name] for name in NAMES[:2]}, fits, 14)
+    start["c02"] = replace(start["c02"], fit=None)
+    cameras, fit = adjust_ring(start, TARGET)
+    again = BundleFit.from_dict(json.loads(json.dumps(fit.to_dict())))
+    assert again.to_dict() == fit.to_dict()
+    stored = CameraCalibration.from_dict(json.loads(json.dumps(cameras["c01"].to_dict())))
+    assert stored.to_dict() == cameras["c01"].to_dict()
+    assert np.array_equal(stored.dot_centres, cameras["c01"].dot_centres)

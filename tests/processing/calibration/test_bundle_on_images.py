@@ -1,0 +1,287 @@
+"""All cameras adjusted together on images: the rendered ring against its truth, the real pair against the paper's way.
+
+One table of figures for both ways: control points, diameter, the target moved by 5 mm.
+"""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from processing.calibration.bundle import adjust_ring, centroid_shift
+from processing.calibration.camera_calibration import CameraCalibration, calibrate_camera
+from processing.calibration.dots import find_dots
+from processing.calibration.target import DotObservations, identify
+from processing.camera import Camera, Intrinsics
+from processing.errors import InputError
+from processing.rig import Rig, RigCamera, read_rig
+from processing.ring import calibrate_ring, control_points
+from processing.session import Capture, Session
+from processing.settings import CalibrationGroup
+from processing.triangulation import reprojection_residuals, triangulate
+
+MOVED = np.array([5.0, 0.0, 0.0])
+
+
+def grey(path: Path) -> np.ndarray:
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    return image
+
+
+@dataclass(frozen=True)
+class Ways:
+    """The paper's calibration and the adjusted one."""
+
+    dlt: dict[str, CameraCalibration]
+    bundle: dict[str, CameraCalibration]
+
+
+@pytest.fixture(scope="module")
+def folder(shared_data) -> Path:
+    return shared_data / "rendered_ring"
+
+
+@pytest.fixture(scope="module")
+def rig(folder) -> Rig:
+    return read_rig(folder / "limb" / "rig.toml")
+
+
+def calibrated(folder: Path, rig: Rig, camera: str) -> CameraCalibration:
+    boards = [grey(path) for path in sorted((folder / "limb" / "board" / camera).glob("*.jpg"))]
+    return calibrate_camera(rig, camera, boards, grey(folder / "limb" / "target" / f"{camera}.jpg"))
+
+
+@pytest.fixture(scope="module")
+def ways(folder, rig) -> Ways:
+    start = {camera.id: calibrated(folder, rig, camera.id) for camera in rig.cameras}
+    return Ways(start, adjust_ring(start, rig.target)[0])
+
+
+@pytest.fixture(scope="module")
+def true_cameras(folder) -> dict[str, Camera]:
+    cameras = {}
+    for true in json.loads((folder / "cameras_truth.json").read_text())["cameras"]:
+        K = np.array([[true["fx"], true["skew"], true["cx"]], [0, true["fy"], true["cy"]], [0, 0, 1]])
+        lens = Intrinsics(K, np.array(true["dist_k1k2p1p2k3"]), (1232, 1640))
+        P = lens.K_undistorted @ np.column_stack([true["R"], true["t"]])
+        cameras[true["name"]] = Camera(true["name"], P / P[2, 3], (1232, 1640), lens)
+    return cameras
+
+
+def pairs(rig: Rig) -> list[tuple[str, str]]:
+    assert len(rig.pairs) == 12
+    return list(rig.pairs)
+
+
+def fitted_diameter(cloud: np.ndarray, z: float) -> tuple[float, float]:
+    """Diameter of the least-squares cylinder and the standard deviation of the points' own. mm."""
+
+    def misfit(q: np.ndarray) -> np.ndarray:
+        axis = np.array([q[2], q[3], 1.0]) / np.linalg.norm([q[2], q[3], 1.0])
+        offset = cloud - [q[0], q[1], z]
+        return np.linalg.norm(offset - np.outer(offset @ axis, axis), axis=1) - q[4]
+
+    found = least_squares(misfit, [0, 0, 0, 0, 57.0], x_scale=[1, 1, 0.01, 0.01, 1])
+    return 2 * found.x[4], 2 * float(found.fun.std())
+
+
+def diameter_bias(rig: Rig, true: dict[str, Camera], cameras: dict[str, CameraCalibration]) -> float:
+    """Diameter of 114 mm seen exactly, triangulated by neighbours, minus 114. mm."""
+    angle, z = (a.ravel() for a in np.meshgrid(np.arange(0, 2 * np.pi, np.pi / 60), np.linspace(15, 235, 12)))
+    normals = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    xyz = 57 * normals + np.outer(z, [0, 0, 1])
+    points = []
+    for pair in pairs(rig):
+        both = np.min([true[id_].incidence_cosine(xyz, normals) for id_ in pair], axis=0) > 0.5
+        px = np.stack([true[id_].project(xyz[both]) for id_ in pair])
+        points.append(triangulate([cameras[id_].camera for id_ in pair], px))
+    return fitted_diameter(np.concatenate(points), 124.0)[0] - 114.0
+
+
+def stage(
+    rig: Rig, cameras: dict[str, CameraCalibration], moved: dict[str, DotObservations], patches: bool
+) -> tuple[float, float]:
+    """Length of the mean displacement of all dots, and RMS of the superimposed ones' distances. mm."""
+    displacements, residuals = [], []
+    for pair in pairs(rig):
+        before, after = [cameras[id_] for id_ in pair], [moved[id_] for id_ in pair]
+        lists = [c.dots for c in before] + after
+        places = [
+            {key: i for i, key in enumerate(zip(d.rows.tolist(), d.columns.tolist(), strict=True))} for d in lists
+        ]
+        common = sorted(set.intersection(*(set(place) for place in places)))
+        chosen = [[place[key] for key in common] for place in places]
+        lenses = [c.camera for c in before]
+        X = triangulate(lenses, np.stack([c.dot_centres[i] for c, i in zip(before, chosen[:2], strict=True)]))
+        px = np.stack([d.px[i] for d, i in zip(after, chosen[2:], strict=True)])
+        if patches:
+            names = [np.array(name) for name in zip(*common, strict=True)]
+            px = px - np.stack([centroid_shift(each, rig.target, *names, translation=MOVED) for each in lenses])
+        Y = triangulate(lenses, px)
+        a, b = X - X.mean(axis=0), Y - Y.mean(axis=0)
+        U, _, Vt = np.linalg.svd(a.T @ b)
+        residuals.append(b - a @ U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt)
+        displacements.append(Y - X)
+    length = float(np.linalg.norm(np.concatenate(displacements).mean(axis=0)))
+    return length, float(np.sqrt(np.mean(np.sum(np.concatenate(residuals) ** 2, axis=1))))
+
+
+def test_the_rendered_ring_is_right_in_every_figure(folder, rig, ways, true_cameras, figures) -> None:
+    moved = {
+        camera.id: identify(
+            find_dots(grey(folder / "target_moved_5mm" / f"{camera.id}.jpg"), rig.target),
+            rig.target,
+            camera.azimuth_deg,
+            camera=camera.id,
+            intrinsics=ways.dlt[camera.id].camera.intrinsics,
+        )
+        for camera in rig.cameras
+    }
+    found = {}
+    for name, cameras in (("dlt", ways.dlt), ("bundle", ways.bundle)):
+        rms = np.sqrt(np.mean([control_points(cameras[a], cameras[b]).rms ** 2 for a, b in pairs(rig)]))
+        bias = diameter_bias(rig, true_cameras, cameras)
+        length, superimposed = stage(rig, cameras, moved, patches=name == "bundle")
+        centre = max(np.linalg.norm(cameras[id_].camera.centre - true.centre) for id_, true in true_cameras.items())
+        found[name] = (float(rms), bias, length, superimposed, float(centre))
+        figures(f"rendered ring, {name}: control points, superimposed, mm", f"{rms:.4f}, {superimposed:.4f}", "0.01")
+        figures(f"rendered ring, {name}: diameter bias, 5 mm, mm", f"{bias:+.4f}, {length:.4f}", "0.003, 5 ± 0.001")
+    rms, bias, length, superimposed, centre = found["bundle"]
+    assert rms < 0.006
+    assert abs(bias) < 0.001
+    assert length == pytest.approx(5.0, abs=0.001)
+    assert superimposed < 0.008
+    assert centre < 0.1
+    rms, bias, length, superimposed, centre = found["dlt"]
+    # The paper's figures do not see what the length and the diameter see.
+    assert rms < 0.007
+    assert superimposed < 0.008
+    assert bias > 0.07
+    assert 5.003 < length < 5.007
+
+
+def test_the_real_pair_is_better_than_the_paper_s_way(shared_data, rig, figures) -> None:
+    folder = shared_data / "multidic_rig"
+    real = replace(
+        rig,
+        target=replace(rig.target, columns=14),
+        cameras=(RigCamera("201", 61.0), RigCamera("202", 92.0)),
+        pairs=(("201", "202"),),
+    )
+    start = {
+        id_: calibrate_camera(
+            real,
+            id_,
+            [grey(path) for path in sorted((folder / "checkerboard" / id_).glob("*.jpg"))],
+            grey(folder / "calibration" / f"{id_}.jpg"),
+        )
+        for id_ in ("201", "202")
+    }
+    bundle, fit = adjust_ring(start, real.target)
+    reference = np.load(folder / "reference.npz")
+    speckles = np.stack([reference["points2d_201"][0], reference["points2d_202"][0]])
+    found = {}
+    for name, cameras in (("dlt", start), ("bundle", bundle)):
+        both = [cameras["201"], cameras["202"]]
+        nominal = [
+            replace(each, dots=replace(each.dots, xyz=start[id_].dots.xyz[_same(start[id_].dots, each.dots)]))
+            for id_, each in cameras.items()
+        ]
+        lenses = [each.camera for each in both]
+        cloud = triangulate(lenses, speckles)
+        across = float(np.sqrt(np.mean(reprojection_residuals(lenses, cloud, speckles)[..., 1] ** 2)))
+        diameter, scatter = fitted_diameter(cloud, 124.0)
+        found[name] = (control_points(nominal[0], nominal[1]).rms, control_points(*both).rms, across, diameter, scatter)
+        figures(
+            f"real pair, {name}: control points, nominal and adjusted, mm",
+            "{:.4f}, {:.4f}".format(*found[name]),
+            "0.07",
+        )
+        figures(f"real pair, {name}: speckles off the epipolar line, px", f"{across:.3f}", "")
+        figures(f"real pair, {name}: diameter, its STD, mm", f"{diameter:.3f}, {scatter:.3f}", "114 ± 0.05, 0.041")
+    assert found["bundle"][0] < found["dlt"][0] < 0.07
+    assert found["bundle"][1] < 0.02
+    # Points that took no part in the calibration: another specimen in later images.
+    assert found["bundle"][2] < 0.75 * found["dlt"][2]
+    assert found["bundle"][3] == pytest.approx(114.0, abs=0.05)
+    assert found["bundle"][4] < found["dlt"][4]
+    assert 0.01 < fit.print_sigma < 0.05
+
+
+def _same(given: DotObservations, chosen: DotObservations) -> list[int]:
+    place = {key: i for i, key in enumerate(zip(given.rows.tolist(), given.columns.tolist(), strict=True))}
+    return [place[key] for key in zip(chosen.rows.tolist(), chosen.columns.tolist(), strict=True)]
+
+
+@pytest.fixture
+def session(folder, rig, tmp_path) -> Session:
+    """Three neighbours of the rendered ring."""
+    names = ("cam_12", "cam_01", "cam_02")
+    some = replace(rig, cameras=tuple(rig.camera(name) for name in names), pairs=(names[:2], names[1:]))
+    boards = tuple(
+        Capture(
+            f"{number + 1:04d}-board",
+            number + 1,
+            "board",
+            tmp_path,
+            {name: folder / "limb" / "board" / name / f"{number:03d}.jpg" for name in names},
+            {},
+        )
+        for number in range(5)
+    )
+    images = {name: folder / "limb" / "target" / f"{name}.jpg" for name in names}
+    return Session(tmp_path, "three", some, (*boards, Capture("0006-target", 6, "target", tmp_path, images, {})))
+
+
+def test_a_session_is_calibrated_as_its_settings_say_and_once(session, rig, ways) -> None:
+    told: list[tuple[float, str]] = []
+    plain = calibrate_ring(session, CalibrationGroup(), lambda done, who: told.append((done, who)))
+    assert plain.bundle is None
+    assert told[-1] == (1.0, "camera cam_02")
+    first = calibrate_ring(session, CalibrationGroup(method="bundle"), lambda done, who: told.append((done, who)))
+    assert told[-1] == (1.0, "all cameras together")
+    assert first.bundle is not None
+    assert first.bundle.cameras == ("cam_12", "cam_01", "cam_02")
+    kept = {path: path.stat().st_mtime_ns for path in (session.path / "calibration").iterdir()}
+    assert sum(path.name.startswith("bundle-") for path in kept) == 1
+    assert len(kept) == 4  # the start is shared by both methods
+    again = calibrate_ring(session, CalibrationGroup(method="bundle"))
+    assert {path: path.stat().st_mtime_ns for path in (session.path / "calibration").iterdir()} == kept
+    assert again.bundle is not None
+    assert again.bundle.to_dict() == first.bundle.to_dict()
+    for id_, calibration in first.cameras.items():
+        assert again.cameras[id_].to_dict() == calibration.to_dict()
+        assert np.array_equal(plain.cameras[id_].camera.P, ways.dlt[id_].camera.P)
+        assert not np.array_equal(calibration.camera.P, plain.cameras[id_].camera.P)
+    loose = calibrate_ring(session, CalibrationGroup(method="bundle", print_error_mm=0.0, radius_error_mm=0.05))
+    assert loose.bundle is not None
+    assert loose.bundle.print_sigma == 0.0
+    assert loose.bundle.sheet.radius == pytest.approx(57.0, abs=0.005)
+
+
+def test_a_session_whose_lenses_were_touched_is_told_so(session, folder) -> None:
+    # The boards of one camera with those of another: lenses that differ by some pixels.
+    boards = [
+        replace(
+            capture,
+            images={**capture.images, "cam_01": folder / "limb" / "board" / "cam_05" / capture.images["cam_01"].name},
+        )
+        if capture.kind == "board"
+        else capture
+        for capture in session.captures
+    ]
+    ring = calibrate_ring(replace(session, captures=tuple(boards)), CalibrationGroup(method="bundle"))
+    assert len(ring.warnings) == 1
+    assert "cam_01" in ring.warnings[0]
+    assert "check that the board is flat" in ring.warnings[0]
+
+
+def test_a_session_without_a_target_is_refused(session) -> None:
+    bare = replace(session, captures=session.of_kind("board"))
+    with pytest.raises(InputError, match="no capture of the calibration target"):
+        calibrate_ring(bare, CalibrationGroup(method="bundle"))
