@@ -348,7 +348,7 @@ def test_a_bad_session_is_not_processed(
     [
         (("--set", "correlation.radius=5"), ["unknown setting 'correlation.radius'", "radius_px"]),
         (("--set", "correlaton.radius_px=5"), ["unknown group of settings 'correlaton'", "correlation"]),
-        (("--set", "calibration.method=bundle"), ["calibration.method", "'bundle' is not available", "use 'dlt'"]),
+        (("--set", "calibration.method=clicks"), ["calibration.method", "'dlt' or 'bundle'", "'clicks'"]),
         (("--set", "surface.method=global"), ["surface.method", "'global' is not available", "use 'pairs'"]),
         (("--set", "strain.window_mm=4"), ["strain.window_mm", "not available", "use 0"]),
         (("--set", "radius"), ["--set radius", "group.name=value", "correlation.radius_px=20"]),
