@@ -31,7 +31,7 @@ SettingsFile = Annotated[Path | None, typer.Option("--settings", help="Settings 
 
 @app.command()
 def demo(
-    cameras: Annotated[int, typer.Option(min=4, max=30, help="Cameras on the ring; use 6 or more.")] = 12,
+    cameras: Annotated[int, typer.Option(min=6, max=30, help="Cameras; neighbours must share a view.")] = 12,
     scale: Annotated[float, typer.Option(min=0.1, max=1.0, help="Image size; 1 is 2464 x 3280 px.")] = 0.25,
     steps: Annotated[int, typer.Option(min=1, max=20, help="Deformed steps after the reference.")] = 3,
     no_serve: Annotated[bool, typer.Option("--no-serve", help="End after the table.")] = False,
