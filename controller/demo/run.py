@@ -14,9 +14,9 @@ from controller.console import narrated, say, show_table
 from controller.demo.client import Client
 from controller.demo.comparison import compare_with_truth
 from controller.demo.rig import Setting, check_alive, running_controller, running_nodes
-from node_agent.virtual_rig.render import render
+from node_agent.virtual_rig.render import warm_up
 from node_agent.virtual_rig.rig import VirtualRig, paper_rig, write_truth
-from node_agent.virtual_rig.scenes import Limb, scene
+from node_agent.virtual_rig.scenes import Limb
 from processing.progress import Progress, Report
 from processing.rig import parse_rig
 from processing.session import newest_results
@@ -36,7 +36,7 @@ def run_demo(folder: Path, *, cameras: int, scale: float, steps: int, serve: boo
     setting = Setting(_new_folder(folder), cameras, scale)
     rig = paper_rig(cameras, scale, setting.seed)
     say(f"a simulated ring of {cameras} cameras of {rig.cameras[0].width} x {rig.cameras[0].height} px")
-    warm_up(cameras)
+    warm_up()  # compiled once here, the renderer is found compiled by every node
     write_truth(rig, setting.folder)
     name = parse_rig(rig.rig_toml()).name
     ids = [camera.id for camera in rig.cameras]
@@ -61,13 +61,6 @@ def run_demo(folder: Path, *, cameras: int, scale: float, steps: int, serve: boo
 def _leave(signum: int, _: FrameType | None) -> None:
     """End as Ctrl-C does, through the exits that stop the processes of the rig."""
     raise SystemExit(128 + signum)
-
-
-def warm_up(cameras: int) -> None:
-    """Compile the renderer once here, so that the nodes find it compiled."""
-    tiny = paper_rig(cameras, 0.05).cameras[0]
-    for kind in ("board", "target", "specimen"):
-        render(tiny, scene(kind, 0))
 
 
 def _capture_all(client: Client, steps: int, report: Report) -> None:

@@ -44,6 +44,7 @@ class VirtualCamera:
         offset_us: float = 20.0,
     ) -> None:
         try:
+            from node_agent.virtual_rig.render import warm_up
             from node_agent.virtual_rig.rig import paper_rig
 
             ring = {lens.id: lens for lens in paper_rig(cameras=cameras, scale=scale, seed=seed).cameras}
@@ -92,14 +93,3 @@ class VirtualCamera:
 
     def close(self) -> None:
         pass
-
-
-def warm_up(specimen: str = "limb") -> None:
-    """Load, or compile and cache, everything that rendering needs, by rendering each kind of scene very small."""
-    from node_agent.virtual_rig.render import render
-    from node_agent.virtual_rig.rig import paper_rig
-    from node_agent.virtual_rig.scenes import scene
-
-    small = paper_rig(cameras=12, scale=0.05).cameras[0]
-    for kind in ("board", "target", "specimen"):
-        render(small, scene(kind, 0, specimen=specimen), 0)

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from node_agent.virtual_rig.body import CYLINDER, approach, point
 from node_agent.virtual_rig.lens import VirtualCamera, ideal
+from node_agent.virtual_rig.rig import paper_rig
 from node_agent.virtual_rig.scenes import Board, Scene, Specimen, Target
+from node_agent.virtual_rig.scenes import scene as make_scene
 from node_agent.virtual_rig.scenes.board import MARGIN, SQUARE, SQUARES
 from node_agent.virtual_rig.sensor import expose
 from node_agent.virtual_rig.texture import RADIUS, checker, covered, dots, speckle
@@ -38,6 +40,13 @@ _GRAZING = 0.02  # mm, by which the estimated clearance of a ray that meets the 
 def render(camera: VirtualCamera, scene: Scene, seed: int = 0) -> NDArray[np.uint8]:
     """The image (height, width) of a scene as a camera delivers it; ``seed`` is that of the sensor's noise."""
     return expose(radiance(camera, scene), seed)
+
+
+def warm_up(specimen: str = "limb") -> None:
+    """Load, or compile and cache, everything that rendering needs, by rendering each kind of scene very small."""
+    small = paper_rig(cameras=12, scale=0.05).cameras[0]
+    for kind in ("board", "target", "specimen"):
+        render(small, make_scene(kind, 0, specimen=specimen), 0)
 
 
 def radiance(camera: VirtualCamera, scene: Scene) -> Radiance:

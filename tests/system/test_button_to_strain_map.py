@@ -11,7 +11,8 @@ from playwright.sync_api import Browser, Page, expect
 
 from controller.demo.comparison import compare_with_truth
 from controller.demo.rig import Setting, check_alive, running_controller, running_nodes
-from controller.demo.run import settings_for, warm_up
+from controller.demo.run import settings_for
+from node_agent.virtual_rig.render import warm_up
 from node_agent.virtual_rig.rig import VirtualRig, paper_rig
 from node_agent.virtual_rig.scenes import Limb
 from processing.results import read_results
@@ -31,7 +32,7 @@ def rig(tmp_path: Path) -> Iterator[tuple[str, Setting]]:
     setting = Setting(tmp_path, cameras=12, scale=SCALE)
     pair = VirtualRig(paper_rig(12, SCALE, setting.seed).cameras[:2])
     ids = [camera.id for camera in pair.cameras]
-    warm_up(12)
+    warm_up()
     with (
         running_controller(setting, pair.rig_toml(), settings_for(SCALE)) as (address, endpoint),
         running_nodes(setting, parse_rig(pair.rig_toml()).name, ids, endpoint) as nodes,
