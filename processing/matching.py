@@ -141,8 +141,7 @@ def _find_region(stereo: _Stereo, image: Image, current: Current, mask: Mask | N
     which = _nearest(hypotheses.warps, warps)
     radius = stereo.radii[which].reshape(shape)
     xyz = hypotheses.xyz[np.arange(len(px)), which].reshape(*shape, 3)
-    with np.errstate(invalid="ignore"):
-        convincing = (zncc > stereo.search.zncc_min) & (second_best < 0.9 * zncc)
+    convincing = _convincing(stereo.search, zncc, second_best)
     convincing &= (which > 0) & (which < len(stereo.radii) - 1)
     if mask is None:
         texture = contrast(image, px, settings.radius)
@@ -163,6 +162,12 @@ def _find_region(stereo: _Stereo, image: Image, current: Current, mask: Mask | N
         )
     region = mask if mask is not None else paint(points, good, first.size)
     return region, px[good.ravel()], warps[good.ravel()]
+
+
+def _convincing(search: Search, zncc: Array, second_best: Array) -> Mask:
+    """Matches (n,) of a sweep that look alike enough, and more so than any other place on the line."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray((zncc > search.zncc_min) & (second_best < 0.9 * zncc))
 
 
 def _nearest(candidates: Array, chosen: Array) -> NDArray[np.int_]:
@@ -194,8 +199,7 @@ def _start_after_motion(
     motion = np.concatenate([in_time.uv[chosen], in_time.gradient[chosen].reshape(-1, 4)], axis=1)
     candidates = compose(motion[:, None, :], hypotheses.warps)
     warps, zncc, second_best = search_hypotheses(reference, current, xy[chosen], candidates, settings.radius)
-    with np.errstate(invalid="ignore"):
-        convincing = (zncc > stereo.search.zncc_min) & (second_best < 0.9 * zncc)
+    convincing = _convincing(stereo.search, zncc, second_best)
     start = np.full((len(xy), 6), np.nan)
     start[chosen[convincing]] = warps[convincing]
     return start

@@ -26,7 +26,7 @@ from processing.errors import ComputationError, InputError
 from processing.images import read_gray, read_mask
 from processing.matching import PairMatches, Search, match_pair
 from processing.progress import Report, Stages, silent
-from processing.results import Results, write_results
+from processing.results import Matches, Results, write_results
 from processing.ring import Ring, calibrate_ring, control_points
 from processing.session import Capture, Session, new_run, read_session
 from processing.settings import Settings
@@ -114,7 +114,6 @@ def _surfaces(
     refined, seconds = 0, 0.0
     for k, pair in enumerate(pairs):
         cameras = (ring.cameras[pair[0]].camera, ring.cameras[pair[1]].camera)
-
         rate = f"{refined / seconds:,.0f} points/s" if seconds else ""
 
         def progress(share: float, k: int = k, pair: tuple[str, str] = pair, rate: str = rate) -> None:
@@ -188,7 +187,7 @@ def _join(
     )
 
 
-def _with_offset(surface: PairSurface, offset: int) -> Any:
+def _with_offset(surface: PairSurface, offset: int) -> Matches:
     vertex = surface.matches.vertex
     return replace(surface.matches, vertex=np.where(vertex >= 0, vertex + offset, -1))
 

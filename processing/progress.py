@@ -37,17 +37,12 @@ class Stages:
     report: Report
     clock: Callable[[], float] = time.monotonic
     _started: float = field(init=False)
-    _stage_started: float = field(init=False)
-    _stage: str = field(init=False, default="")
 
     def __post_init__(self) -> None:
-        self._started = self._stage_started = self.clock()
+        self._started = self.clock()
 
     def at(self, stage: str, fraction: float, message: str = "", rate: str = "") -> None:
         """Say that ``fraction`` of ``stage`` is done."""
-        now = self.clock()
-        if stage != self._stage:
-            self._stage, self._stage_started = stage, now
         total = sum(self.weights.values())
         before = 0.0
         for name, weight in self.weights.items():
@@ -55,6 +50,6 @@ class Stages:
                 break
             before += weight
         done = (before + fraction * self.weights[stage]) / total
-        elapsed = now - self._started
+        elapsed = self.clock() - self._started
         left = elapsed * (1 - done) / done if done > 0.02 else None
         self.report(Progress(stage, min(done, 1.0), message, rate, left))
