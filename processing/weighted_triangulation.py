@@ -122,7 +122,7 @@ def _gauss_newton(views: list[_View], xyz: Array) -> tuple[Array, Array, Array]:
         if not (np.abs(step) > _SETTLED).any():
             break
     else:
-        xyz = np.where((np.abs(step) > 1e3 * _SETTLED).any(axis=1)[:, None], np.nan, xyz)
+        xyz[np.abs(step).max(axis=1) > 1e3 * _SETTLED] = np.nan
     return xyz, normal, np.maximum(chi2, 0.0)
 
 
