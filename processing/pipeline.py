@@ -24,13 +24,14 @@ from processing.correlation import CorrelationSettings
 from processing.correlation.correlate import load_kernels
 from processing.errors import ComputationError, InputError
 from processing.images import read_gray, read_mask
-from processing.matching import PairMatches, Search, match_pair
+from processing.matching import PairMatches, match_pair
 from processing.progress import Report, Stages, silent
 from processing.results import Matches, Results, write_results
 from processing.ring import Ring, calibrate_ring, control_points
 from processing.session import Capture, Session, new_run, read_session
 from processing.settings import Settings
 from processing.surface import PairSurface, pair_surface
+from processing.sweep import Search
 
 log = logging.getLogger(__name__)
 
@@ -209,6 +210,7 @@ def _keep(
             {"pair": list(pair), "mean_mm": error.mean, "rms_mm": error.rms, "points": error.points}
             for pair, error in errors.items()
         ],
+        "bundle": None if ring.bundle is None else ring.bundle.to_dict(),
     }
     stages.at("deform", 0.0)
     with new_run(session.path) as run:
