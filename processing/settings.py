@@ -50,6 +50,8 @@ class CalibrationGroup(_Group):
     """Cameras: the direct linear transformation (dlt), or from there the adjustment of all together (bundle).
 
     distortion : the lens is measured on the checkerboard and corrected.
+    radial_terms, tangential, skew : terms that the lens may have. terms : it gets as many of them as the checkerboard
+    views determine (largest), or those of the smallest information criterion (criterion).
     drop_percentile : checkerboard views whose error lies above it are dropped and the rest is fitted again; 100 keeps
     all views.
     print_error_mm, radius_error_mm, pitch_error_mm, tilt_error_deg : of the bundle: how far, as standard deviations,
@@ -59,6 +61,10 @@ class CalibrationGroup(_Group):
 
     method: Literal["dlt", "bundle"] = "dlt"
     distortion: bool = True
+    radial_terms: Literal[2, 3] = 3
+    tangential: bool = True
+    skew: bool = True
+    terms: Literal["largest", "criterion"] = "largest"
     drop_percentile: float = Field(default=80.0, gt=0, le=100)
     print_error_mm: float = Field(default=0.03, ge=0, le=5)
     radius_error_mm: float = Field(default=0.0, ge=0, le=5)
@@ -89,16 +95,9 @@ class SurfaceGroup(_Group):
 
 
 class StrainGroup(_Group):
-    """Strain. window_mm : width of the window strain is fitted over; 0 takes each triangle alone."""
+    """Strain. window_mm : width of the window it is fitted over, beside that of each triangle alone; 0: no window."""
 
-    window_mm: float = Field(default=0.0, ge=0)
-
-    @field_validator("window_mm")
-    @classmethod
-    def _available(cls, value: float) -> float:
-        if value > 0:
-            raise ValueError("a strain window is not available in this version; use 0, the triangle alone")
-        return value
+    window_mm: float = Field(default=0.0, ge=0, le=1000)
 
 
 class Settings(_Group):
