@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.calibration.quality import ReconstructionError, camera_quality
+from processing.calibration.quality import ReconstructionError
 from processing.mesh import Mesh
 from processing.results import Results
 from processing.ring import Ring
@@ -36,12 +36,23 @@ def summarise(
         "pairs": len(results.pairs),
         "area_mm2": round(float(Mesh(results.vertices_ref, results.faces).areas.sum()), 1),
         "control_points": control,
-        "cameras": [asdict(camera_quality(calibration)) for calibration in ring.cameras.values()],
+        "cameras": [asdict(row) for row in ring.quality],
+        "calibration": _calibration(ring),
         "drift_px": {f"{s.matches.pair[0]}-{s.matches.pair[1]}": _finite(s.drift) for s in surfaces},
         "steps": steps,
         "warnings": list(warnings),
     }
     return {**figures, "table": _table(figures)}
+
+
+def _calibration(ring: Ring) -> dict[str, Any]:
+    """How the cameras were found and how well: the pairs, the target as adjusted, and what could be done better."""
+    return {
+        "method": "dlt" if ring.bundle is None else "bundle",
+        "pairs": [asdict(row) for row in ring.pairs],
+        "bundle": None if ring.bundle is None else ring.bundle.figures(ring.target),
+        "advice": list(ring.advice),
+    }
 
 
 def _step(results: Results, step: int) -> dict[str, Any]:
@@ -80,6 +91,15 @@ def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
             "value": f"{control['mean_mm']:.4f}, {control['rms_mm']:.4f} mm",
         },
     ]
+    bundle = figures["calibration"]["bundle"]
+    if bundle is not None:
+        rows.append(
+            {
+                "figure": "bundle: centroids, print errors, radius",
+                "value": f"{bundle['centroid_sigma_px']:.4f} px, {bundle['print_errors_rms_mm']:.3f} mm, "
+                f"{bundle['radius_mm']:.3f} mm",
+            }
+        )
     for step in figures["steps"][1:]:
         if step["measured"]:
             rows.append(
