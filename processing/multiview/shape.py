@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from processing.camera import Camera
 from processing.correlation import CorrelationSettings, Status
 from processing.errors import ComputationError
+from processing.multiview.agreement import triangulate_agreeing
 from processing.multiview.depth import lay_lattice, px_per_mm, rough_surface
 from processing.multiview.lattice import Pieces, evaluate, robust_pieces
 from processing.multiview.matching import Image, NodeMatches, Ring, match_nodes
@@ -26,7 +27,6 @@ from processing.multiview.tube import lattice_faces
 from processing.multiview.views import seen
 from processing.outliers import Lost
 from processing.sweep import Search, radii_of, sweep
-from processing.weighted_triangulation import triangulate_weighted
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -209,20 +209,13 @@ class _Surface:
             uncertain: Mask = np.asarray((found.sigma > settings.sigma_max).any(axis=2))
         px = np.where(uncertain[..., None], np.nan, found.px)
         sigma = np.sqrt(found.sigma**2 + settings.floor**2)
-        points = triangulate_weighted(cameras, px, sigma)
-        for _ in range(2):
-            bad = _contradicted(points.chi2, points.degrees)
-            if not bad.any():
-                break
-            worst = _worst_view(cameras, points.xyz[bad], px[:, bad], sigma[:, bad], reference[bad])
-            px[worst, np.flatnonzero(bad)] = np.nan
-            points = triangulate_weighted(cameras, px, sigma)
+        points, used = triangulate_agreeing(cameras, px, sigma, reference)
         status = np.where(found.status != 0, found.status, 0)
         status = np.where((status == 0) & ~np.isfinite(points.xyz).all(axis=1), Lost.RESIDUAL, status)
         few = (np.isfinite(found.px[..., 0]) & ~uncertain).sum(axis=0) < 2
         status = np.where((status == Lost.RESIDUAL) & few & uncertain.any(axis=0), Lost.UNCERTAIN, status)
         good = status == 0
-        used = np.isfinite(px[..., 0]) & good
+        used &= good
         self.status[nodes] = status
         self.reference[nodes] = reference
         self.xyz[nodes] = np.where(good[:, None], points.xyz, np.nan)
@@ -260,19 +253,3 @@ class _Surface:
 def _indices(which: Mask) -> tuple[Ints, Ints]:
     columns, rows = np.nonzero(which)
     return columns, rows
-
-
-def _contradicted(chi2: Array, degrees: Ints) -> Mask:
-    """Points (n,) whose views contradict one another far beyond what the others' do."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        each = chi2 / degrees
-        usual = max(1.0, float(np.nanmedian(each[degrees > 0])) if (degrees > 0).any() else 1.0)
-        return np.asarray((degrees > 0) & (each > 25.0 * usual))
-
-
-def _worst_view(cameras: Sequence[Camera], xyz: Array, px: Array, sigma: Array, reference: Ints) -> Ints:
-    """Index (n,) of the view that fits worst; never the reference, whose pixel defines the point."""
-    residual = np.stack([camera.project(xyz) for camera in cameras]) - px
-    each = np.nansum((residual / sigma) ** 2, axis=2)
-    each[reference, np.arange(len(reference))] = -1.0
-    return np.asarray(np.argmax(each, axis=0))
