@@ -1,9 +1,13 @@
-"""The same points in two images of one camera: subsets on whole pixels, twice, the second time with the curvature held.
+"""The same points in two images of one camera: whole-pixel subsets, twice, and what the neighbours know.
 
-A first-order subset in a curved displacement field is biased; a second-order one is noisier. So the field itself is
-asked: a quadratic of the displacement over the neighbours gives every point its second derivatives, and a second
-first-order pass holds them. A subset of the reference lies on a whole pixel, where nothing is interpolated; gradient
-and curvature carry the result to the point, less than a pixel away.
+A first-order subset in a curved displacement field is biased; one of second order is not, but nearly twice as noisy.
+So there are two passes. The first is of second order. A quadratic of its displacement over the neighbours gives every
+point its second derivatives, far less noisy than the subset's own; the second pass is of first order and holds them.
+What bias is left (the field is no quadratic where the surface turns away) is the smooth part of the difference of the
+two passes, and is taken off as far as it stands out of the noise.
+
+A subset of the reference lies on a whole pixel, where nothing is interpolated; gradient and curvature carry the result
+to the point, less than a pixel away.
 """
 
 from __future__ import annotations
@@ -21,7 +25,10 @@ from processing.multiview.quadratic import Neighbourhoods, QuadraticFit
 Array = NDArray[np.float64]
 
 _LOOSE = 1e-4  # px, tolerance of the first of two passes
-_ENOUGH = 0.9  # share of the start values that must hold before the images are searched for others
+_PATIENCE = 20  # iterations of the first of two passes
+_ENOUGH = 0.5  # share of the start values that must hold before the images are searched for others
+_LEAST_EXCESS = 0.1  # of a second-order subset's variance, beyond that of the same subset of first order
+_OVERLAP = 1.2  # subsets share pixels: a mean of several is this much less certain than of independent ones
 _SCATTERS = 8.0  # a point this many times off its neighbours' quadratic contradicts it
 _LEAST_OFF = 0.1  # px, and never less than this
 _AROUND = 60  # points about a point whose difference between the images is the usual one
@@ -74,15 +81,12 @@ def follow(
     around = Neighbourhoods(pixel, window or 1.75 * settings.radius)
     given = None if start is None else shifted(start, shift)
     first = _matched(reference, current, pixel, given, _first_settings(settings) if two_pass else settings, search)
-    if not two_pass:
+    if not two_pass or not first.good.any():
         return _judged(first, reference, shift, around, settings.radius)
-    fit = _fitted(first, around)
     warp = _warp(first)
-    warp[:, 6:] = _held(fit, first, settings.radius)
-    if not np.isfinite(warp).all(axis=1).any():
-        return _judged(first, reference, shift, around, settings.radius)
+    warp[:, 6:] = _held(_fitted(first, around), first, settings.radius)
     second = correlate(reference, current, pixel, settings, start=warp)
-    return _judged(second, reference, shift, around, settings.radius)
+    return _judged(_unbiased(first, second, around), reference, shift, around, settings.radius)
 
 
 def shifted(warp: Array, shift: Array) -> Array:
@@ -99,7 +103,9 @@ def shifted(warp: Array, shift: Array) -> Array:
 
 
 def _first_settings(settings: CorrelationSettings) -> CorrelationSettings:
-    return replace(settings, order=1, tolerance=max(settings.tolerance, _LOOSE))
+    """Of the first of two passes: second order, and no more iterations than a point takes that will be found."""
+    iterations = min(settings.max_iterations, _PATIENCE)
+    return replace(settings, order=2, tolerance=max(settings.tolerance, _LOOSE), max_iterations=iterations)
 
 
 def _matched(
@@ -147,6 +153,25 @@ def _held(fit: QuadraticFit, found: Correlation, radius: int) -> Array:
         return np.zeros_like(curvature)
     _, nearest = cKDTree(found.xy[known]).query(found.xy)
     return np.asarray(curvature[known][nearest])
+
+
+def _unbiased(first: Correlation, second: Correlation, around: Neighbourhoods) -> Correlation:
+    """The second pass less the smooth part of its difference from the first, as far as that is more than noise.
+
+    The part b̂ taken off is b³/(b² + s²) for a difference b of uncertainty s: all of a clear bias, none of noise.
+    """
+    difference = second.uv - first.uv
+    with np.errstate(invalid="ignore"):
+        each = np.sqrt(np.maximum(first.sigma**2 - second.sigma**2, _LEAST_EXCESS * first.sigma**2))
+    size = np.hypot(*each.T)
+    fit = around.fit(difference, size)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        s = _OVERLAP * fit.value_sigma[:, None] * each / size[:, None]
+        share = fit.value**2 / (fit.value**2 + s**2)
+    known = np.isfinite(share).all(axis=1) & second.good
+    uv = np.where(known[:, None], second.uv - share * fit.value, second.uv)
+    sigma = np.where(known[:, None], np.hypot(second.sigma, share * s), second.sigma)
+    return replace(second, uv=uv, sigma=sigma)
 
 
 def _contradicts(fit: QuadraticFit) -> NDArray[np.bool_]:

@@ -27,13 +27,14 @@ class QuadraticFit:
     """Local quadratics of a field of k components at n points; NaN where too few neighbours are known.
 
     value : (n, k). gradient : (n, k, 2) by x, y. curvature : (n, k, 3), second derivatives by xx, xy, yy.
-    curvature_sigma : (n, 3), standard uncertainty of the latter, the neighbours' noise taken as independent.
+    value_sigma (n,), curvature_sigma (n, 3) : their standard uncertainties, the neighbours' noise independent.
     leave_out : (n, k), measured value minus the quadratic of the other points; NaN where not measured.
     """
 
     value: Array
     gradient: Array
     curvature: Array
+    value_sigma: Array
     curvature_sigma: Array
     leave_out: Array
 
@@ -78,8 +79,10 @@ class Neighbourhoods:
         with np.errstate(invalid="ignore", divide="ignore"):
             leave_out = np.where(known[:, None], (values - c[..., 0]) / (1.0 - own)[:, None], np.nan)
         w = self.window
-        variance = np.einsum("naa->na", inverse)[:, 3:]
-        return QuadraticFit(c[..., 0], c[..., 1:3] / w, c[..., 3:] / w**2, np.sqrt(variance) / w**2, leave_out)
+        scatter = np.sqrt(np.einsum("naa->na", inverse))
+        return QuadraticFit(
+            c[..., 0], c[..., 1:3] / w, c[..., 3:] / w**2, scatter[:, 0], scatter[:, 3:] / w**2, leave_out
+        )
 
     def _weights(self, known: NDArray[np.bool_], sigma: Array | None) -> Array:
         if sigma is None:

@@ -115,32 +115,33 @@ def test_motions_of_tens_of_pixels_between_steps_are_followed():
 
 
 def worn(steps):
-    """The pattern after so many steps, in each of which a part of it gives way to a new one: ZNCC 0.88 each."""
+    """The pattern after so many steps, in each of which a part of it gives way to a new one: ZNCC 0.84 each."""
 
     def mixed(x, y):
         grey = pattern(x, y) - 128.0
         for k in range(1, steps + 1):
-            grey = 0.88 * grey + 0.475 * (pattern(x, y, seed=k) - 128.0)
+            grey = 0.84 * grey + 0.543 * (pattern(x, y, seed=k) - 128.0)
         return 128.0 + grey
 
     return mixed
 
 
 def test_where_the_surface_has_changed_the_last_image_takes_the_references_place():
-    ways = [rest, *(back_of(SIZE / 2, 2.0 * k, -1.0 * k, 0.0) for k in (1, 2, 3, 4))]
-    images, x0 = series(ways, [worn(k) for k in range(5)]), points()  # ZNCC with the reference to 0.88⁴ = 0.60
+    ways = [rest, *(back_of(SIZE / 2, 2.0 * k, -1.0 * k, 0.0) for k in (1, 2, 3))]
+    images, x0 = series(ways, [worn(k) for k in range(4)]), points()  # ZNCC with the reference to 0.84³ = 0.59
+    x0 = x0[(np.abs(x0 - SIZE / 2) < 50).all(axis=1)]
     alone = follow_all(images, x0, options=Tracking(update_reference=False))
     result = follow_all(images, x0)
-    assert (alone.status[4] == Status.GOOD).mean() < 0.3
-    assert (result.status[1:] == Status.GOOD).mean() > 0.98
+    assert (alone.status[3] == Status.GOOD).mean() < 0.3
+    assert (result.status[1:] == Status.GOOD).mean() > 0.97
     assert not result.updated[1].any()
-    assert result.updated[4].mean() > 0.5
-    scatter = [np.sqrt(np.nanmean(errors(result, k, forward(ways[k], x0)) ** 2)) for k in (1, 2, 3, 4)]
+    assert result.updated[3].mean() > 0.5
+    scatter = [np.sqrt(np.nanmean(errors(result, k, forward(ways[k], x0)) ** 2)) for k in (1, 2, 3)]
     # Each image adds a change of its own: errors add up like the steps of a random walk, or less.
-    assert (np.array(scatter) < 1.25 * scatter[0] * np.sqrt([1, 2, 3, 4])).all()
-    came = result.updated[4] & result.updated[3]
-    assert (result.sigma[4, came] > result.sigma[3, came]).all()  # variances add up
-    assert (result.c_ls[4, came] >= result.c_ls[3, came]).all()
+    assert (np.array(scatter) < 1.25 * scatter[0] * np.sqrt([1, 2, 3])).all()
+    came = result.updated[3] & result.updated[2]
+    assert (result.sigma[3, came] > result.sigma[2, came]).all()  # variances add up
+    assert (result.c_ls[3, came] >= result.c_ls[2, came]).all()
 
 
 def test_what_is_covered_for_a_while_is_lost_and_found_again():
