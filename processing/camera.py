@@ -100,6 +100,13 @@ class Intrinsics:
         xy_d = self.distort_normalised((px - np.array([cx, cy])) / np.array([fx, fy]))
         return np.stack([fx * xy_d[..., 0] + s * xy_d[..., 1] + cx, fy * xy_d[..., 1] + cy], axis=-1)
 
+    def slope(self, px: Array) -> Array:
+        """d(image pixel)/d(undistorted pixel) at undistorted pixels (..., 2). (..., 2, 2)."""
+        px = np.asarray(px, dtype=float)
+        (fx, s, cx), (_, fy, cy) = self.K[0], self.K[1]
+        J = self._jacobian_normalised((px - np.array([cx, cy])) / np.array([fx, fy]))
+        return np.array([[fx, s], [0.0, fy]]) @ J / np.array([fx, fy])
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -130,6 +137,15 @@ class Camera:
         """World points (..., 3) mm to image pixels (..., 2)."""
         px = self.project_undistorted(xyz)
         return px if self.intrinsics is None else self.intrinsics.to_distorted(px)
+
+    def project_with_slope(self, xyz: Array) -> tuple[Array, Array]:
+        """Image pixels (..., 2) of world points (..., 3) mm, and how they move with the points. (..., 2, 3), px/mm."""
+        h = np.asarray(xyz, dtype=float) @ self.P[:, :3].T + self.P[:, 3]
+        px = h[..., :2] / h[..., 2:]
+        slope = (self.P[:2, :3] - px[..., None] * self.P[2, :3]) / h[..., 2, None, None]
+        if self.intrinsics is None:
+            return px, slope
+        return self.intrinsics.to_distorted(px), self.intrinsics.slope(px) @ slope
 
     def undistort(self, px: Array) -> Array:
         """Image pixels (..., 2) to undistorted pixels."""

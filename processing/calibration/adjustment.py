@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
+from processing.calibration.parameters import PER_CAMERA
 from processing.calibration.patch import (
     Sheet,
     Views,
@@ -33,8 +34,6 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-#: Parameters of a camera: ten of the lens, six of the pose.
-PER_CAMERA = 16
 #: Residuals beyond this many σ count by their length, not by its square (Huber 1964).
 HUBER = 2.5
 #: The adjustment trusts no centroid and no print to better than this, px and mm.

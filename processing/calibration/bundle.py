@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.calibration.adjustment import PER_CAMERA, Problem, Solution, State, adjust
+from processing.calibration.adjustment import Problem, Solution, State, adjust
 from processing.calibration.camera_calibration import CameraCalibration
+from processing.calibration.parameters import PER_CAMERA, Parameters
 from processing.calibration.patch import Sheet, Views, project_centres, project_patches, sheet_points, wrapped
-from processing.camera import Camera, Intrinsics
+from processing.camera import Camera
 from processing.errors import ComputationError
 from processing.rig import Target
 
@@ -183,12 +184,13 @@ def centroid_shift(
     rotation : (3, 3) and translation : (3,) mm, of the target in the world; none leaves it in place.
     """
     sheet = sheet or Sheet.nominal(target)
-    R, t = _pose(camera.P, camera.intrinsics)
+    state = Parameters.of(camera)
+    R, t = state.rotation, state.translation
     t = t if translation is None else t + R @ np.asarray(translation, dtype=float)
     R = R if rotation is None else R @ np.asarray(rotation, dtype=float)
     n = len(rows)
     views = Views(
-        np.tile(_inner(camera), (n, 1)),
+        np.tile(state.inner, (n, 1)),
         np.tile(R, (n, 1, 1)),
         np.tile(t, (n, 1)),
         sheet_points(target, sheet, rows, columns),
@@ -217,11 +219,11 @@ def _problem(given: list[CameraCalibration], target: Target, prior: TargetPrior)
         sheet_sigma=sheet_sigma,
         free=np.concatenate([free_cameras.ravel(), sheet_sigma > 0]),
     )
-    poses = [_pose(each.camera.P, each.camera.intrinsics) for each in given]
+    poses = [Parameters.of(each.camera) for each in given]
     return problem, State(
         inner,
-        np.array([R for R, _ in poses]),
-        np.array([t for _, t in poses]),
+        np.array([each.rotation for each in poses]),
+        np.array([each.translation for each in poses]),
         Sheet.nominal(target),
         np.zeros((len(names), 2)),
     )
@@ -238,36 +240,7 @@ def _lens(given: CameraCalibration) -> tuple[Array, Array, NDArray[np.bool_]]:
         correlation = given.fit.covariance[np.ix_(free, free)] / np.outer(sigma, sigma)
         inflation = max(1.0, 2 * _CORNER_SIGMA**2 / max(given.fit.rms**2, 1e-12))
         information[np.ix_(free, free)] = np.linalg.pinv(correlation) / np.outer(sigma, sigma) / inflation
-    return _inner(given.camera), information, free
-
-
-def _inner(camera: Camera) -> Array:
-    """fx fy s cx cy k1 k2 p1 p2 k3. (10,)."""
-    lens = camera.intrinsics
-    K, distortion = (_split(camera.P)[0], np.zeros(5)) if lens is None else (lens.K, lens.distortion)
-    return np.array([K[0, 0], K[1, 1], K[0, 1], K[0, 2], K[1, 2], *distortion])
-
-
-def _split(P: Array) -> tuple[Array, Array]:
-    """P = λ K [R | t], K upper triangular with K[2, 2] = 1: K (3, 3) and R (3, 3). The world lies before the camera."""
-    M = P[:, :3] * np.sign(np.linalg.det(P[:, :3]))
-    Q, U = np.linalg.qr(np.flipud(M).T)
-    K, R = np.fliplr(np.flipud(U.T)), np.flipud(Q.T)
-    signs = np.diag(np.sign(np.diag(K)))
-    K = K @ signs
-    return K / K[2, 2], signs @ R
-
-
-def _pose(P: Array, lens: Intrinsics | None) -> tuple[Array, Array]:
-    """Rotation and translation nearest to a projection, with the lens's own focal lengths."""
-    centre = -np.linalg.solve(P[:, :3], P[:, 3])
-    if lens is None:
-        R = _split(P)[1]
-        return R, -R @ centre
-    M = np.linalg.solve(lens.K_undistorted, P[:, :3])
-    U, _, Vt = np.linalg.svd(M * np.sign(np.linalg.det(M)))
-    R = U @ Vt
-    return R, -R @ centre
+    return Parameters.of(given.camera).inner, information, free
 
 
 def _require_dots(ids: tuple[str, ...], part: Problem) -> None:
@@ -284,14 +257,8 @@ def _adjusted(
     given: CameraCalibration, number: int, problem: Problem, kept: NDArray[np.bool_], state: State
 ) -> CameraCalibration:
     """One camera's calibration after the adjustment."""
-    fx, fy, s, cx, cy = state.inner[number, :5]
-    K = np.array([[fx, s, cx], [0, fy, cy], [0, 0, 1.0]])
-    size = given.camera.size
-    lens = None if given.camera.intrinsics is None else Intrinsics(K, state.inner[number, 5:], size)
-    P = (K if lens is None else lens.K_undistorted) @ np.column_stack(
-        [state.rotation[number], state.translation[number]]
-    )
-    camera = Camera(given.camera.id, P / P[2, 3], size, lens)
+    found = Parameters(state.inner[number], state.rotation[number], state.translation[number])
+    camera = found.camera(given.camera)
     own = problem.camera == number
     keep = kept[own]
     dot = problem.dot[own & kept]

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.calibration.parameters import lens_jacobians
 from processing.camera import Intrinsics
 from processing.errors import ComputationError, InputError
 
@@ -219,30 +220,13 @@ def _jacobians(state: State, board: Array) -> tuple[Array, Array, Array]:
 
     The pose moves as ``R ← exp([ω]×) R``, ``t ← t + τ``, six parameters (ω, τ).
     """
-    px, rotated, camera, xy = _project(state, board)
-    lens = _intrinsics(state[0], (1, 1))
-    x, y = xy[..., 0], xy[..., 1]
-    r2 = x * x + y * y
-    distorted = lens.distort_normalised(xy)
-    to_px = lens.K[:2, :2]
-
-    inner = np.zeros((*px.shape, 10))
-    inner[..., 0, 0], inner[..., 1, 1], inner[..., 0, 2] = distorted[..., 0], distorted[..., 1], distorted[..., 1]
-    inner[..., 0, 3] = inner[..., 1, 4] = 1.0
-    by_lens = np.stack(
-        [
-            np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3], axis=-1),
-            np.stack([y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3], axis=-1),
-        ],
-        axis=-2,
-    )
-    inner[..., 5:] = to_px @ by_lens
-
+    _, rotated, camera, xy = _project(state, board)
+    px, inner, by_ideal = lens_jacobians(_intrinsics(state[0], (1, 1)), xy)
     z = camera[..., 2]
     by_point = np.zeros((*z.shape, 2, 3))
     by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / z
-    by_point[..., 0, 2], by_point[..., 1, 2] = -x / z, -y / z
-    by_point = to_px @ lens._jacobian_normalised(xy) @ by_point
+    by_point[..., 0, 2], by_point[..., 1, 2] = -xy[..., 0] / z, -xy[..., 1] / z
+    by_point = by_ideal @ by_point
     pose = np.concatenate([np.cross(rotated[..., None, :], by_point), by_point], axis=-1)
     return px, inner, pose
 
