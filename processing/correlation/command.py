@@ -68,7 +68,7 @@ def correlate_files(
             "check that both images show the same surface in focus"
         )
     write_points(out, result, faces)
-    seconds = {**result.seconds, "prepare": preparing}
+    seconds = {**result.seconds, "prepare": preparing + result.seconds["prepare"]}
     return {
         "points": len(xy),
         "good": int(result.good.sum()),

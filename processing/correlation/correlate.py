@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from processing.correlation import kernels
 from processing.correlation.features import feature_starts
-from processing.correlation.prepared import Current, Reference
+from processing.correlation.prepared import Current, Reference, prepare_current, prepare_reference
 from processing.correlation.propagation import Field, Progress, refine
 from processing.correlation.seeds import flow_starts, search_starts, spread
 from processing.correlation.settings import CorrelationSettings
@@ -87,24 +87,32 @@ def correlate(
     xy = np.ascontiguousarray(xy, dtype=np.float64)
     if current.degree != settings.degree:
         raise InputError(f"the current image was prepared for degree {current.degree}, not {settings.interpolation}")
+    if {reference.precision, current.precision} != {settings.precision} or reference.degree != settings.degree:
+        raise InputError("the images were prepared for another tolerance or interpolation; prepare them again")
     if xy.ndim != 2 or xy.shape[1] != 2 or not len(xy):
         raise InputError("there is no point to correlate; check the mask and the step")
     with on_threads(threads):
         load_kernels()
+        began = time.perf_counter()
+        assert reference.slopes  # computed when first asked for
+        seconds = {"prepare": time.perf_counter() - began, "start": 0.0, "refine": 0.0}
         points = Field(reference, current, xy, settings, progress)
-        seconds = {"prepare": reference.seconds + current.seconds, "start": 0.0, "refine": 0.0}
         if start is None:
             _match_automatically(points, seconds)
         else:
             _match_from(points, _parameters(start, len(xy)), seconds)
+    seconds["prepare"] += points.filtering
+    seconds["refine"] -= points.filtering
     return _result(points, seconds)
 
 
 def load_kernels() -> None:
     """Compile or load the kernels, so that no timing contains it."""
-    tiny = np.zeros((8, 8))
-    image = Reference(tiny, np.zeros(2), tiny, tiny, tiny, np.zeros((14, 14)), np.ones((8, 8), bool), 255.0)
-    refine(image, Current(tiny, np.zeros(2), np.zeros((14, 14)), 5), np.full((1, 2), 4.0), np.zeros((1, 12)), _TINY)
+    tiny = np.zeros((16, 16))
+    refine(
+        prepare_reference(tiny, None, _TINY), prepare_current(tiny, None, _TINY),
+        np.full((1, 2), 4.0), np.zeros((1, kernels.N_PARAMETERS)), _TINY,
+    )  # fmt: skip
 
 
 _TINY = CorrelationSettings(radius=2)
@@ -126,11 +134,13 @@ def _match_automatically(points: Field, seconds: dict[str, float]) -> None:
         trial = _try_seeds(points, seeds, method)
         share = float(trial.good.sum() / max((trial.status != Status.NO_TEXTURE).sum(), 1))
         log.debug("%s: %d of %d seeds hold", name, int(trial.good.sum()), len(seeds))
-        seconds["start"] += time.perf_counter() - began
+        seconds["start"] += time.perf_counter() - began - trial.filtering
+        seconds["prepare"] += trial.filtering
         if share < _TRUSTED:
             doubtful.append((share, seeds, trial))
             continue
         points.adopt(seeds, trial)
+        points.region = points.region or trial.region
         _carry_on(points, seconds)
     for _, seeds, trial in sorted(doubtful, key=lambda entry: -entry[0]):
         if len(_open(points)) > (1.0 - _ENOUGH) * _worth(points):
@@ -210,7 +220,7 @@ def usable_threads(count: int | None) -> int:
 
 @contextmanager
 def on_threads(count: int | None) -> Iterator[None]:
-    """Run what follows on so many threads; all cores for None."""
+    """Inside, the kernels run on so many threads; all cores for None."""
     before = numba.get_num_threads()
     if count is not None and count < 1:
         raise InputError(f"the number of threads must be at least 1, not {count}")

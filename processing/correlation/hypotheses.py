@@ -34,9 +34,10 @@ def search_hypotheses(
         raise ValueError(f"warps must be (n, K, 6) for xy (n, 2), not {warps.shape} for {xy.shape}")
     score = np.empty((n, count))
     _score(
-        reference.grey,
+        reference.image,
         reference.mask,
-        np.ascontiguousarray(xy - reference.origin),
+        reference.box[0],
+        reference.box[1],
         current.image,
         np.ascontiguousarray(xy, dtype=np.float64),
         np.ascontiguousarray(warps, dtype=np.float64),
@@ -53,24 +54,24 @@ def search_hypotheses(
 
 
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath={"contract", "reassoc", "arcp", "nsz"})
-def _score(grey, mask, at, image, xy, warps, radius, stride, score):  # type: ignore[no-untyped-def]
+def _score(grey, mask, left_of_mask, top_of_mask, image, xy, warps, radius, stride, score):  # type: ignore[no-untyped-def]
     """ZNCC (n, K) of every warp; -1 where the subset leaves either image or the warp is NaN. Bilinear in the current.
 
-    at : (n, 2) the points in the crop ``grey``; xy : (n, 2) in the whole images.
+    grey, image : the whole images, xy : (n, 2) px in them; mask : (h, w) of the box whose corner is given.
     """
     height, width = image.shape
-    for k in nb.prange(at.shape[0]):
-        jx, iy = math.floor(at[k, 0] + 0.5), math.floor(at[k, 1] + 0.5)
-        off_x, off_y = jx - at[k, 0], iy - at[k, 1]
+    for k in nb.prange(xy.shape[0]):
+        jx, iy = math.floor(xy[k, 0] + 0.5), math.floor(xy[k, 1] + 0.5)
+        off_x, off_y = jx - xy[k, 0], iy - xy[k, 1]
         px = np.empty((3, (2 * (radius // stride) + 1) ** 2))
         n = 0
         for dy in range(-(radius // stride) * stride, radius + 1, stride):
             for dx in range(-(radius // stride) * stride, radius + 1, stride):
-                i, j = iy + dy, jx + dx
-                if dx * dx + dy * dy > radius * radius or i < 0 or j < 0 or i >= grey.shape[0] or j >= grey.shape[1]:
+                i, j = iy + dy - top_of_mask, jx + dx - left_of_mask
+                if dx * dx + dy * dy > radius * radius or i < 0 or j < 0 or i >= mask.shape[0] or j >= mask.shape[1]:
                     continue
                 if mask[i, j]:
-                    px[0, n], px[1, n], px[2, n] = dx + off_x, dy + off_y, grey[i, j]
+                    px[0, n], px[1, n], px[2, n] = dx + off_x, dy + off_y, grey[iy + dy, jx + dx]
                     n += 1
         mean = np.sum(px[2, :n]) / max(n, 1)
         px[2, :n] -= mean

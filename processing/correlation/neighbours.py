@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
@@ -33,14 +31,30 @@ def neighbours(xy: Array, step: float) -> NDArray[np.int64]:
 
 def predicted(xy: Array, parameters: Array, source: NDArray[np.int64], target: NDArray[np.int64]) -> Array:
     """Parameters (k, 12) of target points extrapolated from source points with their derivatives."""
-    out = parameters[source].copy()
+    out = parameters[source]
     d = xy[target] - xy[source]
     dx, dy = d[:, 0], d[:, 1]
     for at in (0, 6):
-        p = parameters[source, at : at + 6].T
-        out[:, at] = p[0] + p[1] * dx + p[2] * dy + 0.5 * p[3] * dx**2 + p[4] * dx * dy + 0.5 * p[5] * dy**2
-        out[:, at + 1] = p[1] + p[3] * dx + p[4] * dy
-        out[:, at + 2] = p[2] + p[4] * dx + p[5] * dy
+        p = parameters.T[at : at + 6, source]
+        out[:, at] += p[1] * dx + p[2] * dy + 0.5 * p[3] * dx**2 + p[4] * dx * dy + 0.5 * p[5] * dy**2
+        out[:, at + 1] += p[3] * dx + p[4] * dy
+        out[:, at + 2] += p[4] * dx + p[5] * dy
+    return out
+
+
+def _expected(xy: Array, parameters: Array, use: NDArray[np.bool_], near: NDArray[np.int64]) -> Array:
+    """What each neighbour in use expects of the displacement of each point; NaN of the others. (n, k, 2)."""
+    source = np.maximum(near, 0)
+    d = xy[:, None] - xy[source]
+    dx, dy = np.where(use, d[..., 0], np.nan), d[..., 1]
+    half_xx, xy_, half_yy = 0.5 * dx * dx, dx * dy, 0.5 * dy * dy
+    curved = bool(np.any(parameters[:, [3, 4, 5, 9, 10, 11]]))
+    out = np.empty((*near.shape, 2))
+    for axis, at in enumerate((0, 6)):
+        p = np.ascontiguousarray(parameters[:, at : at + 6].T)
+        out[..., axis] = p[0][source] + p[1][source] * dx + p[2][source] * dy
+        if curved:
+            out[..., axis] += p[3][source] * half_xx + p[4][source] * xy_ + p[5][source] * half_yy
     return out
 
 
@@ -49,14 +63,12 @@ def inconsistent(xy: Array, parameters: Array, good: NDArray[np.bool_], near: ND
 
     The median of affine predictions is the robust local fit: half the neighbours may be wrong.
     """
-    n, k = near.shape
     use = (near >= 0) & good[near] & good[:, None]
-    prediction = np.full((n, k, 2), np.nan)
-    target, slot = np.nonzero(use)
-    prediction[target, slot] = predicted(xy, parameters, near[target, slot], target)[:, [0, 6]]
-    with warnings.catch_warnings():  # a point without neighbours has no median
-        warnings.simplefilter("ignore", RuntimeWarning)
-        median = np.nanmedian(prediction, axis=1)
+    prediction = _expected(xy, parameters, use, near)
+    # NaN sorts last, so the median of the m others lies at their middle; a point without any has none.
+    ranked, m = np.sort(prediction, axis=1), use.sum(axis=1)
+    rows = np.arange(len(xy))
+    median = 0.5 * (ranked[rows, np.maximum(m - 1, 0) // 2] + ranked[rows, np.minimum(m // 2, near.shape[1] - 1)])
     jump = np.hypot(*(parameters[:, [0, 6]] - median).T)
     known = good & np.isfinite(jump)
     scatter = 1.4826 * np.median(jump[known]) if known.any() else 0.0

@@ -2,69 +2,111 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.correlation.settings import CorrelationSettings
-from processing.correlation.spline import coefficients, gradients
+from processing.correlation.spline import PAD, REACH, coefficients, gradients
 from processing.errors import InputError
 
 Array = NDArray[np.float64]
+Levels = NDArray[np.floating]
 Box = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
 class Reference:
-    """A reference image: grey levels, gradients and coefficients of the box around its region of interest.
+    """A reference image and the box (x0, y0, x1, y1) of it around its region of interest, filtered when needed.
 
-    origin : (x, y) px of the box in the image; grey, gx, gy, mask : (h, w); coef : padded coefficients.
-    image : the whole image as it came; shape : its (height, width); grey_range : 255 or 65535.
+    image : the whole image as it came; mask : (h, w) bool, the region in the box; grey_range : 255 or 65535.
+    precision : float32, or float64 for a tolerance beyond it.
     """
 
     image: NDArray = field(repr=False)
-    origin: Array
-    grey: Array = field(repr=False)
-    gx: Array = field(repr=False)
-    gy: Array = field(repr=False)
-    coef: Array = field(repr=False)
+    box: Box
     mask: NDArray[np.bool_] = field(repr=False)
+    degree: int
+    precision: type
     grey_range: float
-    seconds: float = 0.0
 
     @property
     def shape(self) -> tuple[int, int]:
         """(height, width) of the whole image, px."""
         return self.image.shape[0], self.image.shape[1]
+
+    @property
+    def origin(self) -> Array:
+        """(x, y) px of the box in the image."""
+        return np.array(self.box[:2], dtype=np.float64)
+
+    @cached_property
+    def grey(self) -> Levels:
+        """Grey levels of the box. (h, w)."""
+        return _crop(self.image, self.box, self.precision)
+
+    @cached_property
+    def slopes(self) -> tuple[Levels, Levels]:
+        """∂/∂x and ∂/∂y of the box, two (h, w)."""
+        return gradients(self.grey, self.degree)
+
+    @cached_property
+    def coef(self) -> Levels:
+        """Padded coefficients of the box; only points between the pixels need them."""
+        return coefficients(self.grey, self.degree)
 
 
 @dataclass(frozen=True)
 class Current:
-    """A current image: padded coefficients of a box of it, the box's origin (x, y), and the image as it came."""
+    """A current image as it came, and the box (x0, y0, x1, y1) of it where matches can lie, filtered when needed."""
 
     image: NDArray = field(repr=False)
-    origin: Array
-    coef: Array = field(repr=False)
+    box: Box
     degree: int
-    seconds: float = 0.0
+    precision: type
 
     @property
     def shape(self) -> tuple[int, int]:
         """(height, width) of the whole image, px."""
         return self.image.shape[0], self.image.shape[1]
+
+    @property
+    def origin(self) -> Array:
+        """(x, y) px of the box in the image."""
+        return np.array(self.box[:2], dtype=np.float64)
+
+    @cached_property
+    def coef(self) -> Levels:
+        """Padded coefficients of the box, those of the whole image: the filter sees the pixels around."""
+        x0, y0, x1, y1 = self.box
+        wider = _clip((x0 - REACH, y0 - REACH, x1 + REACH, y1 + REACH), self.image.shape)
+        left, top = x0 - wider[0], y0 - wider[1]
+        filtered = coefficients(_crop(self.image, wider, self.precision), self.degree)
+        return np.ascontiguousarray(filtered[top : top + y1 - y0 + 2 * PAD, left : left + x1 - x0 + 2 * PAD])
+
+    def around(self, positions: Array, margin: float) -> Current:
+        """The same with the box no larger than the positions (k, 2) px and a margin about them."""
+        low, high = np.floor(positions.min(axis=0) - margin), np.ceil(positions.max(axis=0) + margin) + 1
+        x0, y0, x1, y1 = self.box
+        box = (
+            max(x0, min(int(low[0]), x1 - 8)), max(y0, min(int(low[1]), y1 - 8)),
+            min(x1, max(int(high[0]), x0 + 8)), min(y1, max(int(high[1]), y0 + 8)),
+        )  # fmt: skip
+        if (box[2] - box[0]) * (box[3] - box[1]) > 0.7 * (x1 - x0) * (y1 - y0):
+            return self
+        return Current(self.image, box, self.degree, self.precision)
 
 
 def prepare_reference(
     image: NDArray, mask: NDArray[np.bool_] | None = None, settings: CorrelationSettings | None = None
 ) -> Reference:
-    """Filter the reference image (h, w), 8 or 16 bits or float, inside the box of its mask (h, w) bool.
+    """The reference image (h, w), 8 or 16 bits or float, and the box of its mask (h, w) bool.
 
     Without a mask all pixels take part. InputError for an empty mask or one of another size.
     """
     settings = settings or CorrelationSettings()
-    began = time.perf_counter()
     _check_image(image, "reference")
     mask = np.ones(image.shape, bool) if mask is None else np.asarray(mask, bool)
     if mask.shape != image.shape:
@@ -75,37 +117,23 @@ def prepare_reference(
     columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
     if not len(columns):
         raise InputError("the mask marks no pixel; paint the region of interest white")
-    # The mirrored border is not the image: keep the reach of the filter around the mask.
-    margin = 2 + 32
+    margin = 2 + REACH  # the mirrored border is not the image: keep the reach of the filter around the mask
     box = _clip((columns[0] - margin, rows[0] - margin, columns[-1] + 1 + margin, rows[-1] + 1 + margin), image.shape)
-    grey = _crop(image, box)
-    gx, gy = gradients(grey, settings.degree)
-    return Reference(
-        image=image,
-        origin=np.array(box[:2], dtype=np.float64),
-        grey=grey,
-        gx=gx,
-        gy=gy,
-        coef=coefficients(grey, settings.degree),
-        mask=np.ascontiguousarray(mask[box[1] : box[3], box[0] : box[2]]),
-        grey_range=_grey_range(image),
-        seconds=time.perf_counter() - began,
-    )
+    region = np.ascontiguousarray(mask[box[1] : box[3], box[0] : box[2]])
+    return Reference(image, box, region, settings.degree, settings.precision, _grey_range(image))
 
 
 def prepare_current(image: NDArray, roi: Box | None = None, settings: CorrelationSettings | None = None) -> Current:
-    """Filter the current image (h, w), or a box (x0, y0, x1, y1; ends exclusive) of it where matches can lie.
+    """The current image (h, w), or a box (x0, y0, x1, y1; ends exclusive) of it where matches can lie.
 
     A subset that leaves the box is lost as if it left the image.
     """
     settings = settings or CorrelationSettings()
-    began = time.perf_counter()
     _check_image(image, "current")
     box = _clip(roi or (0, 0, image.shape[1], image.shape[0]), image.shape)
     if box[2] - box[0] < 8 or box[3] - box[1] < 8:
         raise InputError(f"the box {roi} of the current image is empty or lies outside it")
-    coef = coefficients(_crop(image, box), settings.degree)
-    return Current(image, np.array(box[:2], dtype=np.float64), coef, settings.degree, time.perf_counter() - began)
+    return Current(image, box, settings.degree, settings.precision)
 
 
 def as_8_bit(image: NDArray) -> NDArray[np.uint8]:
@@ -126,8 +154,8 @@ def _clip(box: Box, shape: tuple[int, ...]) -> Box:
     return max(int(box[0]), 0), max(int(box[1]), 0), min(int(box[2]), shape[1]), min(int(box[3]), shape[0])
 
 
-def _crop(image: NDArray, box: Box) -> Array:
-    return np.ascontiguousarray(image[box[1] : box[3], box[0] : box[2]], dtype=np.float64)
+def _crop(image: NDArray, box: Box, precision: type) -> Levels:
+    return np.ascontiguousarray(image[box[1] : box[3], box[0] : box[2]], dtype=precision)
 
 
 def _check_image(image: NDArray, name: str) -> None:

@@ -8,6 +8,7 @@ the input: not on threads, not on timing.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -34,6 +35,8 @@ class Field:
     """The state of all points while they are being matched; arrays over n points.
 
     parameters (n, 12) as in ``kernels``; tried : (n, 8) bool, neighbours a start value was taken from.
+    region : the part of the current image in use, chosen by the first start values, grown when a point lies beyond.
+    filtering : seconds spent on filtering it.
     """
 
     reference: Reference
@@ -41,6 +44,8 @@ class Field:
     xy: Array
     settings: CorrelationSettings
     progress: Progress | None = None
+    region: Current | None = None
+    filtering: float = 0.0
     near: NDArray[np.int64] = field(init=False)
     parameters: Array = field(init=False)
     status: NDArray[np.int64] = field(init=False)
@@ -71,9 +76,16 @@ class Field:
 
         A result must look alike (ZNCC) and lie within a step of its start value.
         """
-        status, zncc, iterations, sigma, found = refine(
-            self.reference, self.current, self.xy[index], start, self.settings
-        )
+        part = self.region if self.region is not None else self.current.around(*self._reached(start, index))
+        self._filter(part)
+        status, zncc, iterations, sigma, found = refine(self.reference, part, self.xy[index], start, self.settings)
+        beyond = np.flatnonzero(status == Status.OUTSIDE)
+        if part is not self.current and len(beyond):  # of the region, but perhaps not of the image
+            part = self.current
+            self._filter(part)
+            again = refine(self.reference, part, self.xy[index[beyond]], start[beyond], self.settings)
+            status[beyond], zncc[beyond], iterations[beyond], sigma[beyond], found[beyond] = again
+        self.region = part
         limit = self.settings.zncc_min if zncc_min is None else zncc_min
         jump = np.hypot(found[:, 0] - start[:, 0], found[:, 6] - start[:, 6])
         settled = status == Status.GOOD
@@ -88,6 +100,26 @@ class Field:
         if self.progress is not None:
             self.progress(int(self.good.sum()), len(self.xy))
         return keep
+
+    def _filter(self, part: Current) -> None:
+        began = time.perf_counter()
+        assert part.coef.size  # computed when first asked for
+        self.filtering += time.perf_counter() - began
+
+    def _reached(self, start: Array, index: NDArray[np.int64]) -> tuple[Array, float]:
+        """Where the points will lie, judged by the first start values, (k, 2) px, and a margin about that.
+
+        The region of interest moved and stretched as a whole by an affine fit of the start values.
+        """
+        known = np.isfinite(start).all(axis=1)
+        at = self.xy[index[known]]
+        to = at + start[known][:, [0, 6]]
+        margin = 3.0 * self.settings.radius + 32.0
+        if len(at) < 8:
+            return np.array([[0.0, 0.0], [self.current.shape[1], self.current.shape[0]]]), margin
+        A = np.concatenate([np.ones((len(at), 1)), at], axis=1)
+        fit = np.linalg.lstsq(A, to, rcond=None)[0]
+        return np.concatenate([to, fit[0] + self.xy @ fit[1:]]), margin
 
     def adopt(self, index: NDArray[np.int64], other: Field) -> None:
         """Take over the good points of another field, whose points are ``index`` (k,) here, where still open."""
@@ -152,23 +184,24 @@ class Field:
 def bare_points(reference: Reference, xy: Array, settings: CorrelationSettings) -> NDArray[np.bool_]:
     """Points (n,) with clearly too little texture about them, seen at once for all: no start value is sought there.
 
-    The weaker eigenvalue of the structure tensor over the square about the point; the kernel judges the subset itself.
+    The weaker eigenvalue of the structure tensor over the square about the point, from a sample of its pixels; the
+    kernel judges the subset itself.
     """
-    size = (2 * settings.radius + 1,) * 2
-    inside = reference.mask.astype(np.float64)
-    at = np.rint(xy - reference.origin).astype(np.int64)
+    thin = max(settings.radius // 8, 1)
+    size = (2 * (settings.radius // thin) + 1,) * 2
+    sampled = np.s_[::thin, ::thin]
+    inside = reference.mask[sampled].astype(np.float32)
+    gx, gy = (slope[sampled].astype(np.float32) * inside for slope in reference.slopes)
+    at = np.rint((xy - reference.origin) / thin).astype(np.int64)
     h, w = inside.shape
     column, row = np.clip(at[:, 0], 0, w - 1), np.clip(at[:, 1], 0, h - 1)
 
-    def mean(values: Array) -> Array:
-        filtered = cv2.boxFilter(values * inside, cv2.CV_64F, size, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray(filtered, dtype=np.float64)[row, column]
+    def mean(values: NDArray[np.float32]) -> Array:
+        filtered = cv2.boxFilter(values, -1, size, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(filtered[row, column], dtype=np.float64)
 
-    share = np.maximum(mean(inside), 1e-9)
-    xx, xy_, yy = (
-        mean(a * b) / share
-        for a, b in ((reference.gx, reference.gx), (reference.gx, reference.gy), (reference.gy, reference.gy))
-    )
+    share = np.maximum(mean(inside), 1e-6)
+    xx, xy_, yy = mean(gx * gx) / share, mean(gx * gy) / share, mean(gy * gy) / share
     weakest = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy_**2)
     limit = 0.7 * settings.texture_min * reference.grey_range / 255.0
     return np.asarray(weakest < limit**2)
@@ -197,12 +230,12 @@ def refine(
     status = np.full(n, Status.NOT_REACHED, np.int64)
     zncc, sigma = np.full(n, np.nan), np.full((n, 2), np.nan)
     iterations = np.zeros(n, np.int64)
+    between = bool(np.any(xy != np.rint(xy)))
     kernels.refine(
         reference.grey,
-        reference.gx,
-        reference.gy,
-        reference.coef,
-        reference.mask,
+        *reference.slopes,
+        reference.coef if between else np.zeros((1, 1), settings.precision),
+        reference.mask.view(np.uint8),
         reference.origin,
         current.coef,
         current.origin,

@@ -144,7 +144,7 @@ def test_contrast_and_offset_do_not_matter():
     result, changed = match(reference, current), match(reference, 0.4 * current + 60.0)
     assert changed.good.all()
     np.testing.assert_allclose(changed.uv, result.uv, atol=1e-6)
-    np.testing.assert_allclose(changed.zncc, result.zncc, atol=1e-9)
+    np.testing.assert_allclose(changed.zncc, result.zncc, atol=1e-6)  # single precision
 
 
 def test_threads_do_not_change_a_bit():

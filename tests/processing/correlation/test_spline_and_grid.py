@@ -5,8 +5,8 @@ import pytest
 from scipy import ndimage
 
 from processing.correlation import grid
-from processing.correlation.kernels import compose_inverse, compose_inverse_affine
 from processing.correlation.spline import PAD, coefficients, gradients
+from processing.correlation.warps import compose_inverse, compose_inverse_affine
 
 
 @pytest.mark.parametrize("degree", [3, 5])

@@ -1,0 +1,104 @@
+"""Normal equations and warps: a Cholesky factor, and the inverse composition of two warps. Double precision.
+
+The 12 parameters of a warp are those of ``kernels``. The inverse-compositional scheme is Baker & Matthews (2004), its
+second-order composition Gao et al. (2015).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+
+
+@nb.njit(cache=True)
+def cholesky(H, n):  # type: ignore[no-untyped-def]
+    """H (n, n) to its lower factor in place; False where it is not positive definite."""
+    for i in range(n):
+        for j in range(i + 1):
+            total = H[i, j]
+            for k in range(j):
+                total -= H[i, k] * H[j, k]
+            if i == j:
+                if not total > 1e-14 * abs(H[i, i]):
+                    return False
+                H[i, i] = math.sqrt(total)
+            else:
+                H[i, j] = total / H[j, j]
+    return True
+
+
+@nb.njit(cache=True)
+def solve(L, b, n):  # type: ignore[no-untyped-def]
+    """x of L Lᵀ x = b, in place of b."""
+    for i in range(n):
+        for k in range(i):
+            b[i] -= L[i, k] * b[k]
+        b[i] /= L[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            b[i] -= L[k, i] * b[k]
+        b[i] /= L[i, i]
+
+
+@nb.njit(cache=True)
+def _warp_matrix(p, M):  # type: ignore[no-untyped-def]
+    """The warp as a matrix (6, 6) acting on (x², xy, y², x, y, 1), third powers dropped (Gao et al. 2015)."""
+    u, ux, uy, uxx, uxy, uyy = p[0], 1.0 + p[1], p[2], p[3], p[4], p[5]
+    v, vx, vy, vxx, vxy, vyy = p[6], p[7], 1.0 + p[8], p[9], p[10], p[11]
+    M[0, 0], M[0, 1], M[0, 2] = ux * ux + u * uxx, 2 * (ux * uy + u * uxy), uy * uy + u * uyy
+    M[0, 3], M[0, 4], M[0, 5] = 2 * u * ux, 2 * u * uy, u * u
+    M[1, 0], M[1, 1] = 0.5 * (v * uxx + u * vxx) + ux * vx, v * uxy + u * vxy + ux * vy + uy * vx
+    M[1, 2] = 0.5 * (v * uyy + u * vyy) + uy * vy
+    M[1, 3], M[1, 4], M[1, 5] = v * ux + u * vx, u * vy + v * uy, u * v
+    M[2, 0], M[2, 1], M[2, 2] = vx * vx + v * vxx, 2 * (vx * vy + v * vxy), vy * vy + v * vyy
+    M[2, 3], M[2, 4], M[2, 5] = 2 * v * vx, 2 * v * vy, v * v
+    M[3, 0], M[3, 1], M[3, 2], M[3, 3], M[3, 4], M[3, 5] = 0.5 * uxx, uxy, 0.5 * uyy, ux, uy, u
+    M[4, 0], M[4, 1], M[4, 2], M[4, 3], M[4, 4], M[4, 5] = 0.5 * vxx, vxy, 0.5 * vyy, vx, vy, v
+    M[5, 0], M[5, 1], M[5, 2], M[5, 3], M[5, 4], M[5, 5] = 0.0, 0.0, 0.0, 0.0, 0.0, 1.0
+
+
+@nb.njit(cache=True)
+def compose_inverse(p, d, A, B):  # type: ignore[no-untyped-def]
+    """p ← p ∘ d⁻¹ for small d; False where d cannot be inverted. A, B : (6, 6) scratch.
+
+    The two rows x', y' of W(p) W(d)⁻¹ solve W(d)ᵀ m = rowᵀ.
+    """
+    _warp_matrix(d, A)
+    _warp_matrix(p, B)
+    for col in range(6):  # elimination on Aᵀ; near the identity, so no pivoting
+        pivot = A[col, col]
+        if not abs(pivot) > 1e-6:
+            return False
+        for row in range(col + 1, 6):
+            factor = A[col, row] / pivot  # Aᵀ[row, col]
+            for k in range(col, 6):
+                A[k, row] -= factor * A[k, col]
+            B[3, row] -= factor * B[3, col]
+            B[4, row] -= factor * B[4, col]
+    for row in range(5, -1, -1):
+        for r in (3, 4):
+            total = B[r, row]
+            for k in range(row + 1, 6):
+                total -= A[k, row] * B[r, k]
+            B[r, row] = total / A[row, row]
+    p[0], p[1], p[2], p[3], p[4], p[5] = B[3, 5], B[3, 3] - 1.0, B[3, 4], 2 * B[3, 0], B[3, 1], 2 * B[3, 2]
+    p[6], p[7], p[8], p[9], p[10], p[11] = B[4, 5], B[4, 3], B[4, 4] - 1.0, 2 * B[4, 0], B[4, 1], 2 * B[4, 2]
+    return True
+
+
+@nb.njit(cache=True)
+def compose_inverse_affine(p, d):  # type: ignore[no-untyped-def]
+    """p ← p ∘ d⁻¹ of first order, exactly; second derivatives of p stay. False where d cannot be inverted."""
+    a, b, c, e = 1.0 + d[1], d[2], d[7], 1.0 + d[8]
+    det = a * e - b * c
+    if not abs(det) > 1e-6:
+        return False
+    ia, ib, ic, ie = e / det, -b / det, -c / det, a / det
+    tx, ty = -(ia * d[0] + ib * d[6]), -(ic * d[0] + ie * d[6])
+    ux, uy, vx, vy = 1.0 + p[1], p[2], p[7], 1.0 + p[8]
+    p[0] += ux * tx + uy * ty
+    p[6] += vx * tx + vy * ty
+    p[1], p[2] = ux * ia + uy * ic - 1.0, ux * ib + uy * ie
+    p[7], p[8] = vx * ia + vy * ic, vx * ib + vy * ie - 1.0
+    return True

@@ -1,0 +1,135 @@
+"""The fast kernel against plain arithmetic in double precision, and against the bound that noise sets."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from processing.correlation import CorrelationSettings, correlate, grid, prepare_current, prepare_reference
+from processing.correlation.propagation import refine
+from processing.correlation.spline import PAD, coefficients, gradients
+
+_SPEC = importlib.util.spec_from_file_location("double_precision", Path(__file__).with_name("double_precision.py"))
+double_precision = importlib.util.module_from_spec(_SPEC)
+sys.modules["double_precision"] = double_precision  # where numba looks for it
+_SPEC.loader.exec_module(double_precision)
+
+SIZE = 200
+COLUMNS = [0, 6, 1, 2, 7, 8]
+
+
+@pytest.fixture(scope="module")
+def speckle():
+    noise = cv2.GaussianBlur(np.random.default_rng(3).normal(size=(SIZE, SIZE)), (0, 0), 1.6)
+    return 120.0 + 45.0 * noise / noise.std()
+
+
+def warped(image, gradient, shift, curvature=0.0):
+    """The image deformed about its middle, whole grey levels with a noise of 1.5."""
+    y, x = np.mgrid[:SIZE, :SIZE].astype(np.float64)
+    middle = (SIZE - 1) / 2
+    back = np.linalg.inv(np.eye(2) + gradient)
+    dx, dy = x - middle - shift[0], y - middle - shift[1]
+    at_x = back[0, 0] * dx + back[0, 1] * dy + middle + curvature * dx * dx
+    at_y = back[1, 0] * dx + back[1, 1] * dy + middle - curvature * dx * dy
+    moved = cv2.remap(
+        image, at_x.astype(np.float32), at_y.astype(np.float32), cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT_101
+    )
+    return np.rint(moved + np.random.default_rng(4).normal(0, 1.5, moved.shape))
+
+
+def in_double_precision(reference, current, mask, xy, start, settings):
+    degree = settings.degree
+    trim = PAD - 3
+    cut = np.s_[trim:-trim, trim:-trim]
+    gx, gy = gradients(reference, degree)
+    coefs = [np.ascontiguousarray(coefficients(i, degree)[cut]) for i in (reference, current)]
+    n, p = len(xy), start.copy()
+    status, zncc, iterations, sigma = np.zeros(n, np.int64), np.zeros(n), np.zeros(n, np.int64), np.zeros((n, 2))
+    double_precision.refine(
+        reference, gx, gy, coefs[0], mask, np.zeros(2), coefs[1], np.zeros(2), xy, p, np.ones(n, bool),
+        settings.radius, settings.subset == "circle", 3 * settings.order, degree == 5, settings.tolerance,
+        settings.max_iterations, settings.texture_min, 0.0, status, zncc, iterations, sigma,
+    )  # fmt: skip
+    return status, zncc, p, sigma
+
+
+GENTLE = np.array([[0.012, -0.02], [0.015, 0.008]])
+STEEP = np.array([[-0.35, 0.12], [0.06, 0.1]])
+
+
+@pytest.mark.parametrize("gradient", [GENTLE, STEEP], ids=["gentle", "steep"])
+@pytest.mark.parametrize(
+    ("interpolation", "order", "subset"),
+    [("cubic", 1, "circle"), ("cubic", 2, "circle"), ("quintic", 1, "square"), ("quintic", 2, "circle")],
+)
+def test_single_precision_gives_the_matches_of_double(speckle, gradient, interpolation, order, subset):
+    settings = CorrelationSettings(14, 11, order, subset, interpolation, tolerance=1e-6)
+    reference, current = np.rint(speckle), warped(speckle, gradient, (3.3, -1.7), 2e-4)
+    mask = np.zeros((SIZE, SIZE), bool)
+    mask[40:160, 40:160] = True
+    mask[90:110, 70:95] = False
+    xy = grid(mask, settings.step)[0]
+    xy[::3] += [0.3, -0.45]  # between the pixels too
+    start = np.zeros((len(xy), 12))
+    start[:, [1, 2, 7, 8]] = gradient.ravel()
+    start[:, [0, 6]] = (xy - (SIZE - 1) / 2) @ gradient.T + [3.5, -1.5]
+    whole = np.ones((SIZE, SIZE), bool)
+    whole[90:110, 70:95] = False
+    prepared = prepare_reference(reference, whole, settings), prepare_current(current, None, settings)
+    status, zncc, _, sigma, found = refine(*prepared, xy, start, settings)
+    truth = in_double_precision(reference, current, whole, xy, start, settings)
+    good = truth[0] == 0
+    assert good.mean() > 0.9
+    np.testing.assert_array_equal(status == 0, good)
+    difference = np.abs(found - truth[2])[good]
+    print(f"{interpolation}, order {order}, {subset}: {difference[:, [0, 6]].max():.1e} px")
+    assert difference[:, [0, 6]].max() < 1e-5
+    assert difference[:, [1, 2, 7, 8]].max() < 1e-6
+    np.testing.assert_allclose(zncc[good], truth[1][good], atol=1e-6)
+    np.testing.assert_allclose(sigma[good], truth[3][good], rtol=1e-3)
+
+
+@pytest.mark.parametrize("interpolation", ["cubic", "quintic"])
+@pytest.mark.parametrize("radius", [10, 16, 20])
+def test_bias_and_scatter_of_shifts_stay_at_the_bound(radius, interpolation, figures):
+    """Shifts exact by Fourier's theorem; noise 1.5 grey levels; bound √2 σ √(H⁻¹)."""
+    rng = np.random.default_rng(radius)
+    size = 800
+    k = np.fft.fftfreq(size)
+    low_pass = np.exp(-2.0 * (np.pi * 2.0) ** 2 * (k[:, None] ** 2 + np.fft.rfftfreq(size)[None] ** 2))
+    spectrum = np.fft.rfft2(rng.normal(size=(size, size))) * low_pass
+    scene = np.fft.irfft2(spectrum, (size, size))
+    spectrum *= 45.0 / scene.std()
+    settings = CorrelationSettings(radius, 16, 1, interpolation=interpolation, tolerance=1e-3, noise=1.5)
+    mask = np.zeros((size, size), bool)
+    mask[32:-32, 32:-32] = True
+    xy = grid(mask, settings.step)[0]
+    biases, scatters, least = [], [], []
+    for shift in np.arange(0.0, 1.01, 0.125):
+        turn = np.exp(-2j * np.pi * np.fft.rfftfreq(size)[None] * shift)
+        images = [
+            128.0 + np.fft.irfft2(s, (size, size)) + rng.normal(0, 1.5, (size, size))
+            for s in (spectrum, spectrum * turn)
+        ]
+        start = np.tile([shift, 0.0, 0.0, 0.0, 0.0, 0.0], (len(xy), 1))
+        result = correlate(
+            prepare_reference(images[0], mask, settings), prepare_current(images[1], None, settings), xy, settings,
+            start=start,
+        )  # fmt: skip
+        error = result.uv[:, 0] - shift
+        biases.append(np.nanmean(error))
+        scatters.append(np.nanstd(error))
+        least.append(np.sqrt(np.nanmean(result.sigma[:, 0] ** 2)))
+    slope = gradients(np.fft.irfft2(spectrum, (size, size)), 5)[0]
+    # The bound that the six free parameters leave; without the gradients it would be √2 σ / √Σ f_x², less by 2-10 %.
+    bound = np.sqrt(np.mean(np.square(least)))
+    sampling = np.sqrt(2) * 1.5 / np.sqrt(np.sum(slope[mask] ** 2))  # no mean over the image is better known
+    largest, ratio = np.abs(biases).max(), np.sqrt(np.mean(np.square(scatters))) / bound
+    figures(f"shifts, radius {radius}, {interpolation}: bias, 1e-3 px", f"{1e3 * largest:.2f}", "0.6")
+    figures(f"shifts, radius {radius}, {interpolation}: scatter / bound", f"{ratio:.3f}", "1.06")
+    assert largest < 0.6e-3 + 2 * sampling
+    assert ratio < 1.06
