@@ -10,7 +10,7 @@
         faces, pair, vertex_pair
         rigid_motion/R, t        per step, the motion that takes it back onto the reference
         cameras/<id>/            P, size, and K, distortion where the lens is known
-        matches/<k>/             2D matches of pair k: xy, px, c_ls, sigma, status, vertex
+        matches/<k>/             2D matches of a camera pair, or of a camera alone: xy, px, c_ls, sigma, status, vertex
         settings, calibration, summary    text: TOML, JSON, JSON
 
 What follows from the stored arrays is computed when it is read: a step takes about 75 bytes a point and 110 a triangle.
@@ -58,14 +58,15 @@ _CONSTANT = ("area", "pair")
 
 @dataclass(frozen=True)
 class Matches:
-    """2D matches of one camera pair at F steps.
+    """2D matches of a camera pair at F steps, or of a camera alone that followed its own points in time.
 
-    pair : ids, reference camera first. xy : (n, 2) px in the reference image. px : (F, 2, n, 2) in both
-    images. c_ls : (F, n). sigma : (F, 2, n, 2) px. status : (F, n), 0 good. vertex : (n,) index of the vertex, or -1.
-    seconds : time spent by stage.
+    cameras : the C ids, reference camera first. xy : (n, 2) px in the reference image. px : (F, C, n, 2) in their
+    images; of a camera alone the first is the match from another camera, xy the projected point it is followed from,
+    and the later ones are xy and the displacement since. c_ls : (F, n). sigma : (F, C, n, 2) px. status : (F, n), 0
+    good. vertex : (n,) index of the vertex, or -1. seconds : time spent by stage.
     """
 
-    pair: tuple[str, str]
+    cameras: tuple[str, ...]
     xy: Array
     px: Array
     c_ls: Array
@@ -75,8 +76,9 @@ class Matches:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        n, steps = len(self.xy), len(self.px)
-        expected = {"px": (steps, 2, n, 2), "c_ls": (steps, n), "sigma": (steps, 2, n, 2), "status": (steps, n)}
+        n, steps, views = len(self.xy), len(self.px), len(self.cameras)
+        in_images = (steps, views, n, 2)
+        expected = {"px": in_images, "c_ls": (steps, n), "sigma": in_images, "status": (steps, n)}
         _check(self, {**expected, "xy": (n, 2), "vertex": (n,)})
 
 
@@ -349,10 +351,11 @@ def _write_rest(own: h5py.Group, results: Results, ranges: Ranges) -> None:
             group["K"], group["distortion"] = camera.intrinsics.K, camera.intrinsics.distortion
     for k, matches in enumerate(results.matches):
         group = own.create_group(f"matches/{k}")
-        group.attrs["pair"] = json.dumps(matches.pair)
+        group.attrs["cameras"] = json.dumps(matches.cameras)
         group.attrs["seconds"] = json.dumps(matches.seconds)
         for name in ("xy", "px", "c_ls", "sigma", "status", "vertex"):
-            group[name] = getattr(matches, name)
+            values = np.asarray(getattr(matches, name))
+            group.create_dataset(name, data=values, compression="gzip", compression_opts=1, shuffle=True)
     own.require_group("matches")
 
 
@@ -420,6 +423,6 @@ def _read_camera(cameras: h5py.Group, name: str) -> Camera:
 
 
 def _read_matches(group: h5py.Group) -> Matches:
-    first, second = json.loads(group.attrs["pair"])
     arrays = {name: group[name][:] for name in ("xy", "px", "c_ls", "sigma", "status", "vertex")}
-    return Matches(pair=(first, second), seconds=json.loads(group.attrs["seconds"]), **arrays)
+    cameras = tuple(json.loads(group.attrs["cameras"]))
+    return Matches(cameras=cameras, seconds=json.loads(group.attrs["seconds"]), **arrays)

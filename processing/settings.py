@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from processing.errors import InputError
 
@@ -75,9 +75,13 @@ class CalibrationGroup(_Group):
 class SurfaceGroup(_Group):
     """How matches become a surface, and where the surface is looked for.
 
+    method : the surfaces of the camera pairs side by side (pairs), or one lattice over the surface whose points all
+    cameras measure together (global).
     radius_mm : of the cylinder from which the search sets out; 0 takes the target's.
     reach_mm : how far from it the surface may lie. incidence_deg : the steepest angle of view that is used.
     sigma_max_px : a point whose match has a larger standard deviation, where the speckle ends, is lost.
+    spacing_mm : of the lattice; 0 takes the correlation's step as the cameras see it. curvature : of the warps between
+    cameras, from the measured shape and held (geometry), or none.
     """
 
     method: Literal["pairs", "global"] = "pairs"
@@ -85,13 +89,19 @@ class SurfaceGroup(_Group):
     reach_mm: float = Field(default=20.0, gt=0)
     incidence_deg: float = Field(default=65.0, gt=0, lt=90)
     sigma_max_px: float = Field(default=0.05, gt=0)
+    spacing_mm: float = Field(default=0.0, ge=0)
+    curvature: Literal["geometry", "none"] = "geometry"
 
-    @field_validator("method")
-    @classmethod
-    def _available(cls, value: str) -> str:
-        if value == "global":
-            raise ValueError("'global' is not available in this version; use 'pairs'")
-        return value
+
+class TrackingGroup(_Group):
+    """How a camera follows its points in time; of the global method.
+
+    two_pass : second derivatives that the neighbours' displacements show are held in a second pass of first order.
+    update_reference : a point lost against the reference image is sought from the last image that showed it.
+    """
+
+    two_pass: bool = True
+    update_reference: bool = True
 
 
 class StrainGroup(_Group):
@@ -106,6 +116,7 @@ class Settings(_Group):
     correlation: CorrelationGroup = CorrelationGroup()
     calibration: CalibrationGroup = CalibrationGroup()
     surface: SurfaceGroup = SurfaceGroup()
+    tracking: TrackingGroup = TrackingGroup()
     strain: StrainGroup = StrainGroup()
 
     def to_toml(self) -> str:
@@ -114,6 +125,12 @@ class Settings(_Group):
         for group, values in self.model_dump().items():
             lines += [f"[{group}]", *(f"{name} = {_toml(value)}" for name, value in values.items()), ""]
         return "\n".join(lines)
+
+
+#: As the paper measured: cameras by the direct linear transformation, flat subsets, pair by pair.
+PAPER = Settings()
+#: The most exact: all cameras adjusted together, one surface with its own curvature, two passes in time.
+BEST = Settings(calibration=CalibrationGroup(method="bundle"), surface=SurfaceGroup(method="global"))
 
 
 def load_settings(path: Path | None = None, overrides: Sequence[str] = ()) -> Settings:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -12,7 +13,6 @@ from processing.calibration.quality import ReconstructionError
 from processing.mesh import Mesh
 from processing.results import Results
 from processing.ring import Ring
-from processing.surface import PairSurface
 
 Array = NDArray[np.float64]
 
@@ -21,10 +21,13 @@ def summarise(
     results: Results,
     ring: Ring,
     errors: dict[tuple[str, str], ReconstructionError],
-    surfaces: list[PairSurface],
+    drift: Mapping[str, Array],
     warnings: tuple[str, ...],
 ) -> dict[str, Any]:
-    """Counts, calibration quality and one row of figures a step, as JSON values; ``table`` is for the terminal."""
+    """Counts, calibration quality and one row of figures a step, as JSON values; ``table`` is for the terminal.
+
+    drift : (F,) px by pair or camera, the mean vertical residual of each step: cameras that moved between frames.
+    """
     steps = [_step(results, k) for k in range(len(results.steps))]
     control = {
         "mean_mm": _mean([error.mean for error in errors.values()]),
@@ -38,7 +41,7 @@ def summarise(
         "control_points": control,
         "cameras": [asdict(row) for row in ring.quality],
         "calibration": _calibration(ring),
-        "drift_px": {f"{s.matches.pair[0]}-{s.matches.pair[1]}": _finite(s.drift) for s in surfaces},
+        "drift_px": {who: _finite(values) for who, values in drift.items()},
         "steps": steps,
         "warnings": list(warnings),
     }

@@ -139,18 +139,19 @@ def _step(cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, step
         c_ls[one.camera, who] = one.c_ls[step, good]
         status[one.vertex[~good]] = one.status[step, ~good]
     points, used = triangulate_agreeing(cameras, px, sigma)
-    enough = np.isfinite(px[..., 0]).sum(axis=0) >= 2
-    lost = ~np.isfinite(points.xyz).all(axis=1)
+    enough: Mask = np.asarray(np.isfinite(px[..., 0]).sum(axis=0) >= 2)
+    lost: Mask = np.asarray(~np.isfinite(points.xyz).all(axis=1))
     status = np.where(lost, np.where(enough, Lost.RESIDUAL, status), 0).astype(np.int8)
     moved = np.where(lost[:, None], np.nan, points.xyz - shape.xyz)
-    status[surface_outliers(shape.node, moved, 1)] = Lost.SURFACE
-    good = status == 0
-    used &= good
+    status = np.where(surface_outliers(shape.node.astype(float), moved, 1), Lost.SURFACE, status)
+    measured: Mask = np.asarray(status == 0)
+    used &= measured
     motion.status[step] = status
-    motion.xyz[step] = np.where(good[:, None], points.xyz, np.nan)
-    motion.covariance[step] = np.where(good[:, None, None], points.covariance, np.nan)
-    motion.chi2[step], motion.degrees[step] = np.where(good, points.chi2, np.nan), np.where(good, points.degrees, 0)
-    motion.c_ls[step] = np.where(good, np.fmax.reduce(np.where(used, c_ls, np.nan), axis=0), np.nan)
+    motion.xyz[step] = np.where(measured[:, None], points.xyz, np.nan)
+    motion.covariance[step] = np.where(measured[:, None, None], points.covariance, np.nan)
+    motion.chi2[step] = np.where(measured, points.chi2, np.nan)
+    motion.degrees[step] = np.where(measured, points.degrees, 0)
+    motion.c_ls[step] = np.where(measured, np.fmax.reduce(np.where(used, c_ls, np.nan), axis=0), np.nan)
     for one in motion.tracks:
         one.used[step] = used[one.camera, one.vertex]
         at = one.vertex[one.used[step]]

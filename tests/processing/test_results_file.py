@@ -42,7 +42,7 @@ def a_result() -> Results:
     lens = Intrinsics(K, np.array([0.1, -0.2, 1e-4, 2e-4, 0.0]), (1640, 1232))
     n = 36
     matches = Matches(
-        pair=("201", "202"), xy=rng.uniform(0, 900, (n, 2)), px=rng.uniform(0, 900, (3, 2, n, 2)),
+        cameras=("201", "202"), xy=rng.uniform(0, 900, (n, 2)), px=rng.uniform(0, 900, (3, 2, n, 2)),
         c_ls=rng.uniform(0, 0.1, (3, n)), sigma=rng.uniform(0, 0.1, (3, 2, n, 2)), status=status,
         vertex=np.arange(n), seconds={"refine": 1.5},
     )  # fmt: skip
@@ -78,7 +78,7 @@ def test_what_is_written_comes_back(written: Path) -> None:
     assert found.summary == {"points": 36, "unknown": None, "list": [0.0, 1.0, 2.0]}
     for name in ("xy", "px", "c_ls", "sigma", "status", "vertex"):
         np.testing.assert_array_equal(getattr(found.matches[0], name), getattr(result.matches[0], name))
-    assert found.matches[0].pair == ("201", "202")
+    assert found.matches[0].cameras == ("201", "202")
     assert found.matches[0].seconds == {"refine": 1.5}
     point = np.array([[10.0, 20.0, 30.0]])
     for before, after in zip(result.cameras, found.cameras, strict=True):
