@@ -22,9 +22,10 @@ Array = NDArray[np.float64]
 _SEEN = 0.85
 # Mean square of the slopes of the interpolating quintic spline at the samples of white noise of unit variance.
 _SLOPES = 1.894
-# What is no noise lies on the edges of the speckle, a third of the area, which hold nearly all of the slopes: there
-# its mean square, and with it the variance, is three times what a spread over the whole subset would make.
-_ON_EDGES = 3.0
+# What is no noise goes with the slopes: it counts as much more than an even spread over the subset as they are peaked,
+# less what signs that change along an edge cancel. The share is a measured one: views 30° apart and 10 % of stretch,
+# speckles of 7 and 14 px.
+_LEFT = 0.7
 
 
 @dataclass(frozen=True)
@@ -78,5 +79,5 @@ def match_parts(
         own = second.spread(noise[1]) / first.spread(noise[0])
         current = unit * own * (real * noise[1] / area)[:, None]
         other = np.maximum(0.0, 1.0 - seen / residual)
-        systematic = np.einsum("...ij,...j->...i", G**2, _ON_EDGES * sigma**2) * other[:, None]
+        systematic = np.einsum("...ij,...j->...i", G**2, sigma**2) * (_LEFT * first.peaked * other)[:, None]
     return MatchParts(np.sqrt(reference), np.sqrt(current), np.sqrt(systematic))

@@ -22,15 +22,18 @@ class Texture:
     """Of n subsets of one image; NaN where a point lies outside it.
 
     contrast : (n,) standard deviation of the grey levels. slopes : (n, 3) means of fx², fx fy and fy² over the subset,
-    grey levels² a px², the noise's own slopes among them.
+    grey levels² a px², the noise's own slopes among them. peaked : (n,) mean of (fx² + fy²)² over its square: 1 where
+    slopes are alike all over the subset, the more the fewer the edges that hold them all.
     """
 
     contrast: Array
     slopes: Array
+    peaked: Array
 
     def __post_init__(self) -> None:
-        if self.slopes.shape != (len(self.contrast), 3):
-            raise ValueError("texture has a contrast and three mean products of slopes a point")
+        n = len(self.contrast)
+        if self.slopes.shape != (n, 3) or self.peaked.shape != (n,):
+            raise ValueError("texture has a contrast, three mean products of slopes and their peak a point")
 
     def clean(self, noise: float) -> Array:
         """Mean squares of fx and fy, (n, 2), without those that noise of this variance adds."""
@@ -52,12 +55,12 @@ def texture_at(image: Image, px: Array, radius: int, square: bool = False) -> Te
     """The texture about px (n, 2) of an image (h, w), over a square of the area of a subset of this radius, px."""
     px = np.asarray(px, dtype=float)
     n = len(px)
-    contrast, slopes = np.full(n, np.nan), np.full((n, 3), np.nan)
+    contrast, slopes, peaked = np.full(n, np.nan), np.full((n, 3), np.nan), np.full(n, np.nan)
     height, width = image.shape
     with np.errstate(invalid="ignore"):
         inside = ((px > -0.5) & (px < (width - 0.5, height - 0.5))).all(axis=1)
     if not inside.any():
-        return Texture(contrast, slopes)
+        return Texture(contrast, slopes, peaked)
     at = np.rint(px[inside]).astype(np.int64)
     half = radius if square else round(0.5 * np.sqrt(np.pi) * radius)
     margin = half + len(_SLOPE)
@@ -76,4 +79,6 @@ def texture_at(image: Image, px: Array, radius: int, square: bool = False) -> Te
     one = np.ones(1, dtype=np.float32)
     fx, fy = cv2.sepFilter2D(grey, cv2.CV_32F, _SLOPE, one), cv2.sepFilter2D(grey, cv2.CV_32F, one, _SLOPE)
     slopes[inside] = np.column_stack([mean(fx * fx), mean(fx * fy), mean(fy * fy)])
-    return Texture(contrast, slopes)
+    total = fx * fx + fy * fy
+    peaked[inside] = mean(total * total) / np.maximum(mean(total), 1e-9) ** 2
+    return Texture(contrast, slopes, peaked)

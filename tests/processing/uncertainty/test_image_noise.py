@@ -66,6 +66,10 @@ def test_the_texture_of_a_wave_is_that_of_its_formula() -> None:
     np.testing.assert_allclose(found.contrast[:2], np.sqrt((30.0**2 + 20.0**2) / 2), rtol=0.05)
     np.testing.assert_allclose(found.slopes[:2, [0, 2]], [[(30 * a) ** 2 / 2, (20 * b) ** 2 / 2]] * 2, rtol=0.1)
     np.testing.assert_allclose(found.spread(0.0)[:2], [[2 / (30 * a) ** 2, 2 / (20 * b) ** 2]] * 2, rtol=0.1)
+    # Mean of (A cos² + B cos²)² by that of A cos² + B cos² squared, with ⟨cos⁴⟩ = 3/8.
+    A, B = (30 * a) ** 2, (20 * b) ** 2
+    expected = (3 / 8 * (A**2 + B**2) + A * B / 2) / (A / 2 + B / 2) ** 2
+    np.testing.assert_allclose(found.peaked[:2], expected, rtol=0.1)
     assert np.isnan(found.contrast[2:]).all()
     assert np.isnan(found.spread(0.0)[2:]).all()
     np.testing.assert_array_equal(found.slopes[0], found.slopes[1])  # the nearest pixel
@@ -89,4 +93,4 @@ def test_a_pattern_of_one_direction_does_not_tell_where_it_is() -> None:
 
 def test_textures_of_different_lengths_are_refused() -> None:
     with pytest.raises(ValueError, match="a contrast"):
-        Texture(np.zeros(3), np.zeros((4, 3)))
+        Texture(np.zeros(3), np.zeros((4, 3)), np.zeros(3))

@@ -49,7 +49,7 @@ def test_over_repeated_noise_matches_scatter_as_their_two_parts_say(squeeze: flo
 
 
 def test_what_the_noise_does_not_explain_is_systematic_and_what_it_does_is_not() -> None:
-    texture = Texture(np.full(3, 40.0), np.tile([1e14, 0.0, 1e14], (3, 1)))
+    texture = Texture(np.full(3, 40.0), np.tile([1e14, 0.0, 1e14], (3, 1)), np.full(3, 5.0))
     visible = (4.0 + 0.85 * 4.0) / 40.0**2
     c_ls, sigma = visible * np.array([1.0, 0.5, 3.0]), np.full((3, 2), 0.005)
     parts = match_parts(sigma, c_ls, (texture, texture), (4.0, 4.0))
@@ -58,13 +58,13 @@ def test_what_the_noise_does_not_explain_is_systematic_and_what_it_does_is_not()
     np.testing.assert_allclose(parts.reference[0] ** 2 + 0.85 * parts.current[0] ** 2, sigma[0] ** 2, rtol=1e-9)
     # A residual below the noise that was told: the residual counts.
     np.testing.assert_allclose(parts.reference[1] ** 2 + 0.85 * parts.current[1] ** 2, sigma[1] ** 2, rtol=1e-9)
-    # Two thirds of this residual are no noise; on the edges they count three times.
-    np.testing.assert_allclose(parts.systematic[2], sigma[2] * np.sqrt(3.0 * 2.0 / 3.0), rtol=1e-9)
+    # Two thirds of this residual are no noise; on the edges they count 0.7 × 5 times.
+    np.testing.assert_allclose(parts.systematic[2], sigma[2] * np.sqrt(0.7 * 5.0 * 2.0 / 3.0), rtol=1e-9)
     np.testing.assert_allclose(parts.reference[2] ** 2 + 0.85 * parts.current[2] ** 2, sigma[2] ** 2 / 3, rtol=1e-9)
 
 
 def test_a_lost_match_has_no_parts() -> None:
-    texture = Texture(np.full(1, 40.0), np.array([[100.0, 0.0, 100.0]]))
+    texture = Texture(np.full(1, 40.0), np.array([[100.0, 0.0, 100.0]]), np.ones(1))
     parts = match_parts(np.full((1, 2), np.nan), np.full(1, np.nan), (texture, texture), (4.0, 4.0))
     assert np.isnan(parts.reference).all()
     assert np.isnan(parts.current).all()
