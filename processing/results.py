@@ -61,9 +61,9 @@ class Matches:
     """2D matches of a camera pair at F steps, or of a camera alone that followed its own points in time.
 
     cameras : the C ids, reference camera first. xy : (n, 2) px in the reference image. px : (F, C, n, 2) in their
-    images; of a camera alone the first is the match from another camera, xy the projected point it is followed from,
-    and the later ones are xy and the displacement since. c_ls : (F, n). sigma : (F, C, n, 2) px. status : (F, n), 0
-    good. vertex : (n,) index of the vertex, or -1. seconds : time spent by stage.
+    images. c_ls : (F, n). sigma : (F, C, n, 2) px. status : (F, n), 0 good. vertex : (n,) index of the vertex, or -1.
+    seconds : time spent by stage. Of a camera alone, xy is the place as it was matched from another camera, px at the
+    reference the projection of the vertex, from which the point is followed, and sigma there that of xy.
     """
 
     cameras: tuple[str, ...]

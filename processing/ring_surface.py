@@ -166,13 +166,13 @@ def _facing_pairs(
 
 def _matches(cameras: Sequence[Camera], one: CameraTrack, shape: ReferenceShape) -> Matches:
     """One camera's matches. Good ones that contradicted the other cameras' are marked."""
-    px, sigma = one.px.copy(), one.sigma.copy()
-    px[0], sigma[0] = shape.px[one.camera, one.vertex], shape.sigma[one.camera, one.vertex]
+    sigma = one.sigma.copy()
+    sigma[0] = shape.sigma[one.camera, one.vertex]
     status = np.where((one.status == 0) & ~one.used, Lost.RESIDUAL, one.status).astype(np.int8)
     return Matches(
         cameras=(cameras[one.camera].id,),
-        xy=one.px[0],
-        px=px[:, None],
+        xy=shape.px[one.camera, one.vertex],
+        px=one.px[:, None],
         c_ls=one.c_ls,
         sigma=sigma[:, None],
         status=status,
