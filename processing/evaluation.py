@@ -43,6 +43,19 @@ class Evaluation:
         if self.exponent is not None and not -20 <= self.exponent <= 20:
             raise InputError(f"the exponent of a family of strains is from -20 to 20, not {self.exponent:g}")
 
+    @classmethod
+    def of(
+        cls,
+        reference: str = "first",
+        rigid_motion_removed: bool = False,
+        window: float | None = None,
+        exponent: float | None = None,
+    ) -> Evaluation:
+        """The same by words: reference is "first" or "previous". Raises InputError for anything else."""
+        if reference not in ("first", "previous"):
+            raise InputError(f"a step is compared with the 'first' or the 'previous' one, not with '{reference}'")
+        return cls(reference == "previous", rigid_motion_removed, window, exponent)
+
 
 class Evaluated:
     """Results under an evaluation. Steps are computed when asked for, one at a time."""

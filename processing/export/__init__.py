@@ -55,8 +55,9 @@ def export(
     out: Path | None = None,
     evaluation: Evaluation = Evaluation(),  # noqa: B008 - frozen
     colour: str | None = None,
+    run: int | None = None,
 ) -> Path:
-    """Write the newest results of a session in another form; the file or folder written.
+    """Write the results of a session in another form; the file or folder written. ``run`` : the newest unless given.
 
     ``out`` : where to; without it, beside the results. Formats of one file a step write a folder. ``evaluation`` : how
     fields are made of positions. ``colour`` : the field that ply and glb are coloured by, displacement unless given.
@@ -66,7 +67,7 @@ def export(
         raise InputError(f"no export format '{format}'; there are {', '.join(FORMATS)}")
     if colour is not None and format not in _COLOURED:
         raise InputError(f"format '{format}' has no colours; {' and '.join(_COLOURED)} have")
-    results_path = newest_results(Path(session_path))
+    results_path = newest_results(Path(session_path), run)
     if out is None:
         out = results_path.with_name(format if format in _FOLDERS else f"results.{format}")
     out = Path(out)
