@@ -24,11 +24,13 @@ from processing.multiview.quadratic import Neighbourhoods, QuadraticFit
 
 Array = NDArray[np.float64]
 
+_REACH = 2.5  # subset radii about a point in which its neighbours tell its curvature and its bias
 _LOOSE = 1e-4  # px, tolerance of the first of two passes
 _PATIENCE = 20  # iterations of the first of two passes
 _ENOUGH = 0.5  # share of the start values that must hold before the images are searched for others
 _LEAST_EXCESS = 0.1  # of a second-order subset's variance, beyond that of the same subset of first order
 _OVERLAP = 1.2  # subsets share pixels: a mean of several is this much less certain than of independent ones
+_LEFT = 0.25  # share of the bias that may be left: the neighbourhood is wider than the subset
 _SCATTERS = 8.0  # a point this many times off its neighbours' quadratic contradicts it
 _LEAST_OFF = 0.1  # px, and never less than this
 _AROUND = 60  # points about a point whose difference between the images is the usual one
@@ -72,13 +74,13 @@ def follow(
     """Follow points ``at`` (n, 2) px of the reference image, whole or fractional, into the current image.
 
     start : (n, 12) warps at the points, NaN rows where unknown; None: found in the images. window : px, radius of the
-    neighbourhood that second derivatives come from, 1.75 subset radii by default. search : look for start values in the
+    neighbourhood that second derivatives come from, 2.5 subset radii by default. search : look for start values in the
     images where too few of those given hold. settings.order 2 with two_pass False leaves the second derivatives to
     each subset.
     """
     pixel = np.rint(at)
     shift = pixel - at
-    around = Neighbourhoods(pixel, window or 1.75 * settings.radius)
+    around = Neighbourhoods(pixel, window or _REACH * settings.radius)
     given = None if start is None else shifted(start, shift)
     first = _matched(reference, current, pixel, given, _first_settings(settings) if two_pass else settings, search)
     if not two_pass or not first.good.any():
@@ -170,7 +172,8 @@ def _unbiased(first: Correlation, second: Correlation, around: Neighbourhoods) -
         share = fit.value**2 / (fit.value**2 + s**2)
     known = np.isfinite(share).all(axis=1) & second.good
     uv = np.where(known[:, None], second.uv - share * fit.value, second.uv)
-    sigma = np.where(known[:, None], np.hypot(second.sigma, share * s), second.sigma)
+    doubt = np.hypot(share * s, _LEFT * share * fit.value)
+    sigma = np.where(known[:, None], np.hypot(second.sigma, doubt), second.sigma)
     return replace(second, uv=uv, sigma=sigma)
 
 

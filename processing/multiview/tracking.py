@@ -46,7 +46,7 @@ class Tracking:
 
     two_pass : second derivatives of the neighbours' displacement held in a second first-order pass.
     update_reference : lost points are sought from the last image that showed them.
-    order : of the subsets in time. window : px, radius of the neighbourhood of the two passes; None: 1.75 radii.
+    order : of the subsets in time. window : px, radius of the neighbourhood of the two passes; None: 2.5 radii.
     """
 
     two_pass: bool = True
