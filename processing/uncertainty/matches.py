@@ -33,15 +33,18 @@ class MatchParts:
     """Standard deviations of n matches, px, each in its own image.
 
     reference : (n, 2) by the noise of the reference image. current : (n, 2) by that of the current image.
-    systematic : (n, 2) in the current image, by what is no noise.
+    systematic : (n, 2) in the current image, by what is no noise; reference_systematic : (n, 2) the same in pixels of
+    the reference. Either image has its part in it, which no one pair can tell.
     """
 
     reference: Array
     current: Array
     systematic: Array
+    reference_systematic: Array
 
     def __post_init__(self) -> None:
-        if not self.reference.shape == self.current.shape == self.systematic.shape or self.reference.shape[-1] != 2:
+        shapes = {values.shape for values in vars(self).values()}
+        if len(shapes) != 1 or shapes.pop()[-1:] != (2,):
             raise ValueError("the parts of a match's uncertainty have one shape, (..., 2)")
 
 
@@ -79,5 +82,6 @@ def match_parts(
         own = second.spread(noise[1]) / first.spread(noise[0])
         current = unit * own * (real * noise[1] / area)[:, None]
         other = np.maximum(0.0, 1.0 - seen / residual)
-        systematic = np.einsum("...ij,...j->...i", G**2, sigma**2) * (_LEFT * first.peaked * other)[:, None]
-    return MatchParts(np.sqrt(reference), np.sqrt(current), np.sqrt(systematic))
+        systematic = sigma**2 * (_LEFT * first.peaked * other)[:, None]
+    there = np.einsum("...ij,...j->...i", G**2, systematic)
+    return MatchParts(np.sqrt(reference), np.sqrt(current), np.sqrt(there), np.sqrt(systematic))

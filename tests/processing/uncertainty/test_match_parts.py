@@ -73,4 +73,4 @@ def test_a_lost_match_has_no_parts() -> None:
 
 def test_parts_of_different_shapes_are_refused() -> None:
     with pytest.raises(ValueError, match="one shape"):
-        MatchParts(np.zeros((3, 2)), np.zeros((3, 2)), np.zeros((2, 2)))
+        MatchParts(np.zeros((3, 2)), np.zeros((3, 2)), np.zeros((3, 2)), np.zeros((2, 2)))
