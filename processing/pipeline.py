@@ -25,8 +25,9 @@ from processing.correlation.correlate import load_kernels
 from processing.errors import ComputationError, InputError
 from processing.images import read_gray, read_mask
 from processing.matching import PairMatches, match_pair
+from processing.pairs_surface import pairs_surface
 from processing.progress import Report, Stages, silent
-from processing.results import Matches, Results, write_results
+from processing.results import Results, write_results
 from processing.ring import Ring, calibrate_ring, control_points
 from processing.ring_surface import RingSurface, ring_surface
 from processing.session import Capture, Session, new_run, read_session
@@ -59,11 +60,12 @@ def process_session(path: Path, settings: Settings, report: Report = silent) -> 
         whole = _whole_ring(session, ring, tuple(errors), steps, settings, stages)
         results, drift = whole.results, whole.drift
         more_warnings: list[str] = []
+        agreement: dict[str, Any] = {}
     else:
         surfaces, more_warnings = _surfaces(session, ring, tuple(errors), steps, settings, stages)
-        results = _join(session, ring, surfaces, steps, settings)
+        results, agreement = pairs_surface(session, ring, surfaces, steps, settings)
         drift = {"-".join(surface.matches.cameras): surface.drift for surface in surfaces}
-    found = summary.summarise(results, ring, errors, drift, (*ring.warnings, *warnings, *more_warnings))
+    found = summary.summarise(results, ring, errors, drift, agreement, (*ring.warnings, *warnings, *more_warnings))
     for warning in found["warnings"]:
         log.warning("%s", warning)
     return _keep(session, results, found, ring, errors, settings, stages, began)
@@ -196,41 +198,6 @@ def _image_source(session: Session, ring: Ring, steps: tuple[Capture, ...]) -> C
 def _mask(session: Session, camera: Camera) -> NDArray[np.bool_] | None:
     path = session.mask(camera.id)
     return None if path is None else read_mask(path, (camera.size[1], camera.size[0]))
-
-
-def _join(
-    session: Session, ring: Ring, surfaces: list[PairSurface], steps: tuple[Capture, ...], settings: Settings
-) -> Results:
-    """The surfaces of the pairs in one set of arrays."""
-    counts = [surface.vertices.shape[1] for surface in surfaces]
-    offsets = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int)
-    vertices = np.concatenate([surface.vertices for surface in surfaces], axis=1)
-    return Results(
-        rig=session.rig.name,
-        steps=tuple(step.id for step in steps),
-        cameras=tuple(calibration.camera for calibration in ring.cameras.values()),
-        pairs=tuple(_pair(surface.matches) for surface in surfaces),
-        vertices_ref=vertices[0],
-        vertices=vertices,
-        faces=np.concatenate([s.faces + offset for s, offset in zip(surfaces, offsets, strict=True)]),
-        pair=np.repeat(np.arange(len(surfaces)), [len(surface.faces) for surface in surfaces]),
-        vertex_pair=np.repeat(np.arange(len(surfaces)), counts),
-        correlation=np.concatenate([surface.correlation for surface in surfaces], axis=1),
-        sigma_xyz=np.concatenate([surface.sigma for surface in surfaces], axis=1),
-        status=np.concatenate([surface.status for surface in surfaces], axis=1),
-        matches=tuple(_with_offset(surface, int(offset)) for surface, offset in zip(surfaces, offsets, strict=True)),
-        settings=settings.to_toml(),
-    )
-
-
-def _pair(matches: Matches) -> tuple[str, str]:
-    first, second = matches.cameras
-    return first, second
-
-
-def _with_offset(surface: PairSurface, offset: int) -> Matches:
-    vertex = surface.matches.vertex
-    return replace(surface.matches, vertex=np.where(vertex >= 0, vertex + offset, -1))
 
 
 def _keep(

@@ -77,6 +77,9 @@ class SurfaceGroup(_Group):
 
     method : the surfaces of the camera pairs side by side (pairs), or one lattice over the surface whose points all
     cameras measure together (global).
+    merge : of the pairs' surfaces into one, and which triangles of an overlap go first: the worst by correlation, by
+    distance to the other surfaces, by orientation against theirs, or by these and the nearness to the border
+    (combined); none leaves the surfaces one over the other.
     radius_mm : of the cylinder from which the search sets out; 0 takes the target's.
     reach_mm : how far from it the surface may lie. incidence_deg : the steepest angle of view that is used.
     sigma_max_px : a point whose match has a larger standard deviation, where the speckle ends, is lost.
@@ -85,6 +88,7 @@ class SurfaceGroup(_Group):
     """
 
     method: Literal["pairs", "global"] = "pairs"
+    merge: Literal["none", "correlation", "distance", "orientation", "combined"] = "combined"
     radius_mm: float = Field(default=0.0, ge=0)
     reach_mm: float = Field(default=20.0, gt=0)
     incidence_deg: float = Field(default=65.0, gt=0, lt=90)

@@ -22,11 +22,13 @@ def summarise(
     ring: Ring,
     errors: dict[tuple[str, str], ReconstructionError],
     drift: Mapping[str, Array],
+    agreement: Mapping[str, Any],
     warnings: tuple[str, ...],
 ) -> dict[str, Any]:
     """Counts, calibration quality and one row of figures a step, as JSON values; ``table`` is for the terminal.
 
     drift : (F,) px by pair or camera, the mean vertical residual of each step: cameras that moved between frames.
+    agreement : of the surfaces of camera pairs, where there are any.
     """
     steps = [_step(results, k) for k in range(len(results.steps))]
     control = {
@@ -42,6 +44,7 @@ def summarise(
         "cameras": [asdict(row) for row in ring.quality],
         "calibration": _calibration(ring),
         "drift_px": {who: _finite(values) for who, values in drift.items()},
+        "agreement": dict(agreement),
         "steps": steps,
         "warnings": list(warnings),
     }
@@ -101,6 +104,14 @@ def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
                 "figure": "bundle: centroids, print errors, radius",
                 "value": f"{bundle['centroid_sigma_px']:.4f} px, {bundle['print_errors_rms_mm']:.3f} mm, "
                 f"{bundle['radius_mm']:.3f} mm",
+            }
+        )
+    agreement = figures["agreement"]
+    if agreement.get("mismatch_mm") is not None:
+        rows.append(
+            {
+                "figure": "distance between the surfaces of neighbouring pairs",
+                "value": f"{agreement['mismatch_mm']:.4f} ± {agreement['mismatch_std_mm']:.4f} mm",
             }
         )
     for step in figures["steps"][1:]:

@@ -67,6 +67,13 @@ class Seam:
             if not value >= 0:
                 raise ValueError(f"{name} of a seam must not be negative, not {value}")
 
+    @staticmethod
+    def mean_edge(sheets: Sequence[Sheet]) -> float:
+        """Mean length of the edges of all triangles, mm; 0 without any."""
+        lengths = [np.linalg.norm(np.diff(s.vertices[s.faces[:, [0, 1, 2, 0]]], axis=1), axis=2) for s in sheets]
+        every = np.concatenate([np.zeros(0), *(length.ravel() for length in lengths)])
+        return float(every.mean()) if len(every) else 0.0
+
 
 @dataclass(frozen=True)
 class Merged:
@@ -105,7 +112,7 @@ def merge(
     mesh, owner, correlation = _together(sheets)
     if not len(mesh.faces):
         return Merged(mesh.faces, owner, np.zeros(0, np.int64), np.zeros(0, np.int64), 0, ())
-    edge = _mean_edge(mesh)
+    edge = Seam.mean_edge(sheets)
     kept = _without_overlap(mesh, owner, correlation, chosen, seam, edge)
     old = mesh.faces[kept]
     faces, pair, added = _joined(mesh, old, owner, sheets, seam, edge)
@@ -123,11 +130,6 @@ def _together(sheets: Sequence[Sheet]) -> tuple[Mesh, Indices, Array]:
     owner = np.repeat(np.arange(len(sheets)), [len(sheet.faces) for sheet in sheets])
     values = np.concatenate([np.zeros(0), *(sheet.correlation for sheet in sheets)])
     return mesh, owner, values[mesh.faces].max(axis=1)
-
-
-def _mean_edge(mesh: Mesh) -> float:
-    corners = mesh.vertices[mesh.faces]
-    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
 
 
 def _without_overlap(
