@@ -186,6 +186,7 @@ def calibrate_camera(
         camera=camera_id,
         intrinsics=intrinsics,
         rotation_deg=entry.rotation_deg,
+        height_mm=entry.height_mm,
         max_incidence_deg=max_incidence_deg,
     )
     return replace(_place(camera_id, size, observed, intrinsics, fit), views=found, blank=blank)
