@@ -19,9 +19,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Tracks:
-    """Pixels of the vertices.
+    """Pixels of the measured points, those too that the merging of pairs takes out.
 
-    cameras : C ids. px : (F, C, N, 2), NaN where a camera did not measure a vertex. reference : (C, N, 2), where each
+    cameras : C ids. px : (F, C, N, 2), NaN where a camera did not measure a point. reference : (C, N, 2), where each
     was matched between the cameras; tracking in time sets out from the place that all views together give.
     """
 
@@ -33,16 +33,20 @@ class Tracks:
     def of(cls, results: Results) -> Tracks:
         """From the matches that the results keep."""
         ids = tuple(camera.id for camera in results.cameras)
-        steps, vertices = results.vertices.shape[:2]
-        px = np.full((steps, len(ids), vertices, 2), np.nan)
-        reference = np.full((len(ids), vertices, 2), np.nan)
+        alone = all(len(matches.cameras) == 1 for matches in results.matches)
+        count = len(results.vertices_ref) if alone else sum(len(matches.xy) for matches in results.matches)
+        px = np.full((len(results.steps), len(ids), count, 2), np.nan)
+        reference = np.full((len(ids), count, 2), np.nan)
+        offset = 0
         for matches in results.matches:
-            used = np.flatnonzero(matches.vertex >= 0)
+            used = np.flatnonzero(matches.vertex >= 0) if alone else np.arange(len(matches.xy))
+            row = matches.vertex[used] if alone else offset + used
             good = np.where(matches.status[:, used, None] == 0, 1.0, np.nan)
             for k, id_ in enumerate(matches.cameras):
-                camera, vertex = ids.index(id_), matches.vertex[used]
-                px[:, camera, vertex] = matches.px[:, k][:, used] * good
-                reference[camera, vertex] = matches.xy[used] if len(matches.cameras) == 1 else px[0, camera, vertex]
+                camera = ids.index(id_)
+                px[:, camera, row] = matches.px[:, k][:, used] * good
+                reference[camera, row] = matches.xy[used] if alone else px[0, camera, row]
+            offset += len(matches.xy)
         return cls(ids, px, reference)
 
     def reconstruct(self, cameras: Mapping[str, Camera]) -> Array:
@@ -50,7 +54,7 @@ class Tracks:
         return triangulate([cameras[id_] for id_ in self.cameras], self.reference)
 
     def of_pair(self, cameras: Mapping[str, Camera], pair: tuple[str, str], step: int | None = None) -> Array:
-        """The vertices as a pair alone has them. (N, 3) mm, NaN where one of its cameras has no view.
+        """The points as a pair alone has them. (N, 3) mm, NaN where one of its cameras has no view.
 
         step : as tracked in time; None is the reference as matched between the cameras.
         """
