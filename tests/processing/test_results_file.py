@@ -20,6 +20,7 @@ from processing.results import (
     read_summary,
     write_results,
 )
+from processing.strain_window import strain_window
 
 LOST = 7
 
@@ -147,6 +148,61 @@ def test_every_field_of_the_table_can_be_read_at_every_step(written: Path) -> No
     lambda2 = next(row for row in summary["fields"] if row["name"] == "lambda2")
     assert lambda2["range"] == pytest.approx([1.0, 1.2])
     assert lambda2["centre"] == 1.0
+
+
+def everything_known() -> Results:
+    """The same with a strain window and with every deviation that can be known."""
+    result, rng = a_result(), np.random.default_rng(6)
+    return replace(
+        result, settings="[strain]\nwindow_mm = 12.0\n", sigma_displacement=rng.uniform(0, 0.01, (3, 36, 3)),
+        sigma_lambda=rng.uniform(0, 1e-3, (3, 50, 2)), chi2=rng.uniform(0, 3, (3, 36)),
+    )  # fmt: skip
+
+
+def test_what_is_known_beside_the_rest_has_its_fields(tmp_path: Path) -> None:
+    result, path = everything_known(), tmp_path / "results.h5"
+    write_results(path, result)
+    summary = read_summary(path)
+    assert [row["name"] for row in summary["fields"]] == [entry.name for entry in FIELDS]
+    back = read_results(path)
+    for name in ("sigma_displacement", "sigma_lambda", "chi2"):
+        np.testing.assert_allclose(getattr(back, name), getattr(result, name), rtol=1e-6)
+    np.testing.assert_allclose(read_field(path, "sigma_lambda2", 1)[0], result.sigma_lambda[1, :, 1], rtol=1e-6)
+    found = result.deformation(2)
+    whole = np.isfinite(found.J)
+    sigma_E2, _ = read_field(path, "sigma_E2", 2)  # dE = λ dλ
+    np.testing.assert_allclose(sigma_E2[whole], (found.lambda2 * result.sigma_lambda[2, :, 1])[whole], rtol=1e-6)
+    over = result.deformation(2, window=strain_window(result.mesh, 12.0))
+    for name in ("lambda2", "E2", "E_equivalent"):
+        np.testing.assert_allclose(read_field(path, f"window_{name}", 2)[0], getattr(over, name), rtol=1e-6, atol=1e-7)
+    hencky, _ = read_field(path, "window_hencky2", 2)
+    np.testing.assert_allclose(hencky, np.log(over.lambda2), atol=1e-7)
+    seth_hill, _ = read_field(path, "seth_hill2:0.25", 2)
+    np.testing.assert_allclose(seth_hill, (found.lambda2**0.5 - 1) * 2, atol=1e-7)
+
+
+def test_from_one_step_to_the_next_nothing_is_claimed_of_deviations() -> None:
+    result = everything_known()
+    since_reference, since_before = result.fields(2), result.fields(2, previous=True)
+    assert {"sigma_displacement", "sigma_lambda1"} <= since_reference.names
+    assert not {"sigma_displacement", "sigma_lambda1"} & since_before.names
+    moved = result.vertices[2] - result.vertices[1]
+    np.testing.assert_array_equal(since_before.point["displacement"], moved)
+
+
+def test_a_run_without_a_window_says_how_to_have_one(written: Path) -> None:
+    with pytest.raises(InputError, match=r"no field 'window_E2': the run had no strain window.*--window 5"):
+        read_field(written, "window_E2", 1)
+    with pytest.raises(InputError, match="no field 'sigma_E1': the run did not find it"):
+        read_field(written, "sigma_E1", 1)
+
+
+def test_a_step_takes_a_bounded_number_of_bytes(tmp_path: Path) -> None:
+    write_results(tmp_path / "results.h5", everything_known())
+    with h5py.File(tmp_path / "results.h5") as file:
+        sizes = {place: sum(d.nbytes for d in file[f"VTKHDF/{place}"].values()) for place in ("PointData", "CellData")}
+    assert sizes["PointData"] / (3 * 36) <= 70 - 24  # a position takes 24
+    assert sizes["CellData"] / (3 * 50) <= 125
 
 
 def test_a_mesh_is_read_alone(written: Path) -> None:
