@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from processing.correlation import Correlation, CorrelationSettings, Current, Reference, Status, correlate
-from processing.multiview.quadratic import Neighbourhoods, QuadraticFit
+from processing.correlation.quadratic import Neighbourhoods, QuadraticFit
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,6 @@ _OVERLAP = 1.2  # subsets share pixels: a mean of several is this much less cert
 _LEFT = 0.25  # share of the bias that may be left: the neighbourhood is wider than the subset
 _SCATTERS = 8.0  # a point this many times off its neighbours' quadratic contradicts it
 _LEAST_OFF = 0.1  # px, and never less than this
-_AROUND = 60  # points about a point whose difference between the images is the usual one
 _UNLIKE = 8.0  # a mean square difference this many times the usual one is not noise
 
 
@@ -67,20 +66,19 @@ def follow(
     start: Array | None,
     settings: CorrelationSettings,
     *,
+    around: Neighbourhoods | None = None,
     two_pass: bool = True,
-    window: float | None = None,
     search: bool = True,
 ) -> Followed:
     """Follow points ``at`` (n, 2) px of the reference image, whole or fractional, into the current image.
 
-    start : (n, 12) warps at the points, NaN rows where unknown; None: found in the images. window : px, radius of the
-    neighbourhood that second derivatives come from, 2.5 subset radii by default. search : look for start values in the
-    images where too few of those given hold. settings.order 2 with two_pass False leaves the second derivatives to
-    each subset.
+    start : (n, 12) warps at the points, NaN rows where unknown; None: found in the images. around : see
+    ``neighbourhoods``. search : look for start values in the images where too few of those given hold. settings.order
+    2 with two_pass False leaves the second derivatives to each subset.
     """
-    pixel = np.rint(at)
+    around = around or neighbourhoods(at, settings)
+    pixel = around.xy
     shift = pixel - at
-    around = Neighbourhoods(pixel, window or _REACH * settings.radius)
     given = None if start is None else shifted(start, shift)
     first = _matched(reference, current, pixel, given, _first_settings(settings) if two_pass else settings, search)
     if not two_pass or not first.good.any():
@@ -89,6 +87,11 @@ def follow(
     warp[:, 6:] = _held(_fitted(first, around), first, settings.radius)
     second = correlate(reference, current, pixel, settings, start=warp)
     return _judged(_unbiased(first, second, around), reference, shift, around, settings.radius)
+
+
+def neighbourhoods(at: Array, settings: CorrelationSettings, window: float | None = None) -> Neighbourhoods:
+    """Of the whole pixels next to points ``at`` (n, 2) px; window : px, by default 2.5 subset radii."""
+    return Neighbourhoods(np.rint(at), window or _REACH * settings.radius)
 
 
 def shifted(warp: Array, shift: Array) -> Array:
@@ -186,22 +189,21 @@ def _contradicts(fit: QuadraticFit) -> NDArray[np.bool_]:
         return np.asarray(known & (off > max(_LEAST_OFF, _SCATTERS * scatter)))
 
 
-def _unlike(found: Correlation, reference: Reference, radius: int) -> NDArray[np.bool_]:
+def _unlike(found: Correlation, reference: Reference, radius: int, around: Neighbourhoods) -> NDArray[np.bool_]:
     """Points (n,) whose subsets differ between the images by far more than those about them: partly covered, or worn.
 
     Compared are mean square differences in grey levels, C_LS times the variance of the subset: noise leaves the same
     in weak and in strong texture, so weak texture is not taken for a difference.
     """
     good = np.flatnonzero(found.good)
-    if len(good) < 2:
+    if not len(good):
         return np.zeros(len(found.xy), bool)
-    rest = found.c_ls[good] * _variance(reference, found.xy[good], radius)
-    _, near = cKDTree(found.xy[good]).query(found.xy[good], k=min(_AROUND, len(good)))
-    usual = np.maximum(np.median(rest[near], axis=1), np.median(rest))
+    rest = np.full(len(found.xy), np.nan)
+    rest[good] = found.c_ls[good] * _variance(reference, found.xy[good], radius)
     least = (reference.grey_range / 255.0) ** 2  # rounding to whole grey levels and a little more
-    out = np.zeros(len(found.xy), bool)
-    out[good] = rest > _UNLIKE * np.maximum(usual, least)
-    return out
+    usual = np.maximum(around.median(rest), max(float(np.median(rest[good])), least))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(rest > _UNLIKE * usual)
 
 
 def _variance(reference: Reference, xy: Array, radius: int) -> Array:
@@ -222,7 +224,7 @@ def _variance(reference: Reference, xy: Array, radius: int) -> Array:
 def _judged(found: Correlation, reference: Reference, shift: Array, around: Neighbourhoods, radius: int) -> Followed:
     """The matches at the points themselves; those unlike the reference or against their neighbours lost."""
     status = found.status.copy()
-    status[_unlike(found, reference, radius)] = Status.LOW_ZNCC
+    status[_unlike(found, reference, radius, around)] = Status.LOW_ZNCC
     kept = status == Status.GOOD
     fit = around.fit(np.where(kept[:, None], found.uv, np.nan), np.hypot(*found.sigma.T))
     status[kept & _contradicts(fit)] = Status.INCONSISTENT

@@ -25,9 +25,10 @@ from processing.correlation import (
     prepare_reference,
     search_hypotheses,
 )
+from processing.correlation.quadratic import Neighbourhoods
 from processing.correlation.seeds import spread
 from processing.errors import InputError
-from processing.multiview.following import Followed, follow
+from processing.multiview.following import Followed, follow, neighbourhoods
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8] | NDArray[np.uint16]
@@ -157,7 +158,11 @@ class _Points:
     by_way: NDArray[np.int64]
     settings: CorrelationSettings
     options: Tracking
+    around: Neighbourhoods = field(init=False)
     moved: bool = field(default=False)
+
+    def __post_init__(self) -> None:
+        self.around = neighbourhoods(self.x0, self.settings, self.options.window)
 
     @classmethod
     def at_rest(
@@ -200,8 +205,9 @@ class _Points:
     def _follow(
         self, reference: Reference, current: Current, at: Array, start: Array | None, search: bool = True
     ) -> Followed:
-        two_pass, window = self.options.two_pass, self.options.window
-        return follow(reference, current, at, start, self.settings, two_pass=two_pass, window=window, search=search)
+        around = self.around if at is self.x0 else neighbourhoods(at, self.settings, self.options.window)
+        two_pass = self.options.two_pass
+        return follow(reference, current, at, start, self.settings, around=around, two_pass=two_pass, search=search)
 
     def _box(self) -> tuple[int, int, int, int] | None:
         """Where the points may be now: about where they were, or anywhere."""
