@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.calibration.quality import ReconstructionError
+from processing.measure.window_study import gauge
 from processing.mesh import Mesh
 from processing.results import Results
 from processing.ring import Ring
@@ -45,6 +46,7 @@ def summarise(
         "calibration": _calibration(ring),
         "drift_px": {who: _finite(values) for who, values in drift.items()},
         "agreement": dict(agreement),
+        "strain": _strain(results),
         "steps": steps,
         "warnings": list(warnings),
     }
@@ -58,6 +60,18 @@ def _calibration(ring: Ring) -> dict[str, Any]:
         "pairs": [asdict(row) for row in ring.pairs],
         "bundle": None if ring.bundle is None else ring.bundle.figures(ring.target),
         "advice": list(ring.advice),
+    }
+
+
+def _strain(results: Results) -> dict[str, float | None]:
+    """What a strain averages over, mm: each triangle alone, and the window if the run has one."""
+    alone, over = gauge(results, 0.0), gauge(results, results.window_mm)
+    return {
+        "step_mm": _number(alone.step),
+        "subset_mm": _number(alone.subset),
+        "gauge_mm": _number(alone.length),
+        "window_mm": results.window_mm,
+        "window_gauge_mm": _number(over.length) if results.window_mm > 0 else None,
     }
 
 
@@ -114,6 +128,12 @@ def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
                 "value": f"{agreement['mismatch_mm']:.4f} ± {agreement['mismatch_std_mm']:.4f} mm",
             }
         )
+    strain = figures["strain"]
+    if strain["gauge_mm"] is not None:
+        value = f"{strain['gauge_mm']:.1f} mm"
+        if strain["window_gauge_mm"] is not None:
+            value += f", over the window of {strain['window_mm']:g} mm {strain['window_gauge_mm']:.1f} mm"
+        rows.append({"figure": "a strain averages over (virtual strain gauge)", "value": value})
     for step in figures["steps"][1:]:
         if step["measured"]:
             rows.append(
@@ -139,6 +159,10 @@ def _rms(values: Array) -> float | None:
 
 def _mean(values: list[float]) -> float:
     return float(np.mean(values))
+
+
+def _number(value: float) -> float | None:
+    return round(value, 4) if np.isfinite(value) else None
 
 
 def _finite(values: Array) -> list[float | None]:

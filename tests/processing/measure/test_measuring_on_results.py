@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from processing.camera import Camera
 from processing.errors import ComputationError, InputError
 from processing.evaluation import Evaluated, Evaluation
 from processing.measure.extensometer import extensometer
@@ -300,6 +301,29 @@ def test_a_study_of_windows_shows_the_scatter_fall_and_the_strain_stay() -> None
     assert np.median(strain_window(noisy.mesh, 8.0).points) == np.array(table["points"])[last][1]
     with pytest.raises(InputError, match="0 or more"):
         window_study(noisy, [-1.0])
+
+
+def test_the_gauge_knows_the_subset_from_the_camera_and_the_settings() -> None:
+    K = np.array([[2000.0, 0.0, 500.0], [0.0, 2000.0, 500.0], [0.0, 0.0, 1.0]])
+    R = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])  # looks along -x from x = 300
+    camera = Camera("1", K @ np.column_stack([R, -R @ [300.0, 0.0, 40.0]]), (1000, 1000))
+    y, z = np.meshgrid(np.arange(-10.0, 11.0, 2.0), np.arange(30.0, 51.0, 2.0), indexing="ij")
+    plate = np.column_stack([np.full(y.size, 100.0), y.ravel(), z.ravel()])
+    i = np.arange(121).reshape(11, 11)
+    a, b, c, d = (part.ravel() for part in (i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    results = Results(
+        rig="one", steps=("a",), cameras=(camera,), pairs=(("1", "2"),), vertices_ref=plate, vertices=plate[None],
+        faces=faces, pair=np.zeros(len(faces), dtype=np.int64), vertex_pair=np.zeros(121, dtype=np.int64),
+        correlation=np.zeros((1, 121)), sigma_xyz=np.zeros((1, 121, 3)), status=np.zeros((1, 121), dtype=np.int8),
+        settings="[correlation]\nradius_px = 14\n[strain]\nwindow_mm = 6.0\n",
+    )  # fmt: skip
+    held = gauge(results, results.window_mm)
+    assert held.step == pytest.approx(2.0)
+    assert held.subset == pytest.approx(29 / (2000 / 200), rel=1e-3)  # 10 px a mm at 200 mm
+    assert held.length == pytest.approx(6.0 + 2.9, rel=1e-3)
+    nobody = Results(**{**vars(results), "cameras": ()})
+    assert np.isnan(gauge(nobody, 6.0).length)
 
 
 def test_a_table_is_the_same_in_csv_and_json() -> None:
