@@ -97,9 +97,9 @@ _SCALARS: tuple[tuple[str, str, Callable[[Array, Array], Array], float | None], 
 
 
 def _family(name: str, label: str, m: float) -> Iterator[Field]:
+    symbol = f"{label} {name}" if name in "Ee" else label
     for suffix, scalar, measure, centre in _SCALARS:
-        sign = name + suffix if suffix in "12" else ""
-        text = f"{label}, {scalar} {sign}".strip()
+        text = f"{symbol}{suffix}, {scalar}" if name in "Ee" and suffix in "12" else f"{symbol}, {scalar}"
         value = partial(_scalar, measure, m)
         yield Field(name + suffix, text, "", "face", centre, group=f"{label} strain", of=("E1", "E2"), value=value)
 
@@ -124,7 +124,7 @@ _OVER_WINDOW = ("J", "lambda1", "lambda2", "E1", "E2", "E_magnitude", "E_equival
 def _windowed(entry: Field) -> Field:
     """The same field over the strain window."""
     return replace(
-        entry, name=f"window_{entry.name}", label=f"{entry.label}, over the window", group="Over the strain window",
+        entry, name=f"window_{entry.name}", label=f"Window: {entry.label}", group="Over the strain window",
         of=("window_E1", "window_E2"), value=_OVER_STRETCHES.get(entry.name, entry.value),
     )  # fmt: skip
 
