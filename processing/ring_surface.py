@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from processing.camera import Camera
 from processing.correlation import CorrelationSettings
 from processing.errors import ComputationError
+from processing.multiview.certainty import certainty
 from processing.multiview.motion import CameraTrack, Motion, measure_motion
 from processing.multiview.shape import ReferenceShape, ShapeSettings, reference_shape
 from processing.multiview.tracking import Tracking
@@ -117,9 +118,8 @@ def _results(
     facing, vertex_pair = _facing_pairs(cameras, pairs, shape)
     corners = vertex_pair[shape.faces]
     alike = (corners == corners[:, :1]).all(axis=1)
-    moved = np.einsum("fnii->fni", motion.covariance)
-    at_reference = np.einsum("nii->ni", shape.covariance)
-    lost = motion.status != 0
+    tracking = settings.correlation
+    sure = certainty(cameras, shape, motion, tracking.radius_px, tracking.order)
     with np.errstate(invalid="ignore"):
         chi2 = motion.chi2 / np.where(motion.degrees > 0, motion.degrees, 1)
     return Results(
@@ -133,11 +133,12 @@ def _results(
         pair=np.where(alike, corners[:, 0], -1),
         vertex_pair=vertex_pair,
         correlation=motion.c_ls,
-        sigma_xyz=np.where(lost[..., None], np.nan, np.sqrt(at_reference + moved)),
+        sigma_xyz=sure.position,
         status=motion.status,
         matches=tuple(_matches(cameras, one, shape) for one in motion.tracks),
         settings=settings.to_toml(),
-        sigma_displacement=np.where(lost[..., None], np.nan, np.sqrt(moved)),
+        sigma_displacement=sure.displacement,
+        sigma_lambda=sure.stretches,
         chi2=chi2,
     )
 
