@@ -249,7 +249,8 @@ def test_a_session_is_calibrated_as_its_settings_say_and_once(session, rig, ways
     assert first.bundle.cameras == ("cam_12", "cam_01", "cam_02")
     kept = {path: path.stat().st_mtime_ns for path in (session.path / "calibration").iterdir()}
     assert sum(path.name.startswith("bundle-") for path in kept) == 1
-    assert len(kept) == 4  # the start is shared by both methods
+    assert sum(path.name.startswith("survey-") for path in kept) == 1
+    assert len(kept) == 5  # the start is shared by both methods
     again = calibrate_ring(session, CalibrationGroup(method="bundle"))
     assert {path: path.stat().st_mtime_ns for path in (session.path / "calibration").iterdir()} == kept
     assert again.bundle is not None
