@@ -58,11 +58,12 @@ class Evaluation:
 
 
 class Evaluated:
-    """Results under an evaluation. Steps are computed when asked for, one at a time."""
+    """Results under an evaluation. Steps are computed when they are asked for, one at a time."""
 
     def __init__(self, results: Results, evaluation: Evaluation = Evaluation()) -> None:
         self.results = results
         self.evaluation = evaluation
+        self._last: tuple[int, StepFields] | None = None
 
     @property
     def steps(self) -> tuple[str, ...]:
@@ -79,7 +80,11 @@ class Evaluated:
     def fields(self) -> tuple[Field, ...]:
         """The fields there are."""
         exponent = self.evaluation.exponent
-        return (*available(self.step(0).names), *(() if exponent is None else seth_hill_fields(exponent)))
+        return (*available(self._names), *(() if exponent is None else seth_hill_fields(exponent)))
+
+    @cached_property
+    def _names(self) -> set[str]:
+        return self.step(0).names
 
     def field(self, name: str) -> Field:
         """The field of a name. Raises InputError if these results, so evaluated, do not have it."""
@@ -87,16 +92,18 @@ class Evaluated:
             entry = field(name)
         except KeyError:
             entry = None
-        if entry is None or not set(entry.of) <= self.step(0).names:
+        if entry is None or not set(entry.of) <= self._names:
             known = ", ".join(known.name for known in self.fields)
             hint = "; give a window" if name.startswith("window_") and self.window is None else ""
             raise InputError(f"no field '{name}'; there are {known}{hint}")
         return entry
 
     def step(self, step: int) -> StepFields:
-        """The arrays of a step."""
-        how = self.evaluation
-        return self.results.fields(step, self.window, how.previous, how.rigid_motion_removed)
+        """The arrays of a step; those of the step asked for last are kept."""
+        if self._last is None or self._last[0] != step:
+            how = self.evaluation
+            self._last = step, self.results.fields(step, self.window, how.previous, how.rigid_motion_removed)
+        return self._last[1]
 
     def positions(self, step: int) -> Array:
         """Positions of the vertices, (N, 3) mm, NaN where lost; moved back if the rigid motion is removed."""
