@@ -30,6 +30,8 @@ _PATIENCE = 20  # iterations of the first of two passes
 _ENOUGH = 0.5  # share of the start values that must hold before the images are searched for others
 _LEAST_EXCESS = 0.1  # of a second-order subset's variance, beyond that of the same subset of first order
 _OVERLAP = 1.2  # subsets share pixels: a mean of several is this much less certain than of independent ones
+_BIASED = 4.0  # Σ(b/σ)² of a bias below which it may be noise, of 2 numbers
+_CURVED = 20.0  # the same of second derivatives, of 6 numbers of overlapping subsets
 _LEFT = 0.25  # share of the bias that may be left: the neighbourhood is wider than the subset
 _SCATTERS = 8.0  # a point this many times off its neighbours' quadratic contradicts it
 _LEAST_OFF = 0.1  # px, and never less than this
@@ -150,21 +152,21 @@ def _held(fit: QuadraticFit, found: Correlation, radius: int) -> Array:
 
     A wrong second derivative δ moves a round first-order subset of radius r by δ r²/8, the mean of δ x²/2 over it.
     """
-    curvature = fit.curvature.reshape(-1, 6)
-    with np.errstate(invalid="ignore"):
+    size = np.hypot(*found.sigma.T)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sigma = (found.sigma / size[:, None])[:, :, None] * fit.curvature_sigma[:, None, :]
         harm = fit.curvature_sigma.max(axis=1) * radius**2 / 8.0
-        known = np.isfinite(curvature).all(axis=1) & (harm < np.hypot(*found.sigma.T))
+        known = np.isfinite(fit.curvature).all(axis=(1, 2)) & (harm < size)
     if not known.any():
-        return np.zeros_like(curvature)
+        return np.zeros((len(size), 6))
+    curvature = fit.curvature[known].reshape(-1, 6)
+    curvature *= _clear(curvature, sigma[known].reshape(-1, 6), _CURVED)
     _, nearest = cKDTree(found.xy[known]).query(found.xy)
-    return np.asarray(curvature[known][nearest])
+    return np.asarray(curvature[nearest])
 
 
 def _unbiased(first: Correlation, second: Correlation, around: Neighbourhoods) -> Correlation:
-    """The second pass less the smooth part of its difference from the first, as far as that is more than noise.
-
-    The part b̂ taken off is b³/(b² + s²) for a difference b of uncertainty s: all of a clear bias, none of noise.
-    """
+    """The second pass less the smooth part of its difference from the first, as far as that is more than noise."""
     difference = second.uv - first.uv
     with np.errstate(invalid="ignore"):
         each = np.sqrt(np.maximum(first.sigma**2 - second.sigma**2, _LEAST_EXCESS * first.sigma**2))
@@ -172,12 +174,22 @@ def _unbiased(first: Correlation, second: Correlation, around: Neighbourhoods) -
     fit = around.fit(difference, size)
     with np.errstate(invalid="ignore", divide="ignore"):
         s = _OVERLAP * fit.value_sigma[:, None] * each / size[:, None]
-        share = fit.value**2 / (fit.value**2 + s**2)
-    known = np.isfinite(share).all(axis=1) & second.good
+    share = _clear(fit.value, s, _BIASED)
+    known = np.isfinite(fit.value).all(axis=1) & np.isfinite(s).all(axis=1) & second.good
     uv = np.where(known[:, None], second.uv - share * fit.value, second.uv)
-    doubt = np.hypot(share * s, _LEFT * share * fit.value)
+    doubt = share * np.hypot(s, _LEFT * fit.value)
     sigma = np.where(known[:, None], np.hypot(second.sigma, doubt), second.sigma)
     return replace(second, uv=uv, sigma=sigma)
+
+
+def _clear(values: Array, sigma: Array, limit: float) -> Array:
+    """How much (n, 1) of vectors (n, k) stands clear of their uncertainty: 1 - limit / Σ(v/σ)², or nothing.
+
+    The estimator of James & Stein (1961), its positive part: noise alone gives 0, so it costs nothing.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        squares = np.sum((values / sigma) ** 2, axis=1, keepdims=True)
+        return np.nan_to_num(np.maximum(0.0, 1.0 - limit / squares))
 
 
 def _contradicts(fit: QuadraticFit) -> NDArray[np.bool_]:
