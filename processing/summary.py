@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.calibration.quality import ReconstructionError
+from processing.drift import drift_sentences
 from processing.measure.window_study import gauge
 from processing.mesh import Mesh
 from processing.results import Results
@@ -48,7 +49,7 @@ def summarise(
         "agreement": dict(agreement),
         "strain": _strain(results),
         "steps": steps,
-        "warnings": list(warnings),
+        "warnings": [*warnings, *drift_sentences(drift, results.steps)],
     }
     return {**figures, "table": _table(figures)}
 
