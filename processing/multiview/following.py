@@ -43,12 +43,13 @@ class Followed:
     """n points of one image in another; NaN where status is not 0.
 
     warp : (n, 12) at the points: u v ux uy vx vy and uxx uxy uyy vxx vxy vyy. sigma : (n, 2) px of u v.
-    c_ls : (n,). status : (n,), see ``Status``.
+    c_ls : (n,). rest : (n,), mean square difference of the two subsets, grey levels². status : (n,), see ``Status``.
     """
 
     warp: Array
     sigma: Array
     c_ls: Array
+    rest: Array
     status: NDArray[np.int64]
 
     @property
@@ -58,7 +59,7 @@ class Followed:
 
     def part(self, index: NDArray) -> Followed:
         """Some of the points, by indices or a mask."""
-        return Followed(self.warp[index], self.sigma[index], self.c_ls[index], self.status[index])
+        return Followed(self.warp[index], self.sigma[index], self.c_ls[index], self.rest[index], self.status[index])
 
 
 def follow(
@@ -143,7 +144,7 @@ def _fitted(found: Correlation, around: Neighbourhoods) -> QuadraticFit:
     """The quadratics of the displacement, points that contradict it left out."""
     uv, sigma = found.uv, np.hypot(*found.sigma.T)
     fit = around.fit(uv, sigma)
-    odd = _contradicts(fit)
+    odd = contradicts(fit)
     return around.fit(np.where(odd[:, None], np.nan, uv), sigma) if odd.any() else fit
 
 
@@ -192,7 +193,7 @@ def _clear(values: Array, sigma: Array, limit: float) -> Array:
         return np.nan_to_num(np.maximum(0.0, 1.0 - limit / squares))
 
 
-def _contradicts(fit: QuadraticFit) -> NDArray[np.bool_]:
+def contradicts(fit: QuadraticFit) -> NDArray[np.bool_]:
     """Points (n,) far off the quadratic of their neighbours, measured by the scatter of all."""
     off = np.hypot(*fit.leave_out.T)
     known = np.isfinite(off)
@@ -201,21 +202,23 @@ def _contradicts(fit: QuadraticFit) -> NDArray[np.bool_]:
         return np.asarray(known & (off > max(_LEAST_OFF, _SCATTERS * scatter)))
 
 
-def _unlike(found: Correlation, reference: Reference, radius: int, around: Neighbourhoods) -> NDArray[np.bool_]:
-    """Points (n,) whose subsets differ between the images by far more than those about them: partly covered, or worn.
+def most_unlike(rest: Array, around: Neighbourhoods) -> Array:
+    """The largest mean square difference (n,) of a good match, from those of all, (n,); NaN where nothing is known.
 
-    Compared are mean square differences in grey levels, C_LS times the variance of the subset: noise leaves the same
+    A point whose subsets differ by far more than those about it is partly covered, or worn. Noise leaves the same
     in weak and in strong texture, so weak texture is not taken for a difference.
     """
-    good = np.flatnonzero(found.good)
-    if not len(good):
-        return np.zeros(len(found.xy), bool)
+    known = np.isfinite(rest)
+    return _UNLIKE * np.fmax(around.median(rest), np.median(rest[known])) if known.any() else np.full(len(rest), np.nan)
+
+
+def _rest(found: Correlation, reference: Reference, radius: int) -> Array:
+    """C_LS times the variance of the reference's subset, and no less than rounding to whole grey levels makes. (n,)."""
+    good = found.good
     rest = np.full(len(found.xy), np.nan)
-    rest[good] = found.c_ls[good] * _variance(reference, found.xy[good], radius)
-    least = (reference.grey_range / 255.0) ** 2  # rounding to whole grey levels and a little more
-    usual = np.maximum(around.median(rest), max(float(np.median(rest[good])), least))
-    with np.errstate(invalid="ignore"):
-        return np.asarray(rest > _UNLIKE * usual)
+    least = (reference.grey_range / 255.0) ** 2
+    rest[good] = np.maximum(found.c_ls[good] * _variance(reference, found.xy[good], radius), least)
+    return rest
 
 
 def _variance(reference: Reference, xy: Array, radius: int) -> Array:
@@ -236,15 +239,17 @@ def _variance(reference: Reference, xy: Array, radius: int) -> Array:
 def _judged(found: Correlation, reference: Reference, shift: Array, around: Neighbourhoods, radius: int) -> Followed:
     """The matches at the points themselves; those unlike the reference or against their neighbours lost."""
     status = found.status.copy()
-    status[_unlike(found, reference, radius, around)] = Status.LOW_ZNCC
+    rest = _rest(found, reference, radius)
+    status[rest > most_unlike(rest, around)] = Status.LOW_ZNCC
     kept = status == Status.GOOD
     fit = around.fit(np.where(kept[:, None], found.uv, np.nan), np.hypot(*found.sigma.T))
-    status[kept & _contradicts(fit)] = Status.INCONSISTENT
+    status[kept & contradicts(fit)] = Status.INCONSISTENT
     good = status == Status.GOOD
     warp = shifted(_warp(found), -shift)
     return Followed(
         np.where(good[:, None], warp, np.nan),
         np.where(good[:, None], found.sigma, np.nan),
         np.where(good, found.c_ls, np.nan),
+        np.where(good, rest, np.nan),
         status,
     )
