@@ -75,10 +75,12 @@ def sweep(
     radii: Array,
     search: Search,
     settings: CorrelationSettings,
+    least: int = 0,
 ) -> Sweep:
     """Look for the surface from the first camera's image in the second's, inside the mask if there is one.
 
-    image : of the first camera. radii : (K,) mm. The lattice is a multiple of the correlation's step.
+    image : of the first camera. radii : (K,) mm. The lattice is a multiple of the correlation's step. least : positions
+    of a connected piece of surface that is kept; 0 keeps the largest alone.
     """
     first, second = cameras
     spacing = settings.step * max(1, round(1.5 * settings.radius / settings.step))
@@ -101,7 +103,7 @@ def sweep(
         believed &= texture > _LEAST_CONTRAST * usual
     else:
         believed &= mask[px[:, 1].astype(int), px[:, 0].astype(int)]
-    good = coherent(radii[which].reshape(shape), believed.reshape(shape), tolerance=2.0)
+    good = coherent(radii[which].reshape(shape), believed.reshape(shape), tolerance=2.0, least=least)
     xyz = _spread(hypotheses.xyz[np.arange(len(met)), nearest], met, len(px)).reshape(*shape, 3)
     return Sweep(points, px, warps, xyz, good)
 

@@ -36,6 +36,7 @@ Mask = NDArray[np.bool_]
 log = logging.getLogger(__name__)
 
 _RETRIES = 3
+_PIECE = 6  # places of a sweep that hang together: an obstacle may part the surface in several
 _FEW = 1e-3  # share of the points below which another retry is not worth it
 _REFERENCES = 3  # cameras a node is matched from, one after the other, before it is lost
 
@@ -134,7 +135,8 @@ def _samples(ring: Ring, pairs: Sequence[tuple[int, int]], search: Search, progr
         progress(k / len(pairs))
         cameras = (ring.cameras[a], ring.cameras[b])
         mask = ring.masks.get(cameras[0].id)
-        seen_at = sweep(cameras, ring.grey(a), ring.current(b), mask, radii_of(cameras, search), search, ring.settings)
+        radii = radii_of(cameras, search)
+        seen_at = sweep(cameras, ring.grey(a), ring.current(b), mask, radii, search, ring.settings, _PIECE)
         found.append(seen_at.xyz[seen_at.good])
         log.debug("cameras %s, %s: %d places of the surface", cameras[0].id, cameras[1].id, len(found[-1]))
     samples = np.concatenate(found)
@@ -233,10 +235,10 @@ class _Surface:
 
     def _keep(self, nodes: tuple[Ints, Ints], reference: Ints, found: NodeMatches) -> None:
         settings, cameras = self.settings, self.ring.cameras
-        with np.errstate(invalid="ignore"):
-            uncertain: Mask = np.asarray((found.sigma > settings.sigma_max).any(axis=2))
-        px = np.where(uncertain[..., None], np.nan, found.px)
         sigma = np.sqrt(found.noise**2 + found.systematic**2 + settings.floor**2)
+        with np.errstate(invalid="ignore"):
+            uncertain: Mask = np.asarray((sigma > settings.sigma_max).any(axis=2))
+        px = np.where(uncertain[..., None], np.nan, found.px)
         points, used = triangulate_agreeing(cameras, px, sigma, reference)
         status = np.where(found.status != 0, found.status, 0)
         status = np.where((status == 0) & ~np.isfinite(points.xyz).all(axis=1), Lost.RESIDUAL, status)
