@@ -18,6 +18,7 @@ from processing.mesh import Mesh
 from processing.ranges import Ranges
 from processing.results import Results, read_results
 from processing.strain_window import StrainWindow, strain_window
+from processing.uncertainty.window import WindowScatter
 
 Array = NDArray[np.float64]
 
@@ -83,6 +84,10 @@ class Evaluated:
         return (*available(self._names), *(() if exponent is None else seth_hill_fields(exponent)))
 
     @cached_property
+    def _scatter(self) -> WindowScatter | None:
+        return None if self.window is None else self.results.scatter(self.window)
+
+    @cached_property
     def _names(self) -> set[str]:
         return self.step(0).names
 
@@ -102,7 +107,10 @@ class Evaluated:
         """The arrays of a step; those of the step asked for last are kept."""
         if self._last is None or self._last[0] != step:
             how = self.evaluation
-            self._last = step, self.results.fields(step, self.window, how.previous, how.rigid_motion_removed)
+            self._last = (
+                step,
+                self.results.fields(step, self.window, how.previous, how.rigid_motion_removed, self._scatter),
+            )
         return self._last[1]
 
     def positions(self, step: int) -> Array:
