@@ -153,7 +153,7 @@ def export(
 
 @app.command()
 def validate(
-    scale: Annotated[float, typer.Option(min=0.1, max=1.0, help="Image size; 1 is 2464 x 3280 px.")] = 0.25,
+    scale: Annotated[float, typer.Option(min=0.1, max=1.0, help="Image size; 1 is 2464 x 3280 px.")] = 1.0,
     out: Annotated[Path, typer.Option(help="Folder for images, sessions and tables; kept for the next run.")] = Path(
         "ringdic-validate"
     ),
