@@ -35,7 +35,7 @@ _CURVED = 20.0  # the same of second derivatives, of 6 numbers of overlapping su
 _LEFT = 0.25  # share of the bias that may be left: the neighbourhood is wider than the subset
 _SCATTERS = 8.0  # a point this many times off its neighbours' quadratic contradicts it
 _LEAST_OFF = 0.1  # px, and never less than this
-_UNLIKE = 8.0  # a mean square difference this many times the usual one is not noise
+_UNLIKE = 3.0  # a mean square difference this many times the usual one is not noise, which stays below 2
 
 
 @dataclass(frozen=True)
