@@ -30,7 +30,7 @@ def summarise(
     """Counts, calibration quality and one row of figures a step, as JSON values; ``table`` is for the terminal.
 
     drift : (F,) px by pair or camera, the mean vertical residual of each step: cameras that moved between frames.
-    agreement : of the surfaces of camera pairs, where there are any.
+    agreement : of the surfaces of camera pairs, or of the cameras about the points that all measured together.
     """
     steps = [_step(results, k) for k in range(len(results.steps))]
     control = {
@@ -127,6 +127,13 @@ def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
             {
                 "figure": "distance between the surfaces of neighbouring pairs",
                 "value": f"{agreement['mismatch_mm']:.4f} ± {agreement['mismatch_std_mm']:.4f} mm",
+            }
+        )
+    if agreement.get("residual_px") is not None:
+        rows.append(
+            {
+                "figure": "cameras a point, how far they miss it",
+                "value": f"{agreement['views']:.1f}, {agreement['residual_px']:.4f} px",
             }
         )
     strain = figures["strain"]
