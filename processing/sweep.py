@@ -87,7 +87,8 @@ def sweep(
     points = lattice(first.size, spacing, settings.radius + 2)
     shape = points.xy.shape[:2]
     px = points.xy.reshape(-1, 2)
-    met = np.flatnonzero(np.isfinite(on_cylinder(first, px, radii[-1:])).all(axis=(1, 2)))
+    drawn = np.ones(len(px), bool) if mask is None else mask[px[:, 1].astype(int), px[:, 0].astype(int)]
+    met = np.flatnonzero(drawn & np.isfinite(on_cylinder(first, px, radii[-1:])).all(axis=(1, 2)))
     hypotheses = stereo_hypotheses(first, second, px[met], radii, settings.radius)
     everywhere = prepare_reference(image, np.ones(image.shape, bool), settings)
     found = search_hypotheses(everywhere, current, px[met], hypotheses.warps, settings.radius)
@@ -101,8 +102,6 @@ def sweep(
         texture = contrast(image, px, settings.radius)
         usual = float(np.median(texture[believed])) if believed.any() else 0.0
         believed &= texture > _LEAST_CONTRAST * usual
-    else:
-        believed &= mask[px[:, 1].astype(int), px[:, 0].astype(int)]
     good = coherent(radii[which].reshape(shape), believed.reshape(shape), tolerance=2.0, least=least)
     xyz = _spread(hypotheses.xyz[np.arange(len(met)), nearest], met, len(px)).reshape(*shape, 3)
     return Sweep(points, px, warps, xyz, good)
