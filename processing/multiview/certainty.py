@@ -66,13 +66,13 @@ def certainty(cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, 
 
 
 def _of_step(count: int, motion: Motion, step: int) -> tuple[Array, Array]:
-    """Standard deviations (C, n, 2) of the pixels that the positions rest on: of all, and of noise alone."""
+    """Standard deviations (C, n, 2) of the pixels that the positions rest on: the weights, and by noise alone."""
     n = motion.status.shape[1]
     sigma, noise = np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan)
     for one in motion.tracks:
         used = one.used[step]
         who = one.vertex[used]
-        sigma[one.camera, who], noise[one.camera, who] = one.sigma[step, used], one.noise[step, used]
+        sigma[one.camera, who], noise[one.camera, who] = one.weight[step, used], one.noise[step, used]
     return sigma, noise
 
 

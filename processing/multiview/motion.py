@@ -15,6 +15,7 @@ from processing.multiview.agreement import triangulate_agreeing
 from processing.multiview.matching import Image
 from processing.multiview.shape import ReferenceShape
 from processing.multiview.tracking import Track, Tracking, track
+from processing.multiview.weights import smooth_sigma
 from processing.outliers import Lost, surface_outliers
 from processing.uncertainty.matches import match_parts
 from processing.uncertainty.noise import camera_noise
@@ -26,6 +27,7 @@ Mask = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 
+_CELL = 8  # steps of the correlation, side of the squares over which weights are levelled
 _LEAST_SIGMA = 1e-3  # px, what no match is better than
 
 
@@ -34,7 +36,8 @@ class CameraTrack:
     """The k points that one camera followed through F steps.
 
     camera : its index. vertex : (k,) the points. px, sigma : (F, k, 2) px, sigma with all that is uncertain in it;
-    noise : (F, k, 2) px, of the displacement by the images' noise alone. grey_noise : variance of the grey levels.
+    noise : (F, k, 2) px, of the displacement by the images' noise alone; weight : (F, k, 2) px, sigma level over the
+    image, by which positions are found. grey_noise : variance of the grey levels.
     c_ls, status : (F, k). used : (F, k), whether the position rests on it.
     """
 
@@ -43,6 +46,7 @@ class CameraTrack:
     px: Array
     sigma: Array
     noise: Array
+    weight: Array
     grey_noise: float
     c_ls: Array
     status: NDArray[np.int8]
@@ -106,8 +110,10 @@ def measure_motion(
         texture = shape.textures[k].part(vertex)
         variance = camera_noise(float(shape.grey_noise[k]), found.c_ls[1:], texture.contrast)
         noise, sigma = _parted(found, texture, variance)
+        cell = _CELL * correlation.step
+        weight = np.stack([smooth_sigma(x0, np.maximum(one, _LEAST_SIGMA), cell) for one in sigma])
         used = np.zeros(status.shape, bool)
-        tracks.append(CameraTrack(k, vertex, found.px, sigma, noise, variance, found.c_ls, status, used))
+        tracks.append(CameraTrack(k, vertex, found.px, sigma, noise, weight, variance, found.c_ls, status, used))
     progress(1.0, "")
     return _triangulated(cameras, shape, tuple(tracks), steps)
 
@@ -154,7 +160,7 @@ def _step(cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, step
         good = one.status[step] == 0
         who = one.vertex[good]
         px[one.camera, who] = one.px[step, good]
-        sigma[one.camera, who] = np.maximum(one.sigma[step, good], _LEAST_SIGMA)
+        sigma[one.camera, who] = one.weight[step, good]
         c_ls[one.camera, who] = one.c_ls[step, good]
         status[one.vertex[~good]] = one.status[step, ~good]
     points, used = triangulate_agreeing(cameras, px, sigma)

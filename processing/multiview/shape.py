@@ -25,6 +25,7 @@ from processing.multiview.lattice import Pieces, evaluate, robust_pieces
 from processing.multiview.matching import Image, NodeMatches, Ring, match_nodes
 from processing.multiview.tube import lattice_faces
 from processing.multiview.views import seen
+from processing.multiview.weights import smooth_sigma
 from processing.outliers import Lost
 from processing.sweep import Search, radii_of, sweep
 from processing.uncertainty.texture import Texture, TextureMap
@@ -40,6 +41,7 @@ _PIECE = 6  # places of a sweep that hang together: an obstacle may part the sur
 _FEW = 1e-3  # share of the points below which another retry is not worth it
 _REFERENCES = 3  # cameras a node is matched from, one after the other, before it is lost
 
+_CELL = 8  # steps of the correlation, side of the squares over which weights are levelled
 _NOTHING = TextureMap(np.full((1, 1, 5), np.nan, np.float32), 1, (1, 1))  # of a camera without an image
 
 
@@ -50,7 +52,8 @@ class ShapeSettings:
     incidence : the steepest view that is used. spacing : of the lattice, 0 for the correlation's step as the cameras
     see it. curvature : "geometry" holds the second derivatives that the measured shape gives each warp; "none" leaves
     flat subsets flat. piece : reach of the smooth pieces. sigma_max : px, the least certain match that is believed.
-    floor : px, what a pixel is uncertain by beside noise and what the images' difference shows, as by calibration.
+    floor : px, what a pixel is uncertain by beside noise and what the images' difference shows: the cameras, and a
+    shape that bends otherwise than its pieces do.
     """
 
     incidence: float = 65.0
@@ -58,7 +61,7 @@ class ShapeSettings:
     curvature: str = "geometry"
     piece: float = 6.0
     sigma_max: float = 0.05
-    floor: float = 0.002
+    floor: float = 0.005
 
 
 @dataclass(frozen=True)
@@ -67,9 +70,9 @@ class ReferenceShape:
 
     xyz : (n, 3) mm. node : (n, 2) column and row on the lattice. reference : (n,) index of the camera that the point
     was matched from, where it lies on a whole pixel. px, sigma : (C, n, 2), NaN for a camera that was not used; sigma
-    with all that is uncertain in it, noise : (C, n, 2) px, of each image's noise alone. textures, grey_noise : of each
-    camera's image at px, and its variance, NaN where it has none. covariance : (n, 3, 3) mm². chi2, degrees : (n,).
-    c_ls : (n,), the largest over the cameras.
+    with all that is uncertain in it and level over the image, noise : (C, n, 2) px, of each image's noise alone.
+    textures, grey_noise : of each camera's image at px, and its variance, NaN where it has none. covariance :
+    (n, 3, 3) mm². chi2, degrees : (n,). c_ls : (n,), the largest over the cameras.
     faces : (M, 3), outwards. pieces : the surface as fitted. status : (columns, rows) of all nodes, 0 where measured;
     NOT_REACHED also where there is no surface. made, seconds : matches and the time they took.
     """
@@ -238,7 +241,10 @@ class _Surface:
         sigma = np.sqrt(found.noise**2 + found.systematic**2 + settings.floor**2)
         with np.errstate(invalid="ignore"):
             uncertain: Mask = np.asarray((sigma > settings.sigma_max).any(axis=2))
+        uncertain[reference, np.arange(len(reference))] = False  # its pixel names the point
         px = np.where(uncertain[..., None], np.nan, found.px)
+        cell = _CELL * self.ring.settings.step
+        sigma = np.stack([smooth_sigma(at, own, cell) for at, own in zip(px, sigma, strict=True)])
         points, used = triangulate_agreeing(cameras, px, sigma, reference)
         status = np.where(found.status != 0, found.status, 0)
         status = np.where((status == 0) & ~np.isfinite(points.xyz).all(axis=1), Lost.RESIDUAL, status)
