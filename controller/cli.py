@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from controller import measuring
+from controller import measuring, reporting
 from controller.console import narrated, show_table
 from processing.errors import InputError, RingdicError
 
@@ -30,6 +30,7 @@ Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="GROUP.NAM
 SettingsFile = Annotated[Path | None, typer.Option("--settings", help="Settings as a TOML file.")]
 app.add_typer(measuring.measure)
 app.command()(measuring.strain)
+app.command()(reporting.report)
 
 
 @app.command()

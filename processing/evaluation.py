@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from processing.errors import InputError
 from processing.fields import Field, StepFields, available, field, seth_hill_fields
 from processing.mesh import Mesh
-from processing.ranges import Ranges
+from processing.ranges import Ranges, even_limits
 from processing.results import Results, read_results
 from processing.strain_window import StrainWindow, strain_window
 from processing.uncertainty.window import WindowScatter
@@ -133,11 +133,7 @@ class Evaluated:
         ranges = Ranges((entry,))
         for step in range(len(self.steps)):
             ranges.add(self.step(step))
-        low, high = ranges.table()[0]["range"] or (0.0, 1.0)
-        if entry.centre is not None:
-            reach = max(abs(low - entry.centre), abs(high - entry.centre), 1e-6)
-            low, high = entry.centre - reach, entry.centre + reach
-        return (low, high) if high > low else (low - 0.5, low + 0.5)
+        return even_limits(ranges.table()[0]["range"], entry.centre)
 
 
 def evaluated(results_path: Path, evaluation: Evaluation = Evaluation()) -> Evaluated:
