@@ -30,7 +30,8 @@ Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="GROUP.NAM
 SettingsFile = Annotated[Path | None, typer.Option("--settings", help="Settings as a TOML file.")]
 app.add_typer(measuring.measure)
 app.command()(measuring.strain)
-app.command()(reporting.report)
+for _command in (reporting.report, reporting.overlay, reporting.animate):
+    app.command()(_command)
 
 
 @app.command()

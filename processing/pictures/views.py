@@ -13,6 +13,9 @@ from processing.pictures.painter import FaceImage, paint
 
 Array = NDArray[np.float64]
 
+Extent = tuple[float, float, float, float]
+
+_TILT = float(np.radians(15.0))
 _STEEPEST = 0.05  # cosine below which a triangle is seen edge-on and is not drawn
 
 
@@ -27,7 +30,7 @@ class View:
 
     faces: FaceImage
     inside: NDArray[np.bool_]
-    extent: tuple[float, float, float, float]
+    extent: Extent
     aspect: float
 
     @property
@@ -69,20 +72,36 @@ def unrolled(mesh: Mesh, width: int = 720) -> View:
     return View(faces, np.zeros(faces.shape, dtype=bool), extent, arc / max(high - low, 1e-6))
 
 
-def from_side(mesh: Mesh, azimuth: float, height: int = 560, tilt: float = np.radians(15.0)) -> View:
-    """The surface seen from afar at an azimuth (rad), from ``tilt`` above the horizontal; extent in mm, z upwards."""
-    towards = np.array([np.cos(azimuth) * np.cos(tilt), np.sin(azimuth) * np.cos(tilt), np.sin(tilt)])
-    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    up = np.cross(towards, right)
+def from_side(mesh: Mesh, azimuth: float, height: int = 560, tilt: float = _TILT, extent: Extent | None = None) -> View:
+    """The surface seen from afar at an azimuth (rad), from ``tilt`` above the horizontal; extent in mm, up is up.
+
+    extent : what the picture shows, by default the whole surface. Lost triangles are left out.
+    """
+    towards, right, up = _axes(azimuth, tilt)
+    extent = side_extent(mesh, azimuth, tilt) if extent is None else extent
     corners = mesh.vertices[mesh.faces]
     flat = np.stack([corners @ right, corners @ up], axis=2)
-    low, high = np.nanmin(flat, axis=(0, 1)), np.nanmax(flat, axis=(0, 1))
-    margin = 0.02 * float(high[1] - low[1])
-    extent = (low[0] - margin, high[0] + margin, low[1] - margin, high[1] + margin)
     width = max(1, round(height * (extent[1] - extent[0]) / (extent[3] - extent[2])))
     faces = paint(_in_pixels(flat, extent, (height, width)), -(corners @ towards).mean(axis=1), (height, width))
     away = mesh.area_vectors @ towards <= 0
     return View(faces, np.where(faces >= 0, away[faces], False), extent, width / height)
+
+
+def side_extent(mesh: Mesh, azimuth: float, tilt: float = _TILT) -> Extent:
+    """Left, right, bottom and top, mm, of a surface as ``from_side`` shows it, with a margin."""
+    _, right, up = _axes(azimuth, tilt)
+    corners = mesh.vertices[mesh.faces[mesh.whole_faces()]].reshape(-1, 3)
+    flat = corners @ np.stack([right, up], axis=1)
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    margin = 0.02 * float((high - low).max())
+    return float(low[0]) - margin, float(high[0]) + margin, float(low[1]) - margin, float(high[1]) + margin
+
+
+def _axes(azimuth: float, tilt: float) -> tuple[Array, Array, Array]:
+    """Unit vectors towards the onlooker, to the right and up of the picture."""
+    towards = np.array([np.cos(azimuth) * np.cos(tilt), np.sin(azimuth) * np.cos(tilt), np.sin(tilt)])
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    return towards, right, np.cross(towards, right)
 
 
 def through_camera(mesh: Mesh, camera: Camera) -> FaceImage:
@@ -105,7 +124,7 @@ def _cut(azimuth: Array) -> float:
     return float(ordered[widest] + 0.5 * gaps[widest]) if gaps[widest] > 20.0 else 0.0
 
 
-def _in_pixels(xy: Array, extent: tuple[float, float, float, float], shape: tuple[int, int]) -> Array:
+def _in_pixels(xy: Array, extent: Extent, shape: tuple[int, int]) -> Array:
     """Places (..., 2) of the axes in pixels of a picture whose borders are the extent's."""
     left, right, low, high = extent
     x = (xy[..., 0] - left) / (right - left) * shape[1] - 0.5

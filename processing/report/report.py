@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from processing.errors import InputError
 from processing.evaluation import Evaluated, evaluated
+from processing.mesh import Mesh
 from processing.pictures.scale import Scale
 from processing.pictures.views import from_side, mean_azimuth, unrolled
 from processing.report import plots, tables
@@ -159,16 +159,12 @@ def _views(seen: Evaluated, steps: Sequence[int]) -> list[plots.StepViews]:
     front = mean_azimuth(seen.results.mesh)
     made = []
     for step in steps:
-        mesh, _, whole = seen.measured(step)
-        numbers = np.append(np.flatnonzero(whole), -1)
+        mesh = Mesh(seen.positions(step), seen.results.faces)
         sides = []
-        for name, azimuth in (("front", front), ("back", front + np.pi)):
-            if not len(mesh.faces):
-                continue
+        for azimuth in (front, front + np.pi) if mesh.whole_faces().any() else ():
             view = from_side(mesh, azimuth)
-            if name == "front" or view.outside_share > _WORTHWHILE:
-                title = f"from {np.degrees(azimuth) % 360:.0f}°"
-                sides.append((title, replace(view, faces=numbers[view.faces].astype(np.int32))))
+            if not sides or view.outside_share > _WORTHWHILE:
+                sides.append((f"from {np.degrees(azimuth) % 360:.0f}°", view))
         made.append(plots.StepViews(step, seen.steps[step], reference, sides))
     fewest = min(len(step.sides) for step in made)
     return [plots.StepViews(each.step, each.name, each.unrolled, each.sides[:fewest]) for each in made]
