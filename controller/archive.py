@@ -230,13 +230,20 @@ class CaptureWriter:
         }
         return self._store(camera, f".{manifest.format}", image, manifest.sha256, entry)
 
-    def store_file(self, camera: str, source: Path, width: int, height: int) -> Stored:
-        """Archive the file `source` byte for byte, with its extension."""
+    def store_file(self, camera: str, source: Path, width: int, height: int, *, link: bool = False) -> Stored:
+        """Archive the file `source` byte for byte, with its extension.
+
+        link : share the file on the disk instead of copying it, where the file system can; for a source that nobody
+        writes to any more.
+        """
         image = source.read_bytes()
         entry = {"width": width, "height": height, "original": str(source)}
-        return self._store(camera, source.suffix.lower(), image, hashlib.sha256(image).hexdigest(), entry)
+        sha256 = hashlib.sha256(image).hexdigest()
+        return self._store(camera, source.suffix.lower(), image, sha256, entry, source if link else None)
 
-    def _store(self, camera: str, suffix: str, image: bytes, sha256: str, entry: dict[str, Any]) -> Stored:
+    def _store(
+        self, camera: str, suffix: str, image: bytes, sha256: str, entry: dict[str, Any], shared: Path | None = None
+    ) -> Stored:
         if hashlib.sha256(image).hexdigest() != sha256:
             raise ValueError(f"the image of camera {camera} does not have the checksum it came with")
         with self._lock:
@@ -245,7 +252,8 @@ class CaptureWriter:
                 raise ValueError(f"camera {camera} is not expected in capture {self.capture_id}")
             path = self.path / f"{camera}{suffix}"
             try:
-                place(path, image)
+                if shared is None or not _linked(shared, path):
+                    place(path, image)
                 verdict = "archived"
             except FileExistsError:
                 if hashlib.sha256(path.read_bytes()).hexdigest() != sha256:
@@ -339,6 +347,17 @@ def place(path: Path, content: bytes) -> None:
     finally:
         aside.unlink()
     _flush_folder(path.parent)
+
+
+def _linked(source: Path, path: Path) -> bool:
+    """Give a file a second name; False where the file system cannot. Raises FileExistsError, never replaces."""
+    try:
+        os.link(source, path)
+    except FileExistsError:
+        raise
+    except OSError:
+        return False
+    return True
 
 
 def replace_json(path: Path, document: dict[str, Any]) -> None:

@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
+from controller import measuring
 from controller.console import narrated, show_table
 from processing.errors import InputError, RingdicError
 
@@ -27,6 +28,8 @@ app = typer.Typer(
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="GROUP.NAME=VALUE", help="Repeatable.")]
 SettingsFile = Annotated[Path | None, typer.Option("--settings", help="Settings as a TOML file.")]
+app.add_typer(measuring.measure)
+app.command()(measuring.strain)
 
 
 @app.command()
@@ -128,16 +131,43 @@ def export(
     session: Annotated[Path, typer.Argument(help="The session folder.")],
     format_: Annotated[str, typer.Option("--format", help="npz, vtkhdf, vtp, mat, csv, ply or glb.")] = "npz",
     out: Annotated[Path | None, typer.Option(help="Where to; beside the results unless given.")] = None,
+    reference: measuring.Reference = "first",
+    without_rigid_motion: measuring.WithoutRigidMotion = False,
+    window: measuring.Window = None,
+    seth_hill: measuring.SethHill = None,
+    colour: Annotated[str | None, typer.Option(help="Field that ply and glb are coloured by.")] = None,
+    run: measuring.Run = None,
     as_json: AsJson = False,
 ) -> None:
-    """The newest results in another program's form."""
+    """Results in another program's form, evaluated anew from their positions."""
+    from processing.evaluation import Evaluation
     from processing.export import export as export_session
 
-    written = export_session(session, format_, out)
+    how = Evaluation.of(reference, without_rigid_motion, window, seth_hill)
+    written = export_session(session, format_, out, how, colour, run)
     if as_json:
         _print_json({"written": str(written)})
     else:
         typer.echo(f"written {written}", err=True)
+
+
+@app.command()
+def validate(
+    scale: Annotated[float, typer.Option(min=0.1, max=1.0, help="Image size; 1 is 2464 x 3280 px.")] = 0.25,
+    out: Annotated[Path, typer.Option(help="Folder for images, sessions and tables; kept for the next run.")] = Path(
+        "ringdic-validate"
+    ),
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer board views and steps.")] = False,
+    only: Annotated[list[str] | None, typer.Option(metavar="EXPERIMENT", help="One experiment; repeatable.")] = None,
+    images_only: Annotated[bool, typer.Option("--images-only", help="Render the images and stop.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """The paper's experiments on the virtual rig, beside the paper's figures."""
+    from controller.validate import run_validation
+
+    found = run_validation(out, scale=scale, quick=quick, only=only or (), images_only=images_only)
+    if as_json:
+        _print_json(found)
 
 
 @app.command()

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from processing import strain
+
 Array = NDArray[np.float64]
 _I = np.eye(3)
 
@@ -34,6 +36,8 @@ class Deformation:
         principal directions of that configuration.
     area : (M,) mm², reference. isotropy : (..., M) 1 equilateral … 0 degenerate, current.
     normal_reference : (M, 3); normal_current : (..., M, 3), unit.
+
+    Other families of strain follow from the stretches and directions: :mod:`processing.strain`.
     """
 
     F: Array
@@ -77,11 +81,19 @@ def deformation(reference: Array, current: Array, faces: NDArray[np.int_]) -> De
     current : (N, 3) or (F, N, 3) mm, NaN where a vertex is lost.
     faces : (M, 3) vertex indices, counter-clockwise seen from outside.
     """
+    reference, current = np.asarray(reference, dtype=float), np.asarray(current, dtype=float)
+    D, area = directors(reference, faces)
+    d, _ = directors(current, faces)
+    return of_directors(D, d, area, isotropy(current, faces))
+
+
+def of_directors(D: Array, d: Array, area: Array, isotropy: Array) -> Deformation:
+    """The same from directors (..., M, 3, 3), rows D1 D2 in the tangent plane and D3 the unit normal, before and after.
+
+    area : (M,) mm². isotropy : (..., M).
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
-        D, area = directors(np.asarray(reference, dtype=float), faces)
-        d, _ = directors(np.asarray(current, dtype=float), faces)
-        reciprocal = _reciprocal(D)  # (M, 3 directors, 3): rows D^1, D^2, D^3
-        F = np.einsum("...mki,mkj->...mij", d, reciprocal)  # eq. 13
+        F = np.einsum("...ki,...kj->...ij", d, _reciprocal(D))  # eq. 13
         C = np.einsum("...ki,...kj->...ij", F, F)  # eq. 14
         E = 0.5 * (C - _I)  # eq. 16
         b_inverse = _inverse_left_cauchy_green(D, d)
@@ -94,13 +106,12 @@ def deformation(reference: Array, current: Array, faces: NDArray[np.int_]) -> De
         return Deformation(
             F=F, E=E, e=e, J=lambda1 * lambda2, lambda1=lambda1, lambda2=lambda2, E1=E1, E2=E2, e1=e1, e2=e2,
             E_magnitude=_norm(E), e_magnitude=_norm(e), E_equivalent=_equivalent(E), e_equivalent=_equivalent(e),
-            E_shear=0.5 * (E2 - E1), e_shear=0.5 * (e2 - e1),
+            E_shear=strain.shear(E1, E2), e_shear=strain.shear(e1, e2),
             direction1_reference=direction1, direction2_reference=direction2,
             direction1_current=now1, direction2_current=now2,
             shear_direction_reference=_diagonals(direction1, direction2),
             shear_direction_current=_diagonals(now1, now2),
-            area=area, isotropy=isotropy(np.asarray(current, dtype=float), faces),
-            normal_reference=D[..., 2, :], normal_current=d[..., 2, :],
+            area=area, isotropy=isotropy, normal_reference=D[..., 2, :], normal_current=d[..., 2, :],
         )  # fmt: skip
 
 
@@ -109,10 +120,11 @@ def directors(vertices: Array, faces: NDArray[np.int_]) -> tuple[Array, Array]:
     corners = vertices[..., faces, :]
     D1 = corners[..., 1, :] - corners[..., 0, :]
     D2 = corners[..., 2, :] - corners[..., 0, :]
-    cross = np.cross(D1, D2)
-    length = np.linalg.norm(cross, axis=-1, keepdims=True)
-    length = np.where(length > 0, length, np.nan)
-    return np.stack([D1, D2, cross / length], axis=-2), 0.5 * length[..., 0]
+    with np.errstate(invalid="ignore"):
+        cross = np.cross(D1, D2)
+        length = np.linalg.norm(cross, axis=-1, keepdims=True)
+        length = np.where(length > 0, length, np.nan)
+        return np.stack([D1, D2, cross / length], axis=-2), 0.5 * length[..., 0]
 
 
 def isotropy(vertices: Array, faces: NDArray[np.int_]) -> Array:
@@ -136,7 +148,7 @@ def _reciprocal(D: Array) -> Array:
 
 def _inverse_left_cauchy_green(D: Array, d: Array) -> Array:
     """``B⁻¹ = F⁻ᵀ F⁻¹`` with ``F⁻¹ = Σ D_i ⊗ d^i``, the same element seen from the current configuration."""
-    F_inverse = np.einsum("mki,...mkj->...mij", D, _reciprocal(d))
+    F_inverse = np.einsum("...ki,...kj->...ij", D, _reciprocal(d))
     return np.einsum("...ki,...kj->...ij", F_inverse, F_inverse)
 
 
@@ -144,9 +156,9 @@ def _principal_in_plane(E: Array, D: Array) -> tuple[Array, Array, Array, Array]
     """Principal values and unit directions of E in the plane of the reference triangle, smaller value first."""
     a1 = D[..., 0, :] / np.linalg.norm(D[..., 0, :], axis=-1, keepdims=True)
     a2 = np.cross(D[..., 2, :], a1)
-    E11 = np.einsum("mi,...mij,mj->...m", a1, E, a1)
-    E22 = np.einsum("mi,...mij,mj->...m", a2, E, a2)
-    E12 = np.einsum("mi,...mij,mj->...m", a1, E, a2)
+    E11 = np.einsum("...i,...ij,...j->...", a1, E, a1)
+    E22 = np.einsum("...i,...ij,...j->...", a2, E, a2)
+    E12 = np.einsum("...i,...ij,...j->...", a1, E, a2)
     mean, half, radius = 0.5 * (E11 + E22), 0.5 * (E11 - E22), np.hypot(0.5 * (E11 - E22), E12)
     angle = 0.5 * np.arctan2(E12, half) + 0.5 * np.pi  # of the smaller principal value, from a1
     cos, sin = np.cos(angle)[..., None], np.sin(angle)[..., None]

@@ -1,20 +1,31 @@
 """The fields of a result: one table of what there is, and their values at one step.
 
-A rigid motion changes displacements, the Euler-Almansi tensor and directions in the current configuration; stretches,
-J, principal strains, magnitudes, equivalent strain, shear and isotropy are the same with and without it.
+Every strain is a function of the two principal values E1, E2 and of directions, so few arrays are kept and the table
+says how each field follows from them. A rigid motion changes displacements, the Euler-Almansi tensor and directions in
+the current configuration; stretches, J, principal strains, magnitudes, equivalent strain, shear and isotropy are the
+same with and without it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.deformation import deformation
+from processing import strain
+from processing.deformation import Deformation, deformation
 from processing.rigid_motion import RigidMotion
+from processing.strain_window import StrainWindow
 
 Array = NDArray[np.float64]
+
+
+def _itself(values: Array) -> Array:
+    return values
 
 
 @dataclass(frozen=True)
@@ -22,8 +33,8 @@ class Field:
     """One scalar field.
 
     location : "point" or "face". centre : where a diverging colour scale has its middle, None for a sequential one.
-    rigid : whether removing the rigid motion changes it. stored, part : the stored array and which of its columns this
-    is; -1 for the length of the row, None where the array is the field itself.
+    rigid : whether removing the rigid motion changes it. group : heading under which lists of fields show it.
+    of, value : the arrays that it follows from, by name, and how.
     """
 
     name: str
@@ -32,47 +43,129 @@ class Field:
     location: str
     centre: float | None = None
     rigid: bool = False
-    stored: str = ""
-    part: int | None = None
+    group: str = "Quality"
+    of: tuple[str, ...] = ()
+    value: Callable[..., Array] = _itself
 
     def __post_init__(self) -> None:
         if self.location not in ("point", "face"):
             raise ValueError(f"a field lies on points or faces, not '{self.location}'")
-        if not self.stored:
-            object.__setattr__(self, "stored", self.name)
+        if not self.of:
+            object.__setattr__(self, "of", (self.name,))
+
+    def row(self) -> dict[str, Any]:
+        """The field in a catalogue, as JSON values."""
+        names = ("name", "label", "unit", "location", "centre", "rigid", "group")
+        return {name: getattr(self, name) for name in names}
+
+    def from_arrays(self, array: Callable[[str], Array], rigid_motion_removed: bool = False) -> Array:
+        """Its values, from what ``array`` knows under the names in ``of``."""
+        suffix = "_without_rigid_motion" if self.rigid and rigid_motion_removed else ""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return self.value(*(array(name + suffix) for name in self.of))
+
+
+def _column(index: int, values: Array) -> Array:
+    return values[..., index]
+
+
+def _length(values: Array) -> Array:
+    return np.asarray(np.linalg.norm(values, axis=-1))
+
+
+def _stretch(E: Array) -> Array:
+    return np.sqrt(1.0 + 2.0 * E)
+
+
+def _principal(m: float, E: Array) -> Array:
+    """Principal strain of the Seth-Hill family m from that of Green-Lagrange; small strains keep their digits."""
+    log = 0.5 * np.log1p(2.0 * E)
+    return log if m == 0 else np.expm1(2.0 * m * log) / (2.0 * m)
+
+
+def _scalar(measure: Callable[[Array, Array], Array], m: float, E1: Array, E2: Array) -> Array:
+    return measure(_principal(m, E1), _principal(m, E2))
+
+
+_SCALARS: tuple[tuple[str, str, Callable[[Array, Array], Array], float | None], ...] = (
+    ("1", "smaller principal", lambda first, second: first, 0.0),
+    ("2", "larger principal", lambda first, second: second, 0.0),
+    ("_magnitude", "magnitude", strain.magnitude, None),
+    ("_equivalent", "equivalent", strain.equivalent, None),
+    ("_shear", "largest shear", strain.shear, None),
+)
+
+
+def _family(name: str, label: str, m: float) -> Iterator[Field]:
+    symbol = f"{label} {name}" if name in "Ee" else label
+    for suffix, scalar, measure, centre in _SCALARS:
+        text = f"{symbol}{suffix}, {scalar}" if name in "Ee" and suffix in "12" else f"{symbol}, {scalar}"
+        value = partial(_scalar, measure, m)
+        yield Field(name + suffix, text, "", "face", centre, group=f"{label} strain", of=("E1", "E2"), value=value)
+
+
+_DEFORMATION = (
+    Field("J", "Area ratio J", "", "face", 1.0, group="Stretch"),
+    Field("lambda1", "Smaller stretch λ1", "", "face", 1.0, group="Stretch"),
+    Field("lambda2", "Larger stretch λ2", "", "face", 1.0, group="Stretch"),
+    *_family("E", "Green-Lagrange", strain.GREEN_LAGRANGE),
+    *_family("e", "Euler-Almansi", strain.EULER_ALMANSI),
+    *_family("hencky", "Hencky", strain.HENCKY),
+    *_family("biot", "Biot", strain.BIOT),
+)
+_OVER_STRETCHES: dict[str, Callable[..., Array]] = {
+    "J": lambda E1, E2: _stretch(E1) * _stretch(E2),
+    "lambda1": lambda E1, E2: _stretch(E1),
+    "lambda2": lambda E1, E2: _stretch(E2),
+}
+_OVER_WINDOW = ("J", "lambda1", "lambda2", "E1", "E2", "E_magnitude", "E_equivalent", "E_shear", "hencky1", "hencky2")
+
+
+def _windowed(entry: Field) -> Field:
+    """The same field over the strain window."""
+    return replace(
+        entry, name=f"window_{entry.name}", label=f"Window: {entry.label}", group="Over the strain window",
+        of=("window_E1", "window_E2"), value=_OVER_STRETCHES.get(entry.name, entry.value),
+    )  # fmt: skip
+
+
+def _strain_sigma(E: Array, sigma_stretch: Array) -> Array:
+    return _stretch(E) * sigma_stretch  # dE = λ dλ
 
 
 FIELDS = (
-    Field("displacement", "Displacement", "mm", "point", None, True, "displacement", -1),
-    Field("displacement_x", "Displacement x", "mm", "point", 0.0, True, "displacement", 0),
-    Field("displacement_y", "Displacement y", "mm", "point", 0.0, True, "displacement", 1),
-    Field("displacement_z", "Displacement z", "mm", "point", 0.0, True, "displacement", 2),
-    Field("J", "Area ratio J", "", "face", 1.0),
-    Field("lambda1", "Smaller stretch λ1", "", "face", 1.0),
-    Field("lambda2", "Larger stretch λ2", "", "face", 1.0),
-    Field("E1", "Green-Lagrange, smaller principal E1", "", "face", 0.0),
-    Field("E2", "Green-Lagrange, larger principal E2", "", "face", 0.0),
-    Field("e1", "Euler-Almansi, smaller principal e1", "", "face", 0.0),
-    Field("e2", "Euler-Almansi, larger principal e2", "", "face", 0.0),
-    Field("E_magnitude", "Green-Lagrange, magnitude |E|", "", "face"),
-    Field("e_magnitude", "Euler-Almansi, magnitude |e|", "", "face"),
-    Field("E_equivalent", "Green-Lagrange, equivalent", "", "face"),
-    Field("e_equivalent", "Euler-Almansi, equivalent", "", "face"),
-    Field("E_shear", "Green-Lagrange, largest shear", "", "face"),
-    Field("e_shear", "Euler-Almansi, largest shear", "", "face"),
-    Field("isotropy", "Shape of the triangle (1 equilateral)", "", "face"),
-    Field("area", "Area in the reference", "mm²", "face"),
+    Field("displacement", "Displacement", "mm", "point", None, True, "Displacement", ("displacement",), _length),
+    *(
+        Field(
+            f"displacement_{axis}", f"Displacement {axis}", "mm", "point", 0.0, True, "Displacement",
+            ("displacement",), partial(_column, i),
+        )
+        for i, axis in enumerate("xyz")
+    ),
+    *_DEFORMATION,
+    *(_windowed(entry) for entry in _DEFORMATION if entry.name in _OVER_WINDOW),
+    Field("sigma", "Standard deviation of the position", "mm", "point", None, False, "Uncertainty",
+          ("sigma_xyz",), _length),
+    Field("sigma_displacement", "Standard deviation of the displacement", "mm", "point", None, False, "Uncertainty",
+          ("sigma_displacement",), _length),
+    *(
+        Field(f"sigma_lambda{k}", f"Standard deviation of λ{k}", "", "face", None, False, "Uncertainty")
+        for k in (1, 2)
+    ),
+    *(
+        Field(f"sigma_E{k}", f"Standard deviation of E{k}", "", "face", None, False, "Uncertainty",
+              (f"E{k}", f"sigma_lambda{k}"), _strain_sigma)
+        for k in (1, 2)
+    ),
+    Field("chi2", "Disagreement of the cameras, χ² a degree of freedom", "", "point"),
     Field("correlation", "Correlation C_LS (0 best)", "", "point"),
     Field("face_correlation", "Correlation C_LS, worst corner", "", "face"),
-    Field("sigma", "Standard deviation of the position", "mm", "point", None, False, "sigma_xyz", -1),
+    Field("isotropy", "Shape of the triangle (1 equilateral)", "", "face"),
+    Field("area", "Area in the reference", "mm²", "face", of=("area", "E1"),
+          value=lambda area, E1: np.where(np.isfinite(E1), area, np.nan)),
     Field("pair", "Camera pair", "", "face"),
-)
-
-#: Scalars of the deformation that are stored as they are.
-_SCALARS = (
-    "J", "lambda1", "lambda2", "E1", "E2", "e1", "e2", "E_magnitude", "e_magnitude", "E_equivalent", "e_equivalent",
-    "E_shear", "e_shear", "isotropy",
 )  # fmt: skip
+
 _DIRECTIONS = ("direction1_reference", "direction2_reference", "direction1_current", "direction2_current")
 #: VTK's order of a symmetric tensor.
 _SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
@@ -80,65 +173,122 @@ _SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 
 @dataclass(frozen=True)
 class StepFields:
-    """Arrays of one step, float32, by name: ``point`` (N, ...) and ``face`` (M, ...)."""
+    """Arrays of one step by name, in full precision: ``point`` (N, ...) and ``face`` (M, ...).
 
-    point: dict[str, NDArray[np.float32]]
-    face: dict[str, NDArray[np.float32]]
+    Vectors are (·, 3); symmetric tensors (·, 6) in the order xx yy zz xy yz xz.
+    """
+
+    point: dict[str, Array]
+    face: dict[str, Array]
+
+    @property
+    def names(self) -> set[str]:
+        """The arrays there are."""
+        return {*self.point, *self.face}
+
+    def scalar(self, entry: Field, rigid_motion_removed: bool = False) -> Array:
+        """The values of a field, (N,) or (M,)."""
+        arrays = self.point if entry.location == "point" else self.face
+        return entry.from_arrays(arrays.__getitem__, rigid_motion_removed)
+
+
+@dataclass(frozen=True)
+class Certainty:
+    """What is known of each point and triangle beside its place, at one step; None where it is not known.
+
+    correlation : (N,) C_LS. sigma_xyz, sigma_displacement : (N, 3) mm. sigma_lambda : (M, 2). chi2 : (N,).
+    """
+
+    correlation: Array
+    sigma_xyz: Array
+    sigma_displacement: Array | None = None
+    sigma_lambda: Array | None = None
+    chi2: Array | None = None
 
 
 def field(name: str) -> Field:
-    """The field of a name; KeyError if there is none."""
+    """The field of a name; KeyError if there is none.
+
+    Beside those of the table, ``seth_hill1:M``, ``seth_hill2:M``, ``seth_hill_magnitude:M``, … for any exponent M, and
+    every field of deformation as ``window_…``.
+    """
     for entry in FIELDS:
         if entry.name == name:
+            return entry
+    if name.startswith("window_"):
+        inner = field(name.removeprefix("window_"))
+        if inner.of == ("E1", "E2"):
+            return _windowed(inner)
+    family, colon, exponent = name.partition(":")
+    for entry in seth_hill_fields(_number(exponent)) if colon else ():
+        if entry.name.partition(":")[0] == family:
             return entry
     raise KeyError(name)
 
 
+def seth_hill_fields(exponent: float) -> tuple[Field, ...]:
+    """The fields of the Seth-Hill family with any exponent."""
+    fields = _family("seth_hill", f"Seth-Hill m = {exponent:g}", exponent)
+    return tuple(replace(entry, name=f"{entry.name}:{exponent:g}") for entry in fields)
+
+
+def available(names: Collection[str]) -> tuple[Field, ...]:
+    """The fields of the table that follow from the arrays there are."""
+    return tuple(entry for entry in FIELDS if set(entry.of) <= set(names))
+
+
 def compute_fields(
-    vertices_ref: Array,
-    vertices: Array,
+    reference: Array,
+    current: Array,
     faces: NDArray[np.int64],
     to_reference: RigidMotion,
-    correlation: Array,
-    sigma_xyz: Array,
+    certainty: Certainty,
     pair: NDArray[np.int64],
+    window: StrainWindow | None = None,
 ) -> StepFields:
-    """All fields of one step.
+    """All arrays of one step.
 
     Parameters
     ----------
-    vertices_ref, vertices, sigma_xyz : (N, 3) mm. faces : (M, 3). correlation : (N,) C_LS. pair : (M,).
+    reference, current : (N, 3) mm, NaN where lost. faces : (M, 3). pair : (M,).
     to_reference : the motion that takes the step back onto the reference.
-
-    Vectors are (·, 3); tensors (·, 6) in the order xx yy zz xy yz xz.
+    window : the windows of the triangles, for strain over a window beside that of each triangle.
     """
-    found = deformation(vertices_ref, vertices, faces)
+    found = deformation(reference, current, faces)
     point = {
-        "displacement": vertices - vertices_ref,
-        "displacement_without_rigid_motion": to_reference.apply(vertices) - vertices_ref,
-        "correlation": correlation,
-        "sigma_xyz": sigma_xyz,
+        "displacement": current - reference,
+        "displacement_without_rigid_motion": to_reference.apply(current) - reference,
+        "correlation": certainty.correlation,
+        "sigma_xyz": certainty.sigma_xyz,
+        "sigma_displacement": certainty.sigma_displacement,
+        "chi2": certainty.chi2,
     }
-    face = {name: getattr(found, name) for name in (*_SCALARS, *_DIRECTIONS)}
-    face["E_tensor"] = _six(found.E)
-    face["e_tensor"] = _six(found.e)
-    face["area"] = np.where(np.isfinite(found.J), found.area, np.nan)
-    face["face_correlation"] = correlation[faces].max(axis=1)
-    face["pair"] = pair
-    return StepFields(
-        {name: np.asarray(values, dtype=np.float32) for name, values in point.items()},
-        {name: np.asarray(values, dtype=np.float32) for name, values in face.items()},
-    )
+    face = {
+        **_of_deformation(found),
+        "isotropy": found.isotropy,
+        "area": found.area,
+        "face_correlation": certainty.correlation[faces].max(axis=1),
+        "pair": pair.astype(float),
+    }
+    if certainty.sigma_lambda is not None:
+        face["sigma_lambda1"], face["sigma_lambda2"] = certainty.sigma_lambda.T
+    if window is not None:
+        over = _of_deformation(window.deformation(current, reference))
+        face |= {f"window_{name}": values for name, values in over.items()}
+    return StepFields({name: values for name, values in point.items() if values is not None}, face)
 
 
-def pick(entry: Field, stored: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The scalar of a field from its stored array (n,) or (n, 3)."""
-    if entry.part is None:
-        return stored
-    if entry.part < 0:
-        return np.asarray(np.linalg.norm(stored, axis=-1), dtype=np.float32)
-    return np.ascontiguousarray(stored[..., entry.part])
+def _of_deformation(found: Deformation) -> dict[str, Array]:
+    names = ("J", "lambda1", "lambda2", "E1", "E2", *_DIRECTIONS)
+    return {**{name: getattr(found, name) for name in names}, "E_tensor": _six(found.E), "e_tensor": _six(found.e)}
 
 
 def _six(tensor: Array) -> Array:
     return np.stack([tensor[..., i, j] for i, j in _SYMMETRIC], axis=-1)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise KeyError(text) from None

@@ -27,32 +27,14 @@ from processing.correlation import (
     search_hypotheses,
 )
 from processing.errors import ComputationError
-from processing.proxy import compose, stereo_hypotheses, sweep_radii
-from processing.region import coherent, contrast, lattice, paint, well_seen
+from processing.proxy import compose, stereo_hypotheses
+from processing.region import paint, well_seen
 from processing.results import Matches
-
-# Beside the speckled surface there may be bare skin that matches, but poorly: less contrast than this share of the
-# usual is no speckle.
-_LEAST_CONTRAST = 0.3
+from processing.sweep import Search, convincing, radii_of, sweep
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class Search:
-    """How the surface is looked for. Lengths mm, angles degrees.
-
-    radius, reach : the proxy cylinder and how far from it the surface may lie.
-    incidence : the steepest angle at which both cameras must see the surface.
-    zncc_min : of a convincing match of the sweep.
-    """
-
-    radius: float
-    reach: float
-    incidence: float
-    zncc_min: float = 0.75
 
 
 @dataclass(frozen=True)
@@ -89,7 +71,7 @@ def match_pair(
     Raises ComputationError where the cameras share no textured surface.
     """
     first, second = cameras
-    stereo = _Stereo(cameras, search, settings, _radii(cameras, search))
+    stereo = _Stereo(cameras, search, settings, radii_of(cameras, search))
     reference_image, second_image = image(first.id, 0), image(second.id, 0)
     if reference_image is None or second_image is None:
         raise ComputationError(f"cameras {first.id} and {second.id}: the reference capture lacks an image")
@@ -115,44 +97,14 @@ def match_pair(
     return PairMatches(_collect((first.id, second.id), xy, found, steps), faces)
 
 
-def _radii(cameras: tuple[Camera, Camera], search: Search) -> Array:
-    """Radii of the sweep, so close that the match moves by 1.5 px from one to the next."""
-    first, second = cameras
-    towards = first.centre[:2] + second.centre[:2]
-    towards = towards / np.linalg.norm(towards)
-    height = 0.5 * (first.centre[2] + second.centre[2])
-    ends = [np.array([*(radius * towards), height]) for radius in (search.radius, search.radius + 1.0)]
-    seen = [camera.project(np.array(ends)) for camera in cameras]
-    px_per_mm = float(np.linalg.norm(np.diff(seen[1], axis=0) - np.diff(seen[0], axis=0)))
-    return sweep_radii(search.radius, search.reach, float(np.clip(1.5 / max(px_per_mm, 1e-6), 0.1, 2.0)))
-
-
 def _find_region(stereo: _Stereo, image: Image, current: Current, mask: Mask | None) -> tuple[Mask, Array, Array]:
     """The region of interest (height, width), lattice positions (k, 2) px in it and their warps (k, 6)."""
     first, second = stereo.cameras
-    settings = stereo.settings
-    spacing = settings.step * max(1, round(1.5 * settings.radius / settings.step))
-    points = lattice(first.size, spacing, settings.radius + 2)
-    shape = points.xy.shape[:2]
-    px = points.xy.reshape(-1, 2)
-    hypotheses = stereo_hypotheses(first, second, px, stereo.radii, settings.radius)
-    everywhere = prepare_reference(image, np.ones(image.shape, bool), settings)
-    warps, zncc, second_best = search_hypotheses(everywhere, current, px, hypotheses.warps, settings.radius)
-    which = _nearest(hypotheses.warps, warps)
-    radius = stereo.radii[which].reshape(shape)
-    xyz = hypotheses.xyz[np.arange(len(px)), which].reshape(*shape, 3)
-    convincing = _convincing(stereo.search, zncc, second_best)
-    convincing &= (which > 0) & (which < len(stereo.radii) - 1)
+    found = sweep(stereo.cameras, image, current, mask, stereo.radii, stereo.search, stereo.settings)
+    good = found.good
     if mask is None:
-        texture = contrast(image, px, settings.radius)
-        usual = float(np.median(texture[convincing])) if convincing.any() else 0.0
-        convincing &= texture > _LEAST_CONTRAST * usual
-    else:
-        convincing &= mask[px[:, 1].astype(int), px[:, 0].astype(int)]
-    good = coherent(radius, convincing.reshape(shape), tolerance=2.0)
-    if mask is None:
-        xyz = np.where(good[..., None], xyz, np.nan)
-        good &= well_seen(xyz, stereo.cameras, stereo.search.incidence)
+        xyz = np.where(good[..., None], found.xyz, np.nan)
+        good = good & well_seen(xyz, stereo.cameras, stereo.search.incidence)
     if good.sum() < 4:
         where = "" if mask is None else f" inside the mask of camera {first.id}"
         covered = "" if mask is None else ", that the mask covers it"
@@ -160,20 +112,8 @@ def _find_region(stereo: _Stereo, image: Image, current: Current, mask: Mask | N
             f"cameras {first.id} and {second.id}: no textured surface that both see was found{where}; check that the "
             f"specimen is speckled and stands where the target stood{covered}, and that the images are in focus"
         )
-    region = mask if mask is not None else paint(points, good, first.size)
-    return region, px[good.ravel()], warps[good.ravel()]
-
-
-def _convincing(search: Search, zncc: Array, second_best: Array) -> Mask:
-    """Matches (n,) of a sweep that look alike enough, and more so than any other place on the line."""
-    with np.errstate(invalid="ignore"):
-        return np.asarray((zncc > search.zncc_min) & (second_best < 0.9 * zncc))
-
-
-def _nearest(candidates: Array, chosen: Array) -> NDArray[np.int_]:
-    """Index (n,) of the chosen warp among the candidates (n, K, 6)."""
-    distance = np.abs(candidates[..., :2] - chosen[:, None, :2]).sum(axis=-1)
-    return np.argmin(np.where(np.isfinite(distance), distance, np.inf), axis=1)
+    region = mask if mask is not None else paint(found.points, good, first.size)
+    return region, found.px[good.ravel()], found.warps[good.ravel()]
 
 
 def _start_at(xy: Array, seeds: Array, warps: Array) -> Array:
@@ -199,9 +139,9 @@ def _start_after_motion(
     motion = np.concatenate([in_time.uv[chosen], in_time.gradient[chosen].reshape(-1, 4)], axis=1)
     candidates = compose(motion[:, None, :], hypotheses.warps)
     warps, zncc, second_best = search_hypotheses(reference, current, xy[chosen], candidates, settings.radius)
-    convincing = _convincing(stereo.search, zncc, second_best)
+    believed = convincing(stereo.search, zncc, second_best)
     start = np.full((len(xy), 6), np.nan)
-    start[chosen[convincing]] = warps[convincing]
+    start[chosen[believed]] = warps[believed]
     return start
 
 

@@ -24,13 +24,16 @@ from processing.correlation import CorrelationSettings
 from processing.correlation.correlate import load_kernels
 from processing.errors import ComputationError, InputError
 from processing.images import read_gray, read_mask
-from processing.matching import PairMatches, Search, match_pair
+from processing.matching import PairMatches, match_pair
+from processing.pairs_surface import pairs_surface
 from processing.progress import Report, Stages, silent
-from processing.results import Matches, Results, write_results
+from processing.results import Results, write_results
 from processing.ring import Ring, calibrate_ring, control_points
+from processing.ring_surface import RingSurface, ring_surface
 from processing.session import Capture, Session, new_run, read_session
 from processing.settings import Settings
 from processing.surface import PairSurface, pair_surface
+from processing.sweep import Search
 
 log = logging.getLogger(__name__)
 
@@ -53,9 +56,16 @@ def process_session(path: Path, settings: Settings, report: Report = silent) -> 
     stages.at("calibrate", 0.0)
     ring = calibrate_ring(session, settings.calibration, lambda done, who: stages.at("calibrate", done, who))
     errors, warnings = _usable_pairs(session, ring, steps)
-    surfaces, more_warnings = _surfaces(session, ring, tuple(errors), steps, settings, stages)
-    results = _join(session, ring, surfaces, steps, settings)
-    found = summary.summarise(results, ring, errors, surfaces, (*ring.warnings, *warnings, *more_warnings))
+    if settings.surface.method == "global":
+        whole = _whole_ring(session, ring, tuple(errors), steps, settings, stages)
+        results, drift = whole.results, whole.drift
+        more_warnings: list[str] = []
+        agreement: dict[str, Any] = {}
+    else:
+        surfaces, more_warnings = _surfaces(session, ring, tuple(errors), steps, settings, stages)
+        results, agreement = pairs_surface(session, ring, surfaces, steps, settings)
+        drift = {"-".join(surface.matches.cameras): surface.drift for surface in surfaces}
+    found = summary.summarise(results, ring, errors, drift, agreement, (*ring.warnings, *warnings, *more_warnings))
     for warning in found["warnings"]:
         log.warning("%s", warning)
     return _keep(session, results, found, ring, errors, settings, stages, began)
@@ -102,11 +112,7 @@ def _surfaces(
     stages: Stages,
 ) -> tuple[list[PairSurface], list[str]]:
     """Every pair matched and triangulated, one after the other: the correlation itself uses all cores."""
-    search = Search(
-        radius=settings.surface.radius_mm or session.rig.target.radius_mm,
-        reach=settings.surface.reach_mm,
-        incidence=settings.surface.incidence_deg,
-    )
+    search = _search(session, settings)
     correlation = CorrelationSettings(**settings.correlation.keywords)
     image = _image_source(session, ring, steps)
     surfaces: list[PairSurface] = []
@@ -132,6 +138,38 @@ def _surfaces(
         raise ComputationError(f"{session.path}: no camera pair gave a surface: {'; '.join(warnings)}")
     stages.at("triangulate", 1.0)
     return surfaces, warnings
+
+
+def _whole_ring(
+    session: Session,
+    ring: Ring,
+    pairs: tuple[tuple[str, str], ...],
+    steps: tuple[Capture, ...],
+    settings: Settings,
+    stages: Stages,
+) -> RingSurface:
+    """One surface from all cameras that have a reference image."""
+    cameras = [each.camera for each in ring.cameras.values() if each.camera.id in steps[0].images]
+    masks = {camera.id: mask for camera in cameras if (mask := _mask(session, camera)) is not None}
+    return ring_surface(
+        session.rig.name,
+        cameras,
+        pairs,
+        _image_source(session, ring, steps),
+        masks,
+        tuple(step.id for step in steps),
+        _search(session, settings),
+        settings,
+        lambda share, what, rate: stages.at("correlate", share, what, rate),
+    )
+
+
+def _search(session: Session, settings: Settings) -> Search:
+    return Search(
+        radius=settings.surface.radius_mm or session.rig.target.radius_mm,
+        reach=settings.surface.reach_mm,
+        incidence=settings.surface.incidence_deg,
+    )
 
 
 def _matches_made(found: PairMatches) -> int:
@@ -162,36 +200,6 @@ def _mask(session: Session, camera: Camera) -> NDArray[np.bool_] | None:
     return None if path is None else read_mask(path, (camera.size[1], camera.size[0]))
 
 
-def _join(
-    session: Session, ring: Ring, surfaces: list[PairSurface], steps: tuple[Capture, ...], settings: Settings
-) -> Results:
-    """The surfaces of the pairs in one set of arrays."""
-    counts = [surface.vertices.shape[1] for surface in surfaces]
-    offsets = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int)
-    vertices = np.concatenate([surface.vertices for surface in surfaces], axis=1)
-    return Results(
-        rig=session.rig.name,
-        steps=tuple(step.id for step in steps),
-        cameras=tuple(calibration.camera for calibration in ring.cameras.values()),
-        pairs=tuple(surface.matches.pair for surface in surfaces),
-        vertices_ref=vertices[0],
-        vertices=vertices,
-        faces=np.concatenate([s.faces + offset for s, offset in zip(surfaces, offsets, strict=True)]),
-        pair=np.repeat(np.arange(len(surfaces)), [len(surface.faces) for surface in surfaces]),
-        vertex_pair=np.repeat(np.arange(len(surfaces)), counts),
-        correlation=np.concatenate([surface.correlation for surface in surfaces], axis=1),
-        sigma_xyz=np.concatenate([surface.sigma for surface in surfaces], axis=1),
-        status=np.concatenate([surface.status for surface in surfaces], axis=1),
-        matches=tuple(_with_offset(surface, int(offset)) for surface, offset in zip(surfaces, offsets, strict=True)),
-        settings=settings.to_toml(),
-    )
-
-
-def _with_offset(surface: PairSurface, offset: int) -> Matches:
-    vertex = surface.matches.vertex
-    return replace(surface.matches, vertex=np.where(vertex >= 0, vertex + offset, -1))
-
-
 def _keep(
     session: Session,
     results: Results,
@@ -209,6 +217,7 @@ def _keep(
             {"pair": list(pair), "mean_mm": error.mean, "rms_mm": error.rms, "points": error.points}
             for pair, error in errors.items()
         ],
+        "bundle": None if ring.bundle is None else ring.bundle.to_dict(),
     }
     stages.at("deform", 0.0)
     with new_run(session.path) as run:

@@ -2,34 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.fields import FIELDS, StepFields, pick
+from processing.fields import Field, StepFields
 
 
 class Ranges:
-    """Gathers, step by step, the extremes and the 2nd and 98th percentiles of every field."""
+    """Gathers, step by step, the extremes and the 2nd and 98th percentiles of some fields."""
 
-    def __init__(self) -> None:
+    def __init__(self, fields: Sequence[Field]) -> None:
+        self._fields = tuple(fields)
         self._seen: dict[tuple[str, bool], list[NDArray[np.float64] | None]] = {}
 
     def add(self, fields: StepFields) -> None:
         """Take one more step in; the reference comes first."""
-        for entry in FIELDS:
-            arrays = fields.point if entry.location == "point" else fields.face
-            self._add((entry.name, False), pick(entry, arrays[entry.stored]))
-            if entry.rigid:
-                self._add((entry.name, True), pick(entry, arrays[f"{entry.stored}_without_rigid_motion"]))
+        for entry in self._fields:
+            for removed in (False, True) if entry.rigid else (False,):
+                self._add((entry.name, removed), fields.scalar(entry, removed).astype(np.float32))
 
     def table(self) -> list[dict[str, Any]]:
         """The catalogue of fields with their ranges, as JSON values."""
         rows: list[dict[str, Any]] = []
-        for entry in FIELDS:
-            row = {k: v for k, v in asdict(entry).items() if k not in ("stored", "part")}
+        for entry in self._fields:
+            row = entry.row()
             row["range"], row["steps"] = self._spans((entry.name, False))
             if entry.rigid:
                 spans = self._spans((entry.name, True))

@@ -3,21 +3,24 @@
 ::
 
     results.h5
-      VTKHDF/                    moving triangles with all fields: opens in ParaView (a lost point stays at its
-                                 reference position there, with ``measured`` = 0 and NaN fields)
+      VTKHDF/                    moving triangles with the arrays that all fields follow from: opens in ParaView (a lost
+                                 point stays at its reference position there, with ``measured`` = 0 and NaN fields)
       ringdic/                   attributes: schema, rig, steps, pairs, cameras, fields (JSON where not plain)
         reference                (N, 3) mm
         faces, pair, vertex_pair
         rigid_motion/R, t        per step, the motion that takes it back onto the reference
         cameras/<id>/            P, size, and K, distortion where the lens is known
-        matches/<k>/             2D matches of pair k: xy, px, c_ls, sigma, status, vertex
+        matches/<k>/             2D matches of a camera pair, or of a camera alone: xy, px, c_ls, sigma, status, vertex
         settings, calibration, summary    text: TOML, JSON, JSON
+
+What follows from the stored arrays is computed when it is read: a step takes about 70 bytes a point and 120 a triangle.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,27 +34,38 @@ from processing import vtkhdf
 from processing.camera import Camera, Intrinsics
 from processing.deformation import Deformation, deformation
 from processing.errors import InputError
-from processing.fields import FIELDS, compute_fields, pick
+from processing.fields import Certainty, Field, StepFields, available, compute_fields
 from processing.fields import field as field_of
 from processing.mesh import Mesh
 from processing.ranges import Ranges
 from processing.rigid_motion import RigidMotion, motion_to_reference
+from processing.strain_window import StrainWindow, strain_window
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-SCHEMA = 1
+SCHEMA = 2
+
+#: Arrays kept for every step as they are; the other fields follow from them and from the positions.
+_KEPT = (
+    "displacement", "correlation", "sigma_xyz", "sigma_displacement", "chi2",
+    "J", "lambda1", "lambda2", "E1", "E2", "E_tensor", "direction1_reference", "direction1_current", "isotropy",
+    "face_correlation", "sigma_lambda1", "sigma_lambda2", "window_lambda1", "window_lambda2", "window_E1", "window_E2",
+)  # fmt: skip
+#: Arrays that are the same at every step.
+_CONSTANT = ("area", "pair")
 
 
 @dataclass(frozen=True)
 class Matches:
-    """2D matches of one camera pair at F steps.
+    """2D matches of a camera pair at F steps, or of a camera alone that followed its own points in time.
 
-    pair : ids, reference camera first. xy : (n, 2) px in the reference image. px : (F, 2, n, 2) in both
-    images. c_ls : (F, n). sigma : (F, 2, n, 2) px. status : (F, n), 0 good. vertex : (n,) index of the vertex, or -1.
-    seconds : time spent by stage.
+    cameras : the C ids, reference camera first. xy : (n, 2) px in the reference image. px : (F, C, n, 2) in their
+    images. c_ls : (F, n). sigma : (F, C, n, 2) px. status : (F, n), 0 good. vertex : (n,) index of the vertex, or -1.
+    seconds : time spent by stage. Of a camera alone, xy is the place as it was matched from another camera, px at the
+    reference the projection of the vertex, from which the point is followed, and sigma there that of xy.
     """
 
-    pair: tuple[str, str]
+    cameras: tuple[str, ...]
     xy: Array
     px: Array
     c_ls: Array
@@ -61,8 +75,9 @@ class Matches:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        n, steps = len(self.xy), len(self.px)
-        expected = {"px": (steps, 2, n, 2), "c_ls": (steps, n), "sigma": (steps, 2, n, 2), "status": (steps, n)}
+        n, steps, views = len(self.xy), len(self.px), len(self.cameras)
+        in_images = (steps, views, n, 2)
+        expected = {"px": in_images, "c_ls": (steps, n), "sigma": in_images, "status": (steps, n)}
         _check(self, {**expected, "xy": (n, 2), "vertex": (n,)})
 
 
@@ -75,6 +90,8 @@ class Results:
     pair : (M,) index of the pair, -1 where a face joins two. vertex_pair : (N,).
     correlation : (F, N) C_LS, the largest over the images used. sigma_xyz : (F, N, 3). status : (F, N), 0 measured.
     settings : TOML text. calibration, summary : JSON values.
+    sigma_displacement : (F, N, 3) mm; sigma_lambda : (F, M, 2), of λ1 and λ2 of each triangle; chi2 : (F, N), a degree
+    of freedom; each None where it was not found.
     """
 
     rig: str
@@ -93,50 +110,113 @@ class Results:
     settings: str = ""
     calibration: dict[str, Any] = field(default_factory=dict)
     summary: dict[str, Any] = field(default_factory=dict)
+    sigma_displacement: Array | None = None
+    sigma_lambda: Array | None = None
+    chi2: Array | None = None
 
     def __post_init__(self) -> None:
         F, N, M = len(self.steps), len(self.vertices_ref), len(self.faces)
         per_vertex = {"correlation": (F, N), "sigma_xyz": (F, N, 3), "status": (F, N), "vertex_pair": (N,)}
         _check(self, {**per_vertex, "vertices_ref": (N, 3), "vertices": (F, N, 3), "faces": (M, 3), "pair": (M,)})
+        where_known = {"sigma_displacement": (F, N, 3), "sigma_lambda": (F, M, 2), "chi2": (F, N)}
+        _check(self, {name: shape for name, shape in where_known.items() if getattr(self, name) is not None})
         if not np.isfinite(self.vertices_ref).all():
             raise ValueError("a vertex without a reference position cannot be tracked; leave it out")
         Mesh(self.vertices_ref, self.faces)
 
-    def motion(self, step: int) -> RigidMotion:
-        """The rigid motion that takes a step back onto the reference."""
-        return motion_to_reference(self.vertices_ref, self.vertices[step])
+    @property
+    def mesh(self) -> Mesh:
+        """The surface in the reference configuration."""
+        return Mesh(self.vertices_ref, self.faces)
 
-    def deformation(self, step: int, rigid_motion_removed: bool = False) -> Deformation:
-        """Every deformation field of a step, in full precision."""
+    @property
+    def window_mm(self) -> float:
+        """Width of the strain window that the run was told to use; 0 for the triangles alone."""
+        return float(tomllib.loads(self.settings).get("strain", {}).get("window_mm", 0.0))
+
+    def before(self, step: int, previous: bool = False) -> Array:
+        """Positions (N, 3) mm that a step is compared with: the reference, or the step before it (NaN where lost)."""
+        return self.vertices[step - 1] if previous and step > 0 else self.vertices_ref
+
+    def motion(self, step: int, previous: bool = False) -> RigidMotion:
+        """The rigid motion that takes a step back onto the reference, or onto the step before it."""
+        return motion_to_reference(self.before(step, previous), self.vertices[step])
+
+    def deformation(
+        self,
+        step: int,
+        rigid_motion_removed: bool = False,
+        previous: bool = False,
+        window: StrainWindow | None = None,
+    ) -> Deformation:
+        """Every deformation field of a step, in full precision.
+
+        previous : from the step before it, not from the reference. window : over its windows, not of the triangles.
+        """
         current = self.vertices[step]
         if rigid_motion_removed:
-            current = self.motion(step).apply(current)
-        return deformation(self.vertices_ref, current, self.faces)
+            current = self.motion(step, previous).apply(current)
+        if window is not None:
+            return window.deformation(current, self.before(step, previous))
+        return deformation(self.before(step, previous), current, self.faces)
+
+    def fields(
+        self,
+        step: int,
+        window: StrainWindow | None = None,
+        previous: bool = False,
+        rigid_motion_removed: bool = False,
+    ) -> StepFields:
+        """The arrays of a step that every field follows from; the arguments as of :meth:`deformation`."""
+        motion, current = self.motion(step, previous), self.vertices[step]
+        if rigid_motion_removed:
+            motion, current = RigidMotion(np.eye(3), np.zeros(3)), motion.apply(current)
+        of_motion = None if previous else step  # deviations are known of what happened since the reference
+        certainty = Certainty(
+            self.correlation[step],
+            self.sigma_xyz[step],
+            _at(self.sigma_displacement, of_motion),
+            _at(self.sigma_lambda, of_motion),
+            _at(self.chi2, step),
+        )
+        return compute_fields(self.before(step, previous), current, self.faces, motion, certainty, self.pair, window)
 
 
 def write_results(path: Path, results: Results, progress: Callable[[float], None] = lambda _: None) -> None:
     """Compute all fields and write the file; ``path`` must not exist. ``progress`` is told the share done."""
+    window = strain_window(results.mesh, results.window_mm) if results.window_mm > 0 else None
     with h5py.File(path, "x") as file:
         group = vtkhdf.create(file, results.faces, len(results.vertices_ref), len(results.steps))
-        ranges = Ranges()
-        motions = [results.motion(step) for step in range(len(results.steps))]
-        for step, motion in enumerate(motions):
+        ranges: Ranges | None = None
+        for step in range(len(results.steps)):
+            fields = results.fields(step, window)
+            if ranges is None:
+                ranges = Ranges(available(fields.names))
+                for name in _CONSTANT:
+                    vtkhdf.write_constant(group, "CellData", name, fields.face[name].astype(np.float32))
             current = results.vertices[step]
-            fields = compute_fields(
-                results.vertices_ref, current, results.faces, motion,
-                results.correlation[step], results.sigma_xyz[step], results.pair,
-            )  # fmt: skip
             measured = np.isfinite(current).all(axis=1)
             positions = np.where(measured[:, None], current, results.vertices_ref)
             flags = {"measured": measured.astype(np.uint8), "status": results.status[step].astype(np.int8)}
-            vtkhdf.write_step(group, step, positions, {**fields.point, **flags}, fields.face)
+            vtkhdf.write_step(group, step, positions, {**_kept(fields.point), **flags}, _kept(fields.face))
             ranges.add(fields)
             progress((step + 1) / len(results.steps))
-        _write_rest(file.create_group("ringdic"), results, motions, ranges)
+        _write_rest(file.create_group("ringdic"), results, ranges or Ranges(()))
 
 
-def read_results(path: Path) -> Results:
-    """The results of a file, as they were written (fields are not read: they follow from the positions)."""
+def _at(known: Array | None, step: int | None) -> Array | None:
+    return None if known is None or step is None else known[step]
+
+
+def _kept(arrays: dict[str, Array]) -> dict[str, NDArray[np.float32]]:
+    return {name: values.astype(np.float32) for name, values in arrays.items() if name in _KEPT}
+
+
+def read_results(path: Path, matches: bool = True) -> Results:
+    """The results of a file, as they were written (fields are not read: they follow from the positions).
+
+    matches : whether the 2D matches are wanted as well.
+    """
     with _open(path) as file:
         own, group = file["ringdic"], file["VTKHDF"]
         steps = tuple(json.loads(own.attrs["steps"]))
@@ -155,19 +235,22 @@ def read_results(path: Path) -> Results:
             correlation=group["PointData/correlation"][:].reshape(F, N).astype(float),
             sigma_xyz=group["PointData/sigma_xyz"][:].reshape(F, N, 3).astype(float),
             status=group["PointData/status"][:].reshape(F, N),
-            matches=tuple(_read_matches(own["matches"][str(k)]) for k in range(len(own["matches"]))),
+            matches=tuple(_read_matches(own["matches"][str(k)]) for k in range(len(own["matches"]) if matches else 0)),
             settings=_text(own, "settings"),
             calibration=json.loads(_text(own, "calibration")),
             summary=json.loads(_text(own, "summary")),
+            sigma_displacement=_stored(group, "PointData/sigma_displacement", (F, N, 3)),
+            sigma_lambda=_sigma_lambda(group, F),
+            chi2=_stored(group, "PointData/chi2", (F, N)),
         )
 
 
 def read_summary(path: Path) -> dict[str, Any]:
     """What a file holds, as JSON values: rig, steps, cameras, pairs, counts, the table of fields with their ranges.
 
-    ``fields`` : name, label, unit, location, centre, rigid (whether removing the rigid motion changes it), ``range``
-    (2nd to 98th percentile over all steps after the reference), ``steps`` ([least, greatest] of each step, null where
-    nothing was measured), and ``range_without_rigid_motion``, ``steps_without_rigid_motion`` where rigid.
+    ``fields`` : name, label, unit, location, centre, group, rigid (whether removing the rigid motion changes it),
+    ``range`` (2nd to 98th percentile over all steps after the reference), ``steps`` ([least, greatest] of each step,
+    null where nothing was measured), and ``range_without_rigid_motion``, ``steps_without_rigid_motion`` where rigid.
     """
     with _open(path) as file:
         own = file["ringdic"]
@@ -207,19 +290,43 @@ def read_field(path: Path, name: str, step: int, rigid_motion_removed: bool = Fa
 
     Raises InputError for a field or a step that the results do not have.
     """
+    with _open(path) as file:
+        own, group = file["ringdic"], file["VTKHDF"]
+        _check_step(path, own, step)
+        entry = _field_in(path, group, name)
+        place = "PointData" if entry.location == "point" else "CellData"
+
+        def array(stored: str) -> Array:
+            if stored != "displacement_without_rigid_motion":
+                return np.asarray(vtkhdf.read_step(group, place, stored, step), dtype=float)
+            rows = len(own["reference"])
+            positions = group["Points"][step * rows : (step + 1) * rows]
+            positions[vtkhdf.read_step(group, "PointData", "measured", step) == 0] = np.nan
+            motion = RigidMotion(own["rigid_motion/R"][step], own["rigid_motion/t"][step])
+            return np.asarray(motion.apply(positions) - own["reference"][:])
+
+        return entry.from_arrays(array, rigid_motion_removed).astype(np.float32), entry.location
+
+
+def _field_in(path: Path, group: h5py.Group, name: str) -> Field:
+    """The field of a name if the file has what it follows from."""
+    stored = {*group["PointData"], *group["CellData"]}
     try:
         entry = field_of(name)
     except KeyError:
-        raise InputError(f"no field '{name}'; there are {', '.join(f.name for f in FIELDS)}") from None
-    stored = f"{entry.stored}_without_rigid_motion" if entry.rigid and rigid_motion_removed else entry.stored
-    with _open(path) as file:
-        _check_step(path, file["ringdic"], step)
-        place = "PointData" if entry.location == "point" else "CellData"
-        values = vtkhdf.read_step(file["VTKHDF"], place, stored, step)
-    return pick(entry, np.asarray(values, dtype=np.float32)), entry.location
+        raise InputError(f"no field '{name}'; there are {', '.join(f.name for f in available(stored))}") from None
+    if set(entry.of) <= stored:
+        return entry
+    if name.startswith("window_"):
+        raise InputError(
+            f"{path}: no field '{name}': the run had no strain window; process with --set strain.window_mm=5, "
+            "or export these results with --window 5"
+        )
+    raise InputError(f"{path}: no field '{name}': the run did not find it")
 
 
-def _write_rest(own: h5py.Group, results: Results, motions: list[RigidMotion], ranges: Ranges) -> None:
+def _write_rest(own: h5py.Group, results: Results, ranges: Ranges) -> None:
+    motions = [results.motion(step) for step in range(len(results.steps))]
     own.attrs["schema"] = SCHEMA
     own.attrs["rig"] = results.rig
     own.attrs["steps"] = json.dumps(results.steps)
@@ -243,11 +350,23 @@ def _write_rest(own: h5py.Group, results: Results, motions: list[RigidMotion], r
             group["K"], group["distortion"] = camera.intrinsics.K, camera.intrinsics.distortion
     for k, matches in enumerate(results.matches):
         group = own.create_group(f"matches/{k}")
-        group.attrs["pair"] = json.dumps(matches.pair)
+        group.attrs["cameras"] = json.dumps(matches.cameras)
         group.attrs["seconds"] = json.dumps(matches.seconds)
         for name in ("xy", "px", "c_ls", "sigma", "status", "vertex"):
-            group[name] = getattr(matches, name)
+            values = np.asarray(getattr(matches, name))
+            group.create_dataset(name, data=values, compression="gzip", compression_opts=1, shuffle=True)
     own.require_group("matches")
+
+
+def _stored(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Array | None:
+    return group[name][:].reshape(shape).astype(float) if name in group else None
+
+
+def _sigma_lambda(group: h5py.Group, steps: int) -> Array | None:
+    if "CellData/sigma_lambda1" not in group:
+        return None
+    parts = [group[f"CellData/sigma_lambda{k}"][:].reshape(steps, -1) for k in (1, 2)]
+    return np.stack(parts, axis=-1).astype(float)
 
 
 def _open(path: Path) -> h5py.File:
@@ -303,6 +422,6 @@ def _read_camera(cameras: h5py.Group, name: str) -> Camera:
 
 
 def _read_matches(group: h5py.Group) -> Matches:
-    first, second = json.loads(group.attrs["pair"])
     arrays = {name: group[name][:] for name in ("xy", "px", "c_ls", "sigma", "status", "vertex")}
-    return Matches(pair=(first, second), seconds=json.loads(group.attrs["seconds"]), **arrays)
+    cameras = tuple(json.loads(group.attrs["cameras"]))
+    return Matches(cameras=cameras, seconds=json.loads(group.attrs["seconds"]), **arrays)

@@ -14,26 +14,33 @@ import math
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.calibration.advice import camera_advice, pair_advice
 from processing.calibration.bundle import BundleFit, TargetPrior, adjust_ring
 from processing.calibration.camera_calibration import CameraCalibration, calibrate_camera
 from processing.calibration.intrinsics import read_intrinsics
-from processing.calibration.quality import ReconstructionError, reconstruction_error
+from processing.calibration.quality import (
+    CameraQuality,
+    PairQuality,
+    ReconstructionError,
+    camera_quality,
+    pair_quality,
+)
 from processing.errors import ComputationError, InputError
 from processing.images import read_gray
+from processing.rig import Rig, Target
 from processing.session import Session
 from processing.settings import CalibrationGroup
-from processing.triangulation import triangulate
 
 log = logging.getLogger(__name__)
 
-_VERSION = 2  # of what a kept calibration means; raise it when the method changes
+_VERSION = 3  # of what a kept calibration means; raise it when the method changes
 #: A lens this much further from the board's than its uncertainty tells of a fault of board or target.
 _LENS_CHI2 = 25.0
 
@@ -42,12 +49,19 @@ _LENS_CHI2 = 25.0
 class Ring:
     """Calibrated cameras by id, and one sentence for each that could not take part or whose images disagree.
 
+    target : as the rig describes it.
     bundle : of the adjustment of all cameras together, None where each was calibrated alone.
+    quality, pairs : figures of each camera, and of the rig's pairs that see dots in common.
+    advice : what could be done for a better calibration, a sentence each.
     """
 
+    target: Target
     cameras: dict[str, CameraCalibration]
     warnings: tuple[str, ...]
     bundle: BundleFit | None = None
+    quality: tuple[CameraQuality, ...] = ()
+    pairs: tuple[PairQuality, ...] = ()
+    advice: tuple[str, ...] = ()
 
 
 def calibrate_ring(
@@ -78,44 +92,46 @@ def calibrate_ring(
             done += 1
             progress(done / len(taking_part), f"camera {id_}")
     if settings.method == "dlt":
-        return Ring(calibrated, warnings)
+        return _judged(session.rig, Ring(session.rig.target, calibrated, warnings))
     progress(1.0, "all cameras together")
     adjusted, fit = _adjusted(session, calibrated, keys, settings)
-    return Ring(adjusted, (*warnings, *_contradictions(fit)), fit)
+    return _judged(session.rig, Ring(session.rig.target, adjusted, (*warnings, *_contradictions(fit)), fit))
 
 
 def control_points(first: CameraCalibration, second: CameraCalibration) -> ReconstructionError:
-    """Reconstruction error of the dots that two cameras both see (Solav et al. 2018, eq. 10-11).
+    """Reconstruction error of the dots that two cameras both see (Solav et al. 2018, eq. 10-11)."""
+    return pair_quality(first, second)[0]
 
-    True are the places that the calibration takes the dots to have: after a bundle adjustment the print errors found
-    are in them.
-    """
-    seen = [
-        {(int(row), int(column)): i for i, (row, column) in enumerate(zip(dots.rows, dots.columns, strict=True))}
-        for dots in (first.dots, second.dots)
-    ]
-    common = sorted(seen[0].keys() & seen[1].keys())
-    if not common:
-        raise ComputationError(
-            f"cameras {first.camera.id} and {second.camera.id} have no dot of the target in common; "
-            "check that nothing hides the target, and their azimuths in rig.toml"
-        )
-    chosen = [[places[dot] for dot in common] for places in seen]
-    px = np.stack([first.dot_centres[chosen[0]], second.dot_centres[chosen[1]]])
-    return reconstruction_error(first.dots.xyz[chosen[0]], triangulate([first.camera, second.camera], px))
+
+def _judged(rig: Rig, ring: Ring) -> Ring:
+    """The ring with its figures and with advice."""
+    quality = tuple(camera_quality(each, rig.camera(id_).azimuth_deg) for id_, each in ring.cameras.items())
+    advice = [sentence for row in quality for sentence in camera_advice(ring.cameras[row.camera], row)]
+    pairs = []
+    for first, second in rig.pairs:
+        if first in ring.cameras and second in ring.cameras:
+            try:
+                pairs.append(pair_quality(ring.cameras[first], ring.cameras[second])[1])
+            except ComputationError as error:
+                advice.append(str(error))
+    advice += [sentence for row in pairs for sentence in pair_advice(row)]
+    return replace(ring, quality=quality, pairs=tuple(pairs), advice=tuple(advice))
 
 
 def _calibrated(
     session: Session, camera_id: str, target: Path, settings: CalibrationGroup
 ) -> tuple[CameraCalibration, str]:
     """One camera's calibration and its key, from the session's folder if it is there, else made and kept."""
-    boards = [capture.images[camera_id] for capture in session.of_kind("board") if camera_id in capture.images]
+    boards = {
+        capture.id: capture.images[camera_id] for capture in session.of_kind("board") if camera_id in capture.images
+    }
     lens_file = session.rig.camera(camera_id).intrinsics
-    key = _key(session, camera_id, [target, *boards], settings)
+    key = _key(session, camera_id, [target, *boards.values()], settings)
     kept = session.path / "calibration" / f"{camera_id}-{key}.json"
     if kept.is_file():
         return CameraCalibration.from_dict(json.loads(kept.read_text(encoding="utf-8"))), key
-    images = _of_one_size(camera_id, [target, *boards] if settings.distortion and lens_file is None else [target])
+    looked_at = boards if settings.distortion and lens_file is None else {}
+    images = _of_one_size(camera_id, [target, *looked_at.values()])
     calibration = calibrate_camera(
         session.rig,
         camera_id,
@@ -123,7 +139,12 @@ def _calibrated(
         images[0],
         distortion=settings.distortion,
         intrinsics=None if lens_file is None else read_intrinsics(session.path / lens_file),
+        radial=None if settings.radial_terms == 3 else settings.radial_terms,
+        tangential=settings.tangential,
+        skew=settings.skew,
+        fewest_terms=settings.terms == "criterion",
         drop_percentile=settings.drop_percentile,
+        board_names=list(looked_at),
     )
     _keep(kept, calibration.to_dict())
     return calibration, key
@@ -185,7 +206,8 @@ def _of_one_size(camera_id: str, paths: list[Path]) -> list[NDArray]:
 
 def _key(session: Session, camera_id: str, images: list[Path], settings: CalibrationGroup) -> str:
     digest = hashlib.sha256()
-    alone = f"{settings.distortion} {settings.drop_percentile}"
+    alone = f"{settings.distortion} {settings.drop_percentile} {settings.terms} {settings.radial_terms}"
+    alone += f" {settings.tangential} {settings.skew}"
     digest.update(f"{_VERSION} {camera_id} {session.rig.target} {session.rig.board} {alone}".encode())
     digest.update(repr(session.rig.camera(camera_id)).encode())
     for image in images:

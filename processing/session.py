@@ -89,9 +89,17 @@ def runs(path: Path) -> tuple[Path, ...]:
     return tuple(sorted(p for p in results.iterdir() if p.is_dir() and p.name.isdigit()))
 
 
-def newest_results(path: Path) -> Path:
-    """The results file of the newest run; InputError if the session has not been processed."""
+def newest_results(path: Path, run: int | None = None) -> Path:
+    """The results file of the newest run, or of the run of a number.
+
+    InputError if the session has not been processed or has no such run.
+    """
     finished = runs(path)
+    if run is not None and finished:
+        chosen = [folder for folder in finished if int(folder.name) == run]
+        if not chosen:
+            raise InputError(f"{path}: no run {run}; there are {', '.join(folder.name for folder in finished)}")
+        return chosen[0] / "results.h5"
     if not finished:
         _require_session(Path(path))
         raise InputError(f"{path}: no results yet; run 'ringdic process {path}' first")

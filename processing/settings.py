@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from processing.errors import InputError
 
@@ -50,6 +50,8 @@ class CalibrationGroup(_Group):
     """Cameras: the direct linear transformation (dlt), or from there the adjustment of all together (bundle).
 
     distortion : the lens is measured on the checkerboard and corrected.
+    radial_terms, tangential, skew : terms that the lens may have. terms : it gets as many of them as the checkerboard
+    views determine (largest), or those of the smallest information criterion (criterion).
     drop_percentile : checkerboard views whose error lies above it are dropped and the rest is fitted again; 100 keeps
     all views.
     print_error_mm, radius_error_mm, pitch_error_mm, tilt_error_deg : of the bundle: how far, as standard deviations,
@@ -59,6 +61,10 @@ class CalibrationGroup(_Group):
 
     method: Literal["dlt", "bundle"] = "dlt"
     distortion: bool = True
+    radial_terms: Literal[2, 3] = 3
+    tangential: bool = True
+    skew: bool = True
+    terms: Literal["largest", "criterion"] = "largest"
     drop_percentile: float = Field(default=80.0, gt=0, le=100)
     print_error_mm: float = Field(default=0.03, ge=0, le=5)
     radius_error_mm: float = Field(default=0.0, ge=0, le=5)
@@ -69,36 +75,43 @@ class CalibrationGroup(_Group):
 class SurfaceGroup(_Group):
     """How matches become a surface, and where the surface is looked for.
 
+    method : the surfaces of the camera pairs side by side (pairs), or one lattice over the surface whose points all
+    cameras measure together (global).
+    merge : of the pairs' surfaces into one, and which triangles of an overlap go first: the worst by correlation, by
+    distance to the other surfaces, by orientation against theirs, or by these and the nearness to the border
+    (combined); none leaves the surfaces one over the other.
     radius_mm : of the cylinder from which the search sets out; 0 takes the target's.
     reach_mm : how far from it the surface may lie. incidence_deg : the steepest angle of view that is used.
     sigma_max_px : a point whose match has a larger standard deviation, where the speckle ends, is lost.
+    spacing_mm : of the lattice; 0 takes the correlation's step as the cameras see it. curvature : of the warps between
+    cameras, from the measured shape and held (geometry), or none.
     """
 
     method: Literal["pairs", "global"] = "pairs"
+    merge: Literal["none", "correlation", "distance", "orientation", "combined"] = "combined"
     radius_mm: float = Field(default=0.0, ge=0)
     reach_mm: float = Field(default=20.0, gt=0)
     incidence_deg: float = Field(default=65.0, gt=0, lt=90)
     sigma_max_px: float = Field(default=0.05, gt=0)
+    spacing_mm: float = Field(default=0.0, ge=0)
+    curvature: Literal["geometry", "none"] = "geometry"
 
-    @field_validator("method")
-    @classmethod
-    def _available(cls, value: str) -> str:
-        if value == "global":
-            raise ValueError("'global' is not available in this version; use 'pairs'")
-        return value
+
+class TrackingGroup(_Group):
+    """How a camera follows its points in time; of the global method.
+
+    two_pass : second derivatives that the neighbours' displacements show are held in a second pass of first order.
+    update_reference : a point lost against the reference image is sought from the last image that showed it.
+    """
+
+    two_pass: bool = True
+    update_reference: bool = True
 
 
 class StrainGroup(_Group):
-    """Strain. window_mm : width of the window strain is fitted over; 0 takes each triangle alone."""
+    """Strain. window_mm : width of the window it is fitted over, beside that of each triangle alone; 0: no window."""
 
-    window_mm: float = Field(default=0.0, ge=0)
-
-    @field_validator("window_mm")
-    @classmethod
-    def _available(cls, value: float) -> float:
-        if value > 0:
-            raise ValueError("a strain window is not available in this version; use 0, the triangle alone")
-        return value
+    window_mm: float = Field(default=0.0, ge=0, le=1000)
 
 
 class Settings(_Group):
@@ -107,6 +120,7 @@ class Settings(_Group):
     correlation: CorrelationGroup = CorrelationGroup()
     calibration: CalibrationGroup = CalibrationGroup()
     surface: SurfaceGroup = SurfaceGroup()
+    tracking: TrackingGroup = TrackingGroup()
     strain: StrainGroup = StrainGroup()
 
     def to_toml(self) -> str:
@@ -115,6 +129,12 @@ class Settings(_Group):
         for group, values in self.model_dump().items():
             lines += [f"[{group}]", *(f"{name} = {_toml(value)}" for name, value in values.items()), ""]
         return "\n".join(lines)
+
+
+#: As the paper measured: cameras by the direct linear transformation, flat subsets, pair by pair.
+PAPER = Settings()
+#: The most exact: all cameras adjusted together, one surface with its own curvature, two passes in time.
+BEST = Settings(calibration=CalibrationGroup(method="bundle"), surface=SurfaceGroup(method="global"))
 
 
 def load_settings(path: Path | None = None, overrides: Sequence[str] = ()) -> Settings:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.calibration.quality import ReconstructionError, camera_quality
+from processing.calibration.quality import ReconstructionError
+from processing.measure.window_study import gauge
 from processing.mesh import Mesh
 from processing.results import Results
 from processing.ring import Ring
-from processing.surface import PairSurface
 
 Array = NDArray[np.float64]
 
@@ -21,10 +22,15 @@ def summarise(
     results: Results,
     ring: Ring,
     errors: dict[tuple[str, str], ReconstructionError],
-    surfaces: list[PairSurface],
+    drift: Mapping[str, Array],
+    agreement: Mapping[str, Any],
     warnings: tuple[str, ...],
 ) -> dict[str, Any]:
-    """Counts, calibration quality and one row of figures a step, as JSON values; ``table`` is for the terminal."""
+    """Counts, calibration quality and one row of figures a step, as JSON values; ``table`` is for the terminal.
+
+    drift : (F,) px by pair or camera, the mean vertical residual of each step: cameras that moved between frames.
+    agreement : of the surfaces of camera pairs, where there are any.
+    """
     steps = [_step(results, k) for k in range(len(results.steps))]
     control = {
         "mean_mm": _mean([error.mean for error in errors.values()]),
@@ -36,12 +42,37 @@ def summarise(
         "pairs": len(results.pairs),
         "area_mm2": round(float(Mesh(results.vertices_ref, results.faces).areas.sum()), 1),
         "control_points": control,
-        "cameras": [asdict(camera_quality(calibration)) for calibration in ring.cameras.values()],
-        "drift_px": {f"{s.matches.pair[0]}-{s.matches.pair[1]}": _finite(s.drift) for s in surfaces},
+        "cameras": [asdict(row) for row in ring.quality],
+        "calibration": _calibration(ring),
+        "drift_px": {who: _finite(values) for who, values in drift.items()},
+        "agreement": dict(agreement),
+        "strain": _strain(results),
         "steps": steps,
         "warnings": list(warnings),
     }
     return {**figures, "table": _table(figures)}
+
+
+def _calibration(ring: Ring) -> dict[str, Any]:
+    """How the cameras were found and how well: the pairs, the target as adjusted, and what could be done better."""
+    return {
+        "method": "dlt" if ring.bundle is None else "bundle",
+        "pairs": [asdict(row) for row in ring.pairs],
+        "bundle": None if ring.bundle is None else ring.bundle.figures(ring.target),
+        "advice": list(ring.advice),
+    }
+
+
+def _strain(results: Results) -> dict[str, float | None]:
+    """What a strain averages over, mm: each triangle alone, and the window if the run has one."""
+    alone, over = gauge(results, 0.0), gauge(results, results.window_mm)
+    return {
+        "step_mm": _number(alone.step),
+        "subset_mm": _number(alone.subset),
+        "gauge_mm": _number(alone.length),
+        "window_mm": results.window_mm,
+        "window_gauge_mm": _number(over.length) if results.window_mm > 0 else None,
+    }
 
 
 def _step(results: Results, step: int) -> dict[str, Any]:
@@ -80,6 +111,29 @@ def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
             "value": f"{control['mean_mm']:.4f}, {control['rms_mm']:.4f} mm",
         },
     ]
+    bundle = figures["calibration"]["bundle"]
+    if bundle is not None:
+        rows.append(
+            {
+                "figure": "bundle: centroids, print errors, radius",
+                "value": f"{bundle['centroid_sigma_px']:.4f} px, {bundle['print_errors_rms_mm']:.3f} mm, "
+                f"{bundle['radius_mm']:.3f} mm",
+            }
+        )
+    agreement = figures["agreement"]
+    if agreement.get("mismatch_mm") is not None:
+        rows.append(
+            {
+                "figure": "distance between the surfaces of neighbouring pairs",
+                "value": f"{agreement['mismatch_mm']:.4f} ± {agreement['mismatch_std_mm']:.4f} mm",
+            }
+        )
+    strain = figures["strain"]
+    if strain["gauge_mm"] is not None:
+        value = f"{strain['gauge_mm']:.1f} mm"
+        if strain["window_gauge_mm"] is not None:
+            value += f", over the window of {strain['window_mm']:g} mm {strain['window_gauge_mm']:.1f} mm"
+        rows.append({"figure": "a strain averages over (virtual strain gauge)", "value": value})
     for step in figures["steps"][1:]:
         if step["measured"]:
             rows.append(
@@ -105,6 +159,10 @@ def _rms(values: Array) -> float | None:
 
 def _mean(values: list[float]) -> float:
     return float(np.mean(values))
+
+
+def _number(value: float) -> float | None:
+    return round(value, 4) if np.isfinite(value) else None
 
 
 def _finite(values: Array) -> list[float | None]:

@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from processing.mesh import Mesh
+from processing.projection import line_hits
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -67,9 +68,14 @@ def inconsistent_edges(mesh: Mesh) -> Indices:
 
 def non_manifold_vertices(mesh: Mesh) -> Indices:
     """Vertices (K,) where triangles meet in more than one fan: two pieces or two borders touch in a point."""
-    if not len(mesh.faces):
-        return np.zeros(0, np.int64)
-    # Corners of triangles are joined across the edges they share; a sound vertex is one piece of corners.
+    each = np.unique(np.column_stack([mesh.faces.ravel(), fans(mesh)]), axis=0)
+    vertices, count = np.unique(each[:, 0], return_counts=True)
+    return vertices[count > 1]
+
+
+def fans(mesh: Mesh) -> Indices:
+    """Number of the fan of each corner, (3M,): the corners at a vertex whose triangles hang together round it."""
+    # Corners of triangles are joined across the edges they share.
     half = _half_edges(mesh.faces)
     corner = np.arange(len(half))
     start, end = corner, corner - corner % 3 + (corner + 1) % 3
@@ -81,10 +87,28 @@ def non_manifold_vertices(mesh: Mesh) -> Indices:
     a = np.concatenate([start[first], end[first]])
     b = np.concatenate([np.where(turned, end[second], start[second]), np.where(turned, start[second], end[second])])
     joined = coo_array((np.ones(len(a), bool), (a, b)), shape=(len(half), len(half)))
-    _, piece = connected_components(joined, directed=False)
-    fans = np.unique(np.column_stack([mesh.faces.ravel(), piece]), axis=0)[:, 0]
-    vertices, count = np.unique(fans, return_counts=True)
-    return vertices[count > 1]
+    return np.asarray(connected_components(joined, directed=False)[1], dtype=np.int64)
+
+
+def without_pinches(mesh: Mesh) -> NDArray[np.bool_]:
+    """Triangles (M,) left when at every vertex only the fan of the largest area stays."""
+    kept = np.ones(len(mesh.faces), bool)
+    while True:
+        left = np.flatnonzero(kept)
+        part = Mesh(mesh.vertices, mesh.faces[left])
+        pinched = np.isin(part.faces.ravel(), non_manifold_vertices(part))
+        if not pinched.any():
+            return kept
+        fan = fans(part)
+        area = np.bincount(fan, np.repeat(np.nan_to_num(part.areas), 3))
+        corners = np.flatnonzero(pinched)
+        # The largest fan of each vertex: the last of its corners in order of the fan's area.
+        order = np.lexsort((fan[corners], area[fan[corners]], part.faces.ravel()[corners]))
+        corners = corners[order]
+        vertex = part.faces.ravel()[corners]
+        last = np.flatnonzero(np.append(vertex[1:] != vertex[:-1], True))
+        largest = np.repeat(fan[corners[last]], np.diff(np.append(-1, last)))
+        kept[left[np.unique(corners[fan[corners] != largest] // 3)]] = False
 
 
 def pieces(mesh: Mesh) -> Indices:
@@ -159,8 +183,8 @@ def doubly_covered(mesh: Mesh, reach: float) -> Array:
     for part in np.array_split(np.arange(len(own)), max(1, len(own) // 500_000)):
         first, second = own[part], other[part]
         for k, weights in enumerate(_SAMPLES):
-            inside, height = _along(weights @ corners[first], normals[first], corners[second])
-            covered[first[inside & (np.abs(height) < reach)], k] = True
+            there, along = line_hits(weights @ corners[first], normals[first], corners[second])
+            covered[first[(there > 1e-6).all(axis=1) & (np.abs(along) < reach)], k] = True
     return covered.mean(axis=1)
 
 
@@ -183,20 +207,6 @@ def overlap_area(mesh: Mesh, reach: float) -> float:
     return float(0.5 * (doubly_covered(mesh, reach) * mesh.areas).sum())
 
 
-def _along(points: Array, directions: Array, corners: Array) -> tuple[NDArray[np.bool_], Array]:
-    """Whether lines through points along directions (n, 3) pass triangles (n, 3, 3) inside, and how far off, (n,)."""
-    a, b, c = np.moveaxis(corners, 1, 0)
-    edge1, edge2 = b - a, c - a
-    across = np.cross(directions, edge2)
-    determinant = np.einsum("ni,ni->n", edge1, across)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u = np.einsum("ni,ni->n", points - a, across) / determinant
-        beside = np.cross(points - a, edge1)
-        v = np.einsum("ni,ni->n", directions, beside) / determinant
-        height = np.einsum("ni,ni->n", edge2, beside) / determinant
-        return (u > 1e-6) & (v > 1e-6) & (u + v < 1 - 1e-6), height
-
-
 def _enclosed(points: Array) -> float:
     """Length of the vector area that a closed line of points (n, 3) encloses."""
     about = points - points.mean(axis=0)
@@ -208,6 +218,15 @@ def _corner_angles(mesh: Mesh) -> Array:
     corners = mesh.vertices[mesh.faces]
     ahead, behind = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
     return np.arctan2(np.linalg.norm(np.cross(ahead, behind), axis=2), np.einsum("mki,mki->mk", ahead, behind))
+
+
+def neighbours(faces: Indices) -> Indices:
+    """Triangles beside each triangle, (M, 3): across the edge from corner k to the next; -1 at a border.
+
+    Where more than two triangles share an edge, one of the others.
+    """
+    twin = _twins(_half_edges(faces))
+    return np.where(twin >= 0, twin // 3, -1).reshape(-1, 3)
 
 
 def _half_edges(faces: Indices) -> Indices:

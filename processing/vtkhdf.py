@@ -1,7 +1,7 @@
 """The VTKHDF group of a results file: triangles that move in time, as ParaView and VTK read it.
 
 Layout after the VTK file format specification, "VTKHDF", version 2.0, type PolyData: the steps of every array lie one
-after the other, connectivity is stored once and all steps point to it.
+after the other; connectivity and arrays that stay the same are stored once and all steps point to them.
 """
 
 from __future__ import annotations
@@ -59,12 +59,18 @@ def write_step(
             _array(group, place, name, values)[step * len(values) : (step + 1) * len(values)] = values
 
 
+def write_constant(group: h5py.Group, place: str, name: str, values: NDArray[np.generic]) -> None:
+    """An array of points or cells that is the same at every step; ``place`` is "PointData" or "CellData"."""
+    group[place].create_dataset(name, data=values)
+    steps = int(group["Steps"].attrs["NSteps"])
+    group["Steps"][f"{place}Offsets"].create_dataset(name, data=np.zeros(steps, dtype=np.int64))
+
+
 def read_step(group: h5py.Group, place: str, name: str, step: int) -> NDArray[np.generic]:
     """One array of one step; ``place`` is "PointData" or "CellData"."""
-    dataset = group[place][name]
-    steps = int(group["Steps"].attrs["NSteps"])
-    rows = dataset.shape[0] // steps
-    return np.asarray(dataset[step * rows : (step + 1) * rows])
+    rows = int(group["NumberOfPoints" if place == "PointData" else "Polygons/NumberOfCells"][0])
+    start = int(group["Steps"][f"{place}Offsets"][name][step])
+    return np.asarray(group[place][name][start : start + rows])
 
 
 def _array(group: h5py.Group, place: str, name: str, values: NDArray[np.generic]) -> h5py.Dataset:

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from controller.truth import errors, face_middles
 from node_agent.virtual_rig.scenes import Limb
-from processing.results import Results, read_results
+from processing.results import read_results
 
 Array = NDArray[np.float64]
 
@@ -50,31 +51,18 @@ class Figure:
 def compare_with_truth(results_file: Path, limb: Limb) -> list[Figure]:
     """Every step of the results against the limb's formulas; step k of the results is step k of the limb."""
     results = read_results(results_file)
-    theta, z, distance = limb.material_coordinates(results.vertices_ref)
-    reference = limb.position(theta, z, 0)
-    figures = [
-        _figure("distance from the surface", "reference", _span(np.hypot(*reference.T[:2]), "mm"), distance, "mm")
-    ]
-    for step in range(1, len(results.steps)):
-        moved = limb.position(theta, z, step) - reference
-        error = results.vertices[step] - results.vertices_ref - moved
-        length = np.linalg.norm(moved, axis=1)
-        name = results.steps[step]
-        figures.append(_figure("displacement", name, _span(length, "mm"), np.linalg.norm(error, axis=1), "mm"))
-        figures += _stretches(results, step, limb, theta, z)
+    found = errors(results, limb)
+    reference = limb.position(found.theta, found.z, 0)
+    radii = _span(np.hypot(*reference.T[:2]), "mm")
+    figures = [_figure("distance from the surface", "reference", radii, found.distance, "mm")]
+    middles = face_middles(found.theta, found.z, results.faces)
+    for step, name in list(enumerate(results.steps))[1:]:
+        length = np.linalg.norm(limb.position(found.theta, found.z, step) - reference, axis=1)
+        error = np.linalg.norm(found.displacement[step], axis=1)
+        figures.append(_figure("displacement", name, _span(length, "mm"), error, "mm"))
+        for k, true in enumerate(limb.stretches(*middles, step)):
+            figures.append(_figure(f"stretch λ{k + 1}", name, _span(true), found.stretches[step, :, k], ""))
     return figures
-
-
-def _stretches(results: Results, step: int, limb: Limb, theta: Array, z: Array) -> list[Figure]:
-    """The two principal stretches of the triangles against those at their centres."""
-    corners = theta[results.faces]
-    corners = corners[:, :1] + np.mod(corners - corners[:, :1] + np.pi, 2 * np.pi) - np.pi
-    truth = limb.stretches(corners.mean(axis=1), z[results.faces].mean(axis=1), step)
-    found = results.deformation(step)
-    return [
-        _figure(f"stretch {name}", results.steps[step], _span(true), measured - true, "")
-        for name, true, measured in (("λ1", truth[0], found.lambda1), ("λ2", truth[1], found.lambda2))
-    ]
 
 
 def _figure(quantity: str, step: str, true: str, error: Array, unit: str) -> Figure:

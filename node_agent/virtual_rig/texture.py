@@ -119,8 +119,11 @@ def _digit(a, b, number, ws, wz):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def dots(s, z, ws, wz):  # type: ignore[no-untyped-def]
-    """Dark share of the target's print: squares, column numbers above the top row, one disk as a mark."""
+def dots(s, z, ws, wz, prints):  # type: ignore[no-untyped-def]
+    """Dark share of the target's print: squares, column numbers above the top row, one disk as a mark.
+
+    prints : (rows, columns, 2) by how much each square is off its place, mm.
+    """
     column = math.floor(s / _SPACING + 0.5)
     a = s - column * _SPACING
     if column >= _COLUMNS:
@@ -130,7 +133,8 @@ def dots(s, z, ws, wz):  # type: ignore[no-untyped-def]
     dark = 0.0
     row = math.floor((z - 10.0) / _SPACING + 0.5)
     if 0 <= row < _ROWS:
-        dark = _box(a, z - 10.0 - row * _SPACING, _DOT / 2, _DOT / 2, ws, wz)
+        off_s, off_z = prints[row, column, 0], prints[row, column, 1]
+        dark = _box(a - off_s, z - 10.0 - row * _SPACING - off_z, _DOT / 2, _DOT / 2, ws, wz)
     if abs(z - _MARK_Z) < 3.0 and abs(s - _SPACING / 2) < 3.0:
         dark = max(dark, _disk(s - _SPACING / 2, z - _MARK_Z, _MARK_RADIUS, ws, wz))
     if z > _DIGIT_Z - 1.0:

@@ -127,12 +127,14 @@ class Solution:
 
     covariance : (16 C + 3, 16 C + 3) of cameras and sheet, zero for what was held.
     dots_covariance : (m, 2, 2) of the print errors, mm².
+    chi2 : (C,) squared residuals of each camera's centroids in units of their variance, a degree of freedom.
     """
 
     state: State
     scales: Scales
     covariance: Array
     dots_covariance: Array
+    chi2: Array
     iterations: int
 
 
@@ -168,10 +170,11 @@ def adjust(problem: Problem, start: State, print_sigma: float, *, limit: int = 6
             px = _robust_sigma(problem.px - problem.project(state))
             scales = Scales(max(px, _PX_FLOOR), print_sigma)
         near = near or done or gained <= 0.02 * cost
-    covariance, _, dots_covariance = _inverse(normal)
+    covariance, crossed, dots_covariance = _inverse(normal)
+    redundancy = 1 - _leverage(problem, normal, covariance, crossed, dots_covariance)
     whole = np.zeros((len(problem.free),) * 2)
     whole[np.ix_(problem.free, problem.free)] = covariance
-    return Solution(state, scales, whole, dots_covariance, iterations)
+    return Solution(state, scales, whole, dots_covariance, _chi2(problem, normal, redundancy), iterations)
 
 
 @dataclass(frozen=True)
@@ -310,6 +313,13 @@ def _estimate(problem: Problem, state: State, normal: _Normal) -> Scales:
     own = float(np.einsum("mii->", dots)) / old.print**2
     found = float(np.sqrt(np.sum(state.offsets**2) / max(count - own, 1e-6 * count)))
     return Scales(px, max(found, _PRINT_FLOOR), lens)
+
+
+def _chi2(problem: Problem, normal: _Normal, redundancy: Array) -> Array:
+    count = len(problem.lens)
+    squares = np.sum(normal.weights * normal.residuals**2, axis=1)
+    degrees = np.bincount(problem.camera, weights=redundancy.sum(axis=1), minlength=count)
+    return np.bincount(problem.camera, weights=squares, minlength=count) / np.maximum(degrees, 1.0)
 
 
 def _leverage(problem: Problem, normal: _Normal, covariance: Array, crossed: Array, dots: Array) -> Array:

@@ -64,6 +64,9 @@ class BundleFit:
     rows, columns : (m,) dots seen. offsets, offsets_sigma : (m, 2) their print errors along arc and axis, mm.
     lens_chi2 : (C,) squared distance of the lens from the board's, in units of the board's covariance, a parameter:
         about 1 or less, or board and target contradict each other. NaN where no board was used.
+    lens_scale : by what the boards' standard errors of the lenses had to be multiplied to agree with the target.
+    chi2 : (C,) squared residuals of a camera's centroids in units of their variance, a degree of freedom: a camera far
+        above 1 is worse than the others.
     """
 
     cameras: tuple[str, ...]
@@ -76,6 +79,8 @@ class BundleFit:
     offsets: Array
     offsets_sigma: Array
     lens_chi2: Array
+    lens_scale: float
+    chi2: Array
 
     def __post_init__(self) -> None:
         size = PER_CAMERA * len(self.cameras) + 3
@@ -92,6 +97,39 @@ class BundleFit:
         """Standard errors of radius, pitch (mm) and tilt (rad). (3,)."""
         return np.sqrt(np.diag(self.covariance)[-3:])
 
+    def figures(self, target: Target) -> dict[str, Any]:
+        """What an operator reads, as JSON values: the target as found, and a row a camera.
+
+        Lengths mm, ``_px`` px; each ``_sigma`` is the standard error of what it follows.
+        """
+        radius, pitch, tilt = (float(value) for value in self.sheet_sigma)
+        sigma = self.camera_sigma
+        return {
+            "centroid_sigma_px": self.px_sigma,
+            "print_errors_rms_mm": self.print_sigma,
+            "print_errors_largest_mm": float(np.linalg.norm(self.offsets, axis=1).max(initial=0.0)),
+            "lens_scale": self.lens_scale,
+            "radius_mm": self.sheet.radius,
+            "radius_sigma_mm": radius,
+            "pitch_mm": self.sheet.pitch,
+            "pitch_sigma_mm": pitch,
+            "seam_mm": self.sheet.seam(target),
+            "tilt_deg": float(np.degrees(self.sheet.tilt)),
+            "tilt_sigma_deg": float(np.degrees(tilt)),
+            "cameras": [
+                {
+                    "camera": id_,
+                    "focal_sigma_px": sigma[c, :2].tolist(),
+                    "centre_sigma_px": sigma[c, 3:5].tolist(),
+                    "turn_sigma_deg": np.degrees(sigma[c, 10:13]).tolist(),
+                    "shift_sigma_mm": sigma[c, 13:].tolist(),
+                    "chi2": float(self.chi2[c]),
+                    "lens_chi2": None if np.isnan(self.lens_chi2[c]) else float(self.lens_chi2[c]),
+                }
+                for c, id_ in enumerate(self.cameras)
+            ],
+        }
+
     def to_dict(self) -> dict[str, Any]:
         """Everything as JSON values."""
         return {
@@ -105,6 +143,8 @@ class BundleFit:
             "offsets": self.offsets.tolist(),
             "offsets_sigma": self.offsets_sigma.tolist(),
             "lens_chi2": [None if np.isnan(value) else float(value) for value in self.lens_chi2],
+            "lens_scale": self.lens_scale,
+            "chi2": self.chi2.tolist(),
         }
 
     @classmethod
@@ -121,6 +161,8 @@ class BundleFit:
             np.array(values["offsets"], dtype=float).reshape(-1, 2),
             np.array(values["offsets_sigma"], dtype=float).reshape(-1, 2),
             np.array([np.nan if value is None else value for value in values["lens_chi2"]], dtype=float),
+            float(values["lens_scale"]),
+            np.array(values["chi2"], dtype=float),
         )
 
 
@@ -265,12 +307,12 @@ def _adjusted(
     centroid = problem.project(state)[own & kept]
     sz = sheet_points(problem.target, state.sheet, problem.rows, problem.columns) + state.offsets
     dots = replace(given.dots.chosen(keep), xyz=wrapped(sz[dot], state.sheet.radius))
-    return CameraCalibration(
+    return replace(
+        given,
         camera=camera,
         dots=dots,
         residuals=camera.undistort(dots.px) - camera.undistort(centroid),
         left_out=given.left_out + int((~keep).sum()),
-        fit=given.fit,
         centroid_shift=centroid - problem.project_centres(state)[own & kept],
     )
 
@@ -291,4 +333,6 @@ def _fit(ids: tuple[str, ...], part: Problem, solution: Solution) -> BundleFit:
         state.offsets,
         dots_sigma if len(dots_sigma) else np.zeros_like(state.offsets),
         np.where(known, part.lens_gap(state) / np.maximum(count, 1), np.nan),
+        solution.scales.lens,
+        solution.chi2,
     )

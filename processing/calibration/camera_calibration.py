@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,8 @@ class CameraCalibration:
     fit : the fit of the lens to the board, or None where it was given or distortion is not corrected.
     centroid_shift : (n, 2) centroid of a dot's image minus the image of its centre, px, as far as it is modelled: zero
         after the direct linear transformation, which takes the one for the other.
+    views : names of the board images on which the fit rests or which it left out, in its order.
+    blank : names of the board images in which the board was not found.
     """
 
     camera: Camera
@@ -52,6 +54,8 @@ class CameraCalibration:
     left_out: int
     fit: IntrinsicsFit | None
     centroid_shift: Array
+    views: tuple[str, ...] = ()
+    blank: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.residuals.shape != (len(self.dots), 2) or self.centroid_shift.shape != (len(self.dots), 2):
@@ -80,6 +84,8 @@ class CameraCalibration:
             "residuals": self.residuals.tolist(),
             "left_out": self.left_out,
             "centroid_shift": self.centroid_shift.tolist(),
+            "views": list(self.views),
+            "blank": list(self.blank),
         }
 
     @classmethod
@@ -99,6 +105,8 @@ class CameraCalibration:
             int(values["left_out"]),
             None if fit is None else IntrinsicsFit.from_dict(fit),
             np.array(values["centroid_shift"], dtype=float).reshape(-1, 2),
+            tuple(values["views"]),
+            tuple(values["blank"]),
         )
 
 
@@ -113,7 +121,9 @@ def calibrate_camera(
     radial: int | None = None,
     tangential: bool = True,
     skew: bool = True,
+    fewest_terms: bool = False,
     drop_percentile: float = 80.0,
+    board_names: Sequence[str] | None = None,
     max_incidence_deg: float = 55.0,
     linear_light: bool = True,
     progress: Callable[[int, int], None] | None = None,
@@ -123,7 +133,8 @@ def calibrate_camera(
     board_images, target_image : grey, (height, width), all of one size; uint8, uint16 or float in 0 … 255.
     distortion : False calibrates by the DLT alone; the board images are not looked at.
     intrinsics : the lens, where the rig gives it; the board images are not looked at.
-    radial, tangential, skew, drop_percentile : see ``calibrate_intrinsics``.
+    radial, tangential, skew, fewest_terms, drop_percentile : see ``calibrate_intrinsics``.
+    board_names : what to call the board images; None numbers them from 1.
     max_incidence_deg : dots seen more obliquely are not used.
     linear_light : images are sRGB-coded.
     progress : called with (images done, images in all).
@@ -140,6 +151,8 @@ def calibrate_camera(
                 f"image is {width} x {height}; all images of a camera must have one size"
             )
     fit = None
+    found: tuple[str, ...] = ()
+    blank: tuple[str, ...] = ()
     if not distortion:
         intrinsics = None
     elif intrinsics is not None:
@@ -149,14 +162,18 @@ def calibrate_camera(
                 f"pixels, the target image is {width} x {height}; give intrinsics made at this size"
             )
     else:
+        names = [str(i + 1) for i in range(len(board_images))] if board_names is None else list(board_names)
         views = _find_views(rig, camera_id, board_images, progress)
+        found = tuple(name for name, view in zip(names, views, strict=True) if view is not None)
+        blank = tuple(name for name, view in zip(names, views, strict=True) if view is None)
         fit = calibrate_intrinsics(
-            views,
+            [view for view in views if view is not None],
             board_points(rig.board),
             size,
             radial=radial,
             tangential=tangential,
             skew=skew,
+            fewest_terms=fewest_terms,
             drop_percentile=drop_percentile,
         )
         _require_focal_length(camera_id, fit)
@@ -169,26 +186,26 @@ def calibrate_camera(
         camera=camera_id,
         intrinsics=intrinsics,
         rotation_deg=entry.rotation_deg,
+        height_mm=entry.height_mm,
         max_incidence_deg=max_incidence_deg,
     )
-    return _place(camera_id, size, observed, intrinsics, fit)
+    return replace(_place(camera_id, size, observed, intrinsics, fit), views=found, blank=blank)
 
 
 def _find_views(
     rig: Rig, camera_id: str, images: Sequence[Image], progress: Callable[[int, int], None] | None
-) -> list[Array]:
-    """Corners of the board in each image that shows all of it."""
+) -> list[Array | None]:
+    """Corners of the board in each image, None where it is not seen whole."""
     views = []
     for number, image in enumerate(images, start=1):
-        corners = find_corners(image, rig.board.inner_corners)
-        if corners is not None:
-            views.append(corners)
+        views.append(find_corners(image, rig.board.inner_corners))
         if progress is not None:
             progress(number, len(images))
-    if len(views) < VIEWS_NEEDED:
+    found = sum(view is not None for view in views)
+    if found < VIEWS_NEEDED:
         across, along = rig.board.squares
         raise InputError(
-            f"camera {camera_id}: the checkerboard was found in {len(views)} of {len(images)} board images; the lens "
+            f"camera {camera_id}: the checkerboard was found in {found} of {len(images)} board images; the lens "
             f"needs at least {VIEWS_NEEDED}. Check that every image shows the whole board, sharp and without glare, "
             f"and that [board] squares in rig.toml ({across} x {along}) counts its squares; or give the camera an "
             "intrinsics file, or switch calibration.distortion off"

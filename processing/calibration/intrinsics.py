@@ -16,6 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.calibration.coverage import coverage, residual_distortion
+from processing.calibration.lens_model import Choice, LensModel, choose, independent, possible
 from processing.calibration.parameters import lens_jacobians
 from processing.camera import Intrinsics
 from processing.errors import ComputationError, InputError
@@ -29,6 +31,8 @@ PARAMETERS = ("fx", "fy", "s", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 K3_SIGMA_LIMIT = 0.2
 #: With fewer views than this no view is dropped for being above the percentile.
 VIEWS_FOR_DROPPING = 10
+#: Parameters that every lens has.
+_ALWAYS = np.array([True, True, False, True, True, True, True, False, False, False])
 #: No corner is better than this, px.
 _CORNER_FLOOR = 1e-6
 #: Views without which a camera with free skew, focal lengths and centre is not determined.
@@ -44,6 +48,10 @@ class IntrinsicsFit:
     kept : (n,), which views the fit rests on.
     rms : RMS distance over the kept views, px.
     covariance : (10, 10) of the same parameters; rows and columns of held ones are 0.
+    model : the terms that are free, in words. reason : why these.
+    coverage : part of the image that the kept views of the board cover together.
+    residual_distortion : px, RMS over the cells of the image of what corners seen there are off in common, which
+        noise does not explain: a lens or a board that is not as the model says.
     """
 
     intrinsics: Intrinsics
@@ -52,6 +60,10 @@ class IntrinsicsFit:
     kept: NDArray[np.bool_]
     rms: float
     covariance: Array
+    model: str = ""
+    reason: str = ""
+    coverage: float = float("nan")
+    residual_distortion: float = float("nan")
 
     def to_dict(self) -> dict[str, Any]:
         """The fit as JSON values."""
@@ -62,6 +74,10 @@ class IntrinsicsFit:
             "kept": self.kept.tolist(),
             "rms": self.rms,
             "covariance": self.covariance.tolist(),
+            "model": self.model,
+            "reason": self.reason,
+            "coverage": self.coverage,
+            "residual_distortion": self.residual_distortion,
         }
 
     @classmethod
@@ -74,6 +90,10 @@ class IntrinsicsFit:
             np.array(values["kept"], dtype=bool),
             float(values["rms"]),
             np.array(values["covariance"], dtype=float),
+            str(values["model"]),
+            str(values["reason"]),
+            float(values["coverage"]),
+            float(values["residual_distortion"]),
         )
 
 
@@ -114,6 +134,7 @@ def calibrate_intrinsics(
     radial: int | None = None,
     tangential: bool = True,
     skew: bool = True,
+    fewest_terms: bool = False,
     drop_percentile: float = 80.0,
 ) -> IntrinsicsFit:
     """Intrinsics from the corners of a board in several views.
@@ -122,6 +143,8 @@ def calibrate_intrinsics(
     board_xy : (n, 2) mm.
     size : (width, height), px.
     radial : number of radial terms, 2 or 3; None takes 3 where the standard error of k3 is below ``K3_SIGMA_LIMIT``.
+    tangential, skew : whether these are free.
+    fewest_terms : of the models without some of these terms that of the smallest information criterion is taken.
     drop_percentile : views whose error lies above this percentile are left out and the rest is fitted again, where
         there are at least ``VIEWS_FOR_DROPPING``; 100 keeps all.
 
@@ -133,27 +156,47 @@ def calibrate_intrinsics(
         )
     px = np.stack([np.asarray(view, dtype=float).reshape(-1, 2) for view in views])
     board = np.column_stack([np.asarray(board_xy, dtype=float), np.zeros(len(board_xy))])
-    free = np.array([True, True, skew, True, True, True, True, tangential, tangential, radial != 2])
+    models = possible(radial, tangential, skew, fewest_terms)
+    largest = models[0]
+    whole, _ = _refine(_start(px, board, size), px, board, largest.free)
+    kept = _views_to_keep(_view_errors(whole, px, board), drop_percentile)
+    inner, rotations, translations = whole
+    best = px[kept]
+    fits: dict[LensModel, tuple[State, Array]] = {}
 
-    start = _start(px, board, size)
-    state, covariance = _refine(start, px, board, free)
-    if radial is None and covariance[9, 9] > K3_SIGMA_LIMIT**2:
-        free[9] = False
-        state, covariance = _refine(start, px, board, free)
+    def fit(model: LensModel) -> tuple[float, float]:
+        start = (np.where(model.free | _ALWAYS, inner, 0.0), rotations[kept], translations[kept])
+        fits[model] = _refine(start, best, board, model.free)
+        state, covariance = fits[model]
+        return _cost(state, best, board) / best.size, float(np.sqrt(covariance[9, 9]))
+
+    worth = independent((px - _project(whole, board)[0])[kept], board[:, :2])
+    choice = choose(models, fit, worth, K3_SIGMA_LIMIT, fewest_terms)
+    if choice.model not in fits:
+        fit(choice.model)
+    (inner, rotations_kept, translations_kept), covariance = fits[choice.model]
+    rotations, translations = rotations.copy(), translations.copy()
+    rotations[kept], translations[kept] = rotations_kept, translations_kept
+    state = (inner, *_poses_refined(inner, rotations, translations, px, board))
     errors = _view_errors(state, px, board)
-    kept = _views_to_keep(errors, drop_percentile)
-    if not kept.all():
-        inner, rotations, translations = state
-        inner_state = (inner, rotations[kept], translations[kept])
-        (inner, rotations_kept, translations_kept), covariance = _refine(inner_state, px[kept], board, free)
-        rotations, translations = rotations.copy(), translations.copy()
-        rotations[kept], translations[kept] = rotations_kept, translations_kept
-        state = (inner, *_poses_refined(inner, rotations, translations, px, board))
-        errors = _view_errors(state, px, board)
-    intrinsics = _intrinsics(state[0], size)
+    residuals = (px - _project(state, board)[0])[kept]
     rms = float(np.sqrt(np.mean(errors[kept] ** 2)))
-    log.info("intrinsics from %d of %d views, RMS %.3f px", kept.sum(), len(views), rms)
-    return IntrinsicsFit(intrinsics, np.sqrt(np.diag(covariance)), errors, kept, rms, covariance)
+    log.info("intrinsics from %d of %d views, %s (%s), RMS %.3f px", kept.sum(), len(views), *_words(choice), rms)
+    return IntrinsicsFit(
+        _intrinsics(inner, size),
+        np.sqrt(np.diag(covariance)),
+        errors,
+        kept,
+        rms,
+        covariance,
+        *_words(choice),
+        coverage(best, size),
+        residual_distortion(best, residuals, size),
+    )
+
+
+def _words(choice: Choice) -> tuple[str, str]:
+    return str(choice.model), choice.reason
 
 
 State = tuple[Array, Array, Array]  # inner (10,), rotations (views, 3, 3), translations (views, 3)

@@ -13,6 +13,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
@@ -120,6 +121,7 @@ def identify(
     camera: str = "",
     intrinsics: Intrinsics | None = None,
     rotation_deg: float = 0.0,
+    height_mm: float | None = None,
     max_incidence_deg: float = 55.0,
 ) -> DotObservations:
     """Row, column and point of every dot seen under less than ``max_incidence_deg``.
@@ -128,17 +130,16 @@ def identify(
     azimuth_deg : nominal azimuth of the camera, good to ± 5°.
     intrinsics : the lens, if known: it makes the expected places sharper, the positions stay image pixels.
     rotation_deg : by how much the image is turned clockwise; the nearest multiple of 90 is used.
+    height_mm : of the camera, good to a third of the rows' spacing: it tells the rows apart where the image shows
+        neither end of the target.
 
     Raises InputError, with the camera's name and what was found, where the dots do not make a camera.
     """
-    if intrinsics is None:
-        upright = _upright(dots, rotation_deg)
-    else:
-        px = intrinsics.to_undistorted(dots.px)
-        usable = np.flatnonzero(np.isfinite(px).all(axis=1))
-        dots = dots[usable]
-        upright = _upright(replace(dots, px=px[usable]), rotation_deg)
+    dots, upright = _prepared(dots, intrinsics, rotation_deg)
     numbering = _number(upright, target, azimuth_deg, camera, lens_known=intrinsics is not None)
+    _, border = _prepared(_border(dots.size), intrinsics, rotation_deg)
+    frame = _straightened(border, numbering.bend).px.astype(np.float32)
+    numbering = replace(numbering, L=_with_rows(numbering, frame, target, camera, height_mm))
     upright = _straightened(upright, numbering.bend)
     L = numbering.L
     all_rows = range(1, target.rows + 1)
@@ -160,6 +161,24 @@ def identify(
         azimuth_deg,
     )
     return DotObservations(camera, rows, columns, dots.px[found], xyz, azimuth, numbering.margin)
+
+
+def _prepared(dots: Dots, intrinsics: Intrinsics | None, rotation_deg: float) -> tuple[Dots, Dots]:
+    """Dots that the lens can show, and the same undistorted, where it is known, and turned upright."""
+    if intrinsics is None:
+        return dots, _upright(dots, rotation_deg)
+    px = intrinsics.to_undistorted(dots.px)
+    usable = np.flatnonzero(np.isfinite(px).all(axis=1))
+    return dots[usable], _upright(replace(dots[usable], px=px[usable]), rotation_deg)
+
+
+def _border(size: tuple[int, int]) -> Dots:
+    """Points along the border of an image, as if they were dots."""
+    side = np.linspace(0, 1, 16, endpoint=False)
+    none, full = np.zeros(16), np.ones(16)
+    around = np.concatenate([[side, none], [full, side], [1 - side, full], [none, 1 - side]], axis=1).T
+    n = len(around)
+    return Dots(around * (np.array(size) - 1.0), np.ones(n), np.ones(n), np.ones(n), size)
 
 
 def _upright(dots: Dots, rotation_deg: float) -> Dots:
@@ -241,12 +260,67 @@ def _number(dots: Dots, target: Target, azimuth_deg: float, camera: str, *, lens
             f"target's columns (the camera stands at {azimuth_deg + good[0].deviation:.1f}° or "
             f"{azimuth_deg + good[1].deviation:.1f}°); give azimuth_deg to within 5°"
         )
-    if good[0].rows != target.rows:
-        raise InputError(
-            f"camera {camera}: {good[0].rows} rows of dots are seen in the target image, [target] in rig.toml says "
-            f"{target.rows}; all rows must be in view, not hidden over the whole width, and [target] rows must be right"
-        )
     return replace(good[0], margin=margin)
+
+
+def _with_rows(
+    numbering: _Numbering,
+    frame: NDArray[np.float32],
+    target: Target,
+    camera: str,
+    height_mm: float | None,
+) -> Array:
+    """The DLT parameters with the rows numbered, where the image cuts some of them off.
+
+    frame : the border of the image, a polygon (m, 2) in the coordinates of the dots.
+    A row that is not seen must lie outside the image: that leaves one place for those that are, if the image shows an
+    end of the target, and the camera's height decides otherwise.
+    """
+    possible = []
+    for below in range(target.rows - numbering.rows + 1):
+        L = _lifted(numbering.L, below * target.row_spacing_mm)
+        rows = [*range(1, below + 1), *range(below + numbering.rows + 1, target.rows + 1)]
+        if not _any_inside(L, rows, frame, target):
+            possible.append((float(Camera("", dlt.to_projection(L), (1, 1)).centre[2]), L))
+    if height_mm is not None and len(possible) > 1:
+        possible = [each for each in possible if abs(each[0] - height_mm) < target.row_spacing_mm / 2]
+    if len(possible) == 1:
+        return possible[0][1]
+    seen = f"camera {camera}: {numbering.rows} rows of dots are seen in the target image, "
+    if possible:
+        raise InputError(
+            f"{seen}[target] in rig.toml says {target.rows}, and neither the lowest nor the highest is in view; show "
+            f"one of them, or give the camera's height_mm in rig.toml to within {target.row_spacing_mm / 3:.0f} mm"
+        )
+    raise InputError(
+        f"{seen}[target] in rig.toml says {target.rows}; rows within the image must not be hidden over the whole "
+        "width, and [target] rows must be right"
+    )
+
+
+def _lifted(L: Array, z: float) -> Array:
+    """The camera that sees points lifted by z mm where this one sees them."""
+    P = dlt.to_projection(L)
+    P[:, 3] -= z * P[:, 2]
+    return np.asarray((P / P[2, 3]).ravel()[:11])
+
+
+def _any_inside(L: Array, rows: list[int], frame: NDArray[np.float32], target: Target) -> bool:
+    """Whether dots of these rows, seen well, would lie in the image by more than their size."""
+    if not rows:
+        return False
+    camera = Camera("", dlt.to_projection(L), (1, 1))
+    grid = np.meshgrid(rows, np.arange(1, target.columns + 1))
+    xyz = dot_points(target, grid[0].ravel(), grid[1].ravel())
+    normals = xyz * np.array([1 / target.radius_mm, 1 / target.radius_mm, 0])
+    xyz = xyz[camera.incidence_cosine(xyz, normals) > math.cos(math.radians(40.0))]
+    if not len(xyz):
+        return False
+    margin = _projected_size(camera, xyz, target)[1]
+    px = camera.project_undistorted(xyz)
+    depth = np.array([cv2.pointPolygonTest(frame, (float(x), float(y)), True) for x, y in px])
+    inside = depth > margin
+    return bool(inside.mean() > 0.2)
 
 
 def _try(

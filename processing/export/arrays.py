@@ -1,4 +1,4 @@
-"""All steps as arrays: NumPy's npz and MATLAB's mat."""
+"""All steps as arrays for Python: NumPy's npz."""
 
 from __future__ import annotations
 
@@ -6,53 +6,47 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.io import savemat
 
-from processing.results import Results, read_results
+from processing.evaluation import Evaluated
+
+_SCALARS = ("lambda1", "lambda2", "J")
 
 
-def export_npz(results_path: Path, out: Path) -> None:
+def export_npz(seen: Evaluated, out: Path) -> None:
     """Write ``vertices_ref`` (N, 3), ``vertices`` (F, N, 3), ``faces`` (M, 3), ``lambda1``, ``lambda2``, ``J`` (F, M),
     ``E`` (F, M, 3, 3), ``correlation`` (F, N), ``sigma_xyz`` (F, N, 3) and ``pair`` (M,).
 
-    mm, world frame; step 0 is the reference, with identity deformation; NaN where not measured.
+    mm, world frame; step 0 is the reference, with identity deformation; NaN where not measured. With a strain window,
+    the four of deformation also as ``window_…``.
     """  # fmt: skip
     with Path(out).open("wb") as file:  # given a name, savez would append a suffix to it
-        np.savez(file, **arrays(read_results(results_path)))
+        np.savez(file, **arrays(seen))
 
 
-def export_mat(results_path: Path, out: Path) -> None:
-    """Write the arrays of the npz for MATLAB, level 5: ``faces`` and ``pair`` count from 1 (0: a face joins two pairs).
-
-    ``steps`` and ``settings`` are text.
-    """
-    results = read_results(results_path)
-    values = arrays(results)
-    values["faces"] = np.asarray(results.faces, dtype=float) + 1
-    values["pair"] = np.asarray(results.pair, dtype=float) + 1
-    values["steps"] = np.array(results.steps, dtype=object)
-    values["settings"] = results.settings
-    with Path(out).open("wb") as file:
-        savemat(file, values, do_compression=True, oned_as="column")
-
-
-def arrays(results: Results) -> dict[str, Any]:
+def arrays(seen: Evaluated) -> dict[str, Any]:
     """The arrays of the npz, in full precision."""
+    results = seen.results
     F, M = len(results.steps), len(results.faces)
-    scalars = {name: np.empty((F, M)) for name in ("lambda1", "lambda2", "J")}
-    E = np.empty((F, M, 3, 3))
+    prefixes = ("", "window_") if seen.window is not None else ("",)
+    found: dict[str, Any] = {prefix + name: np.empty((F, M)) for prefix in prefixes for name in _SCALARS}
+    found |= {f"{prefix}E": np.empty((F, M, 3, 3)) for prefix in prefixes}
     for step in range(F):
-        found = results.deformation(step)
-        E[step] = found.E
-        for name, values in scalars.items():
-            values[step] = getattr(found, name)
+        fields = seen.step(step)
+        for prefix in prefixes:
+            for name in _SCALARS:
+                found[prefix + name][step] = fields.face[prefix + name]
+            found[f"{prefix}E"][step] = square(fields.face[f"{prefix}E_tensor"])
     return {
         "vertices_ref": results.vertices_ref,
-        "vertices": results.vertices,
+        "vertices": np.stack([seen.positions(step) for step in range(F)]),
         "faces": results.faces,
-        **scalars,
-        "E": E,
+        **found,
         "correlation": results.correlation,
         "sigma_xyz": results.sigma_xyz,
         "pair": results.pair,
     }
+
+
+def square(six: np.ndarray) -> np.ndarray:
+    """Symmetric tensors (..., 3, 3) of their components (..., 6), xx yy zz xy yz xz."""
+    return six[..., [[0, 3, 5], [3, 1, 4], [5, 4, 2]]]

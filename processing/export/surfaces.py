@@ -1,4 +1,4 @@
-"""Every step as a surface: PLY with fields, GLB with colours. Triangles that lost a corner are left out."""
+"""Every step as a surface: PLY with fields and colours, GLB with colours. Triangles that lost a corner are left out."""
 
 from __future__ import annotations
 
@@ -8,55 +8,70 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from processing.fields import FIELDS
-from processing.mesh import Mesh
-from processing.results import read_field, read_mesh, read_positions, read_summary
+from processing.colours import colours
+from processing.evaluation import Evaluated
+from processing.fields import Field, StepFields
 
-#: A sequential scale from dark blue to yellow, evenly rising in lightness; rows are RGB, 0 … 255.
-_SCALE = np.array([[40, 24, 90], [50, 80, 140], [34, 140, 140], [96, 200, 96], [250, 230, 40]], dtype=float)
+Array = NDArray[np.float64]
+
 _GLTF_FROM_WORLD = 1e-3 * np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+DEFAULT_COLOUR = "displacement"
 
 
-def export_ply(results_path: Path, out: Path) -> None:
-    """Write ``STEP.ply`` (binary, mm) for every step, with every field as a property of its vertices or faces."""
-    for step, name in enumerate(read_summary(results_path)["steps"]):
-        mesh, kept, whole = _measured(results_path, step)
-        solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-        for entry in FIELDS:
-            values, location = read_field(results_path, entry.name, step)
-            if location == "point":
+def export_ply(seen: Evaluated, out: Path, colour: str = DEFAULT_COLOUR) -> None:
+    """Write ``STEP.ply`` (binary, mm) for every step: every field as a property of its vertices or faces, and colours
+    of one of them, one scale for all steps."""
+    paint = _Paint(seen, colour)
+    for step, name in enumerate(seen.steps):
+        fields = seen.step(step)
+        mesh, kept, whole = seen.measured(step)
+        solid = _solid(mesh.vertices, mesh.faces, paint.vertices(fields)[kept])
+        for entry in seen.fields:
+            values = fields.scalar(entry).astype(np.float32)
+            if entry.location == "point":
                 solid.vertex_attributes[entry.name] = values[kept]
             else:
                 solid.face_attributes[entry.name] = values[whole]
         solid.export(out / f"{name}.ply", file_type="ply")
 
 
-def export_glb(results_path: Path, out: Path) -> None:
-    """Write ``STEP.glb`` for every step, coloured by the length of the displacement, one scale for all steps.
+def export_glb(seen: Evaluated, out: Path, colour: str = DEFAULT_COLOUR) -> None:
+    """Write ``STEP.glb`` for every step, coloured by a field, one scale for all steps.
 
     glTF's conventions: metres, y upwards (the target's z).
     """
-    summary = read_summary(results_path)
-    displacement = next(row for row in summary["fields"] if row["name"] == "displacement")
-    low, high = displacement["range"] or (0.0, 0.0)
-    for step, name in enumerate(summary["steps"]):
-        mesh, kept, _ = _measured(results_path, step)
-        values, _ = read_field(results_path, "displacement", step)
-        colours = _colours(values[kept], low, high)
-        solid = trimesh.Trimesh(mesh.vertices @ _GLTF_FROM_WORLD.T, mesh.faces, vertex_colors=colours, process=False)
+    paint = _Paint(seen, colour)
+    for step, name in enumerate(seen.steps):
+        mesh, kept, _ = seen.measured(step)
+        solid = _solid(mesh.vertices @ _GLTF_FROM_WORLD.T, mesh.faces, paint.vertices(seen.step(step))[kept])
         solid.export(out / f"{name}.glb", file_type="glb")
 
 
-def _measured(results_path: Path, step: int) -> tuple[Mesh, NDArray[np.int64], NDArray[np.bool_]]:
-    """The measured part of a step, the old index of its vertices, and which triangles it has."""
-    moved = Mesh(read_positions(results_path, step), read_mesh(results_path).faces)
-    whole = moved.whole_faces()
-    mesh, kept = Mesh(moved.vertices, moved.faces[whole]).compact()
-    return mesh, kept, whole
+def _solid(vertices: Array, faces: NDArray[np.int64], rgba: NDArray[np.uint8]) -> trimesh.Trimesh:
+    """A surface with colours; one without points has none."""
+    return trimesh.Trimesh(vertices, faces, vertex_colors=rgba if len(rgba) else None, process=False)
 
 
-def _colours(values: NDArray[np.float32], low: float, high: float) -> NDArray[np.uint8]:
-    """RGBA (n, 4) on the sequential scale from ``low`` to ``high``."""
-    share = np.clip((values - low) / max(high - low, 1e-12), 0.0, 1.0) * (len(_SCALE) - 1)
-    rgb = np.stack([np.interp(share, np.arange(len(_SCALE)), _SCALE[:, i]) for i in range(3)], axis=1)
-    return np.column_stack([rgb, np.full(len(rgb), 255.0)]).astype(np.uint8)
+class _Paint:
+    """Colours of the vertices by one field; a field of faces is averaged at each vertex over its triangles."""
+
+    def __init__(self, seen: Evaluated, name: str) -> None:
+        self._entry: Field = seen.field(name)
+        self._limits = seen.limits(name)
+        self._faces = seen.results.faces
+        self._count = len(seen.results.vertices_ref)
+
+    def vertices(self, fields: StepFields) -> NDArray[np.uint8]:
+        """RGBA (N, 4)."""
+        values = fields.scalar(self._entry)
+        if self._entry.location == "face":
+            values = self._at_vertices(values)
+        rgb = colours(values, *self._limits, diverging=self._entry.centre is not None)
+        return np.column_stack([np.rint(255 * rgb), np.full(len(rgb), 255.0)]).astype(np.uint8)
+
+    def _at_vertices(self, values: Array) -> Array:
+        known = np.isfinite(values)
+        corners = self._faces[known].ravel()
+        total = np.bincount(corners, np.repeat(values[known], 3), self._count)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(total / np.bincount(corners, minlength=self._count))

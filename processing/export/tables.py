@@ -7,27 +7,28 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.fields import FIELDS
-from processing.results import read_field, read_mesh, read_positions, read_summary
+from processing.evaluation import Evaluated
 
 
-def export_csv(results_path: Path, out: Path) -> None:
+def export_csv(seen: Evaluated, out: Path) -> None:
     """Write ``STEP-points.csv`` and ``STEP-faces.csv`` for every step into the folder ``out``.
 
-    The first line names the columns with their units; vertices count from 0; what was not measured is empty.
+    The first line names the columns with their units; vertices count from 0; what was not measured is empty. The
+    columns ``…_reference`` hold what the step is compared with.
     """
-    mesh = read_mesh(results_path)
-    for step, name in enumerate(read_summary(results_path)["steps"]):
+    for step, name in enumerate(seen.steps):
         columns: dict[str, list[tuple[str, NDArray[np.generic]]]] = {"point": [], "face": []}
-        positions = read_positions(results_path, step)
+        positions = seen.positions(step)
+        before = seen.results.before(step, seen.evaluation.previous)
         for i, axis in enumerate("xyz"):
-            columns["point"].append((f"{axis}_reference [mm]", mesh.vertices[:, i]))
+            columns["point"].append((f"{axis}_reference [mm]", before[:, i]))
             columns["point"].append((f"{axis} [mm]", positions[:, i]))
         for i in range(3):
-            columns["face"].append((f"vertex{i + 1}", mesh.faces[:, i]))
-        for entry in FIELDS:
+            columns["face"].append((f"vertex{i + 1}", seen.results.faces[:, i]))
+        fields = seen.step(step)
+        for entry in seen.fields:
             unit = f" [{entry.unit}]" if entry.unit else ""
-            columns[entry.location].append((entry.name + unit, read_field(results_path, entry.name, step)[0]))
+            columns[entry.location].append((entry.name + unit, fields.scalar(entry).astype(np.float32)))
         _write(out / f"{name}-points.csv", columns["point"])
         _write(out / f"{name}-faces.csv", columns["face"])
 

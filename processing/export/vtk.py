@@ -11,47 +11,72 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing import vtkhdf
-from processing.results import read_summary
+from processing.evaluation import Evaluated
+from processing.fields import StepFields
 
 _TYPES = {"f4": "Float32", "f8": "Float64", "u1": "UInt8", "i1": "Int8", "i8": "Int64"}
+Arrays = dict[str, NDArray[np.generic]]
 
 
-def export_vtkhdf(results_path: Path, out: Path) -> None:
-    """Write the moving surface alone, without what is kept beside it."""
-    with h5py.File(results_path, "r") as source, h5py.File(out, "w") as target:
-        source.copy("VTKHDF", target)
+def export_vtkhdf(seen: Evaluated, out: Path) -> None:
+    """Write the moving surface with every field, and the vectors and tensors they come from."""
+    with h5py.File(out, "w") as file:
+        group = vtkhdf.create(file, seen.results.faces, len(seen.results.vertices_ref), len(seen.steps))
+        for step in range(len(seen.steps)):
+            positions, point, cell = _step(seen, step)
+            vtkhdf.write_step(group, step, positions, point, cell)
 
 
-def export_vtp(results_path: Path, out: Path) -> None:
+def export_vtp(seen: Evaluated, out: Path) -> None:
     """Write ``STEP.vtp`` for every step and ``series.pvd``, which opens them as one series, into the folder ``out``."""
-    names = read_summary(results_path)["steps"]
-    with h5py.File(results_path, "r") as file:
-        group = file["VTKHDF"]
-        for step, name in enumerate(names):
-            _write(out / f"{name}.vtp", _poly_data(group, step))
+    for step, name in enumerate(seen.steps):
+        positions, point, cell = _step(seen, step)
+        _write(out / f"{name}.vtp", _poly_data(positions, seen.results.faces, point, cell))
     series = ET.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
     collection = ET.SubElement(series, "Collection")
-    for step, name in enumerate(names):
+    for step, name in enumerate(seen.steps):
         ET.SubElement(collection, "DataSet", timestep=str(step), part="0", file=f"{name}.vtp")
     _write(out / "series.pvd", series)
 
 
-def _poly_data(group: h5py.Group, step: int) -> ET.Element:
-    points = int(group["NumberOfPoints"][0])
-    faces = group["Polygons/Connectivity"][:]
+def _step(seen: Evaluated, step: int) -> tuple[NDArray[np.float64], Arrays, Arrays]:
+    """Positions, all finite (a lost point stays at its reference), and the arrays of points and of faces."""
+    current = seen.positions(step)
+    measured: NDArray[np.bool_] = np.asarray(np.isfinite(current).all(axis=1))
+    flags: Arrays = {
+        "measured": measured.astype(np.uint8),
+        "status": seen.results.status[step].astype(np.int8),
+    }
+    fields = seen.step(step)
+    point, cell = (_arrays(seen, fields, location) for location in ("point", "face"))
+    return np.where(measured[:, None], current, seen.results.vertices_ref), point | flags, cell
+
+
+def _arrays(seen: Evaluated, fields: StepFields, location: str) -> Arrays:
+    """Vectors and tensors as they are; of the scalars, every field that is not a component or length of one."""
+    arrays = fields.point if location == "point" else fields.face
+    wide = {name: values for name, values in arrays.items() if values.ndim > 1}
+    scalars = {
+        entry.name: fields.scalar(entry)
+        for entry in seen.fields
+        if entry.location == location and not any(name in wide for name in entry.of)
+    }
+    return {name: np.asarray(values, dtype=np.float32) for name, values in (wide | scalars).items()}
+
+
+def _poly_data(positions: NDArray[np.float64], faces: NDArray[np.int64], point: Arrays, cell: Arrays) -> ET.Element:
     root = ET.Element("VTKFile", type="PolyData", version="1.0", byte_order="LittleEndian", header_type="UInt64")
     piece = ET.SubElement(
-        ET.SubElement(root, "PolyData"), "Piece", NumberOfPoints=str(points), NumberOfPolys=str(len(faces) // 3)
+        ET.SubElement(root, "PolyData"), "Piece", NumberOfPoints=str(len(positions)), NumberOfPolys=str(len(faces))
     )
-    positions = ET.SubElement(piece, "Points")
-    _array(positions, "Points", group["Points"][step * points : (step + 1) * points])
+    _array(ET.SubElement(piece, "Points"), "Points", positions)
     polygons = ET.SubElement(piece, "Polys")
-    _array(polygons, "connectivity", faces)
-    _array(polygons, "offsets", group["Polygons/Offsets"][1:])
-    for place in ("PointData", "CellData"):
+    _array(polygons, "connectivity", faces.astype(np.int64).ravel())
+    _array(polygons, "offsets", np.arange(3, faces.size + 1, 3, dtype=np.int64))
+    for place, arrays in (("PointData", point), ("CellData", cell)):
         holder = ET.SubElement(piece, place)
-        for name in group[place]:
-            _array(holder, name, vtkhdf.read_step(group, place, name, step))
+        for name, values in arrays.items():
+            _array(holder, name, values)
     return root
 
 

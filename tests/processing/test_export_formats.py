@@ -8,13 +8,16 @@ from xml.etree import ElementTree as ET
 
 import h5py
 import numpy as np
+import pandas
 import pytest
 import trimesh
 from scipy.io import loadmat
 
 from processing.errors import InputError
+from processing.evaluation import Evaluation
 from processing.export import FORMATS, export
 from processing.results import Results, read_field, read_summary, write_results
+from processing.strain_window import strain_window
 
 LOST = 4
 STEPS = ("0003-specimen", "0004-specimen")
@@ -139,12 +142,18 @@ def test_vtp_carries_points_and_fields_of_each_step(session: Path, tmp_path: Pat
     np.testing.assert_array_equal(arrays["E2"], expected)
 
 
-def test_vtkhdf_is_the_moving_surface_alone(session: Path, tmp_path: Path) -> None:
+def test_vtkhdf_is_the_moving_surface_with_every_field(session: Path, tmp_path: Path) -> None:
     path = export(session, "vtkhdf", tmp_path / "sheet.vtkhdf")
+    names = {row["name"] for row in read_summary(session / "results" / "0001" / "results.h5")["fields"]}
     with h5py.File(path) as file:
         assert list(file) == ["VTKHDF"]
         assert file["VTKHDF"].attrs["Type"] == b"PolyData"
         np.testing.assert_array_equal(file["VTKHDF/Points"][:30], bent_sheet().vertices_ref)
+        arrays = {*file["VTKHDF/PointData"], *file["VTKHDF/CellData"]}
+    vectors = {"displacement", "displacement_without_rigid_motion", "sigma_xyz", "e_tensor", "direction1_current"}
+    assert vectors <= arrays
+    of_vectors = {name for name in names if name.startswith("displacement")} | {"sigma"}
+    assert names - of_vectors <= arrays  # lengths and components are the viewer's to make
 
 
 @pytest.mark.parametrize("name", ["vtkhdf", "vtp"])
@@ -163,6 +172,134 @@ def test_vtk_reads_what_is_exported(session: Path, tmp_path: Path, name: str) ->
     assert (surface.GetNumberOfPoints(), surface.GetNumberOfCells()) == (30, 40)
     expected, _ = read_field(session / "results" / "0001" / "results.h5", "lambda2", 1)
     np.testing.assert_array_equal(vtk_to_numpy(surface.GetCellData().GetArray("lambda2")), expected)
+
+
+def last_step(session: Path, out: Path, name: str, evaluation: Evaluation) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Points and fields of the last step as another program's reader finds them."""
+    path = export(session, name, out, evaluation)
+    if name == "npz":
+        with np.load(path) as arrays:
+            fields = {n: arrays[n][1] for n in arrays if n.endswith(("lambda2", "J"))}
+            return arrays["vertices"][1], fields
+    if name == "mat":
+        results = loadmat(path, simplify_cells=True)["DIC3DPPresults"]
+        return results["Points3D"][1], {"lambda2": results["Deform"]["Lamda2"][1], "J": results["Deform"]["J"][1]}
+    if name == "csv":
+        points, faces = (pandas.read_csv(path / f"{STEPS[1]}-{kind}.csv") for kind in ("points", "faces"))
+        return points[["x [mm]", "y [mm]", "z [mm]"]].to_numpy(), {n: faces[n].to_numpy() for n in faces}
+    if name == "ply":
+        solid = trimesh.load(path / f"{STEPS[1]}.ply", process=False)
+        stored = solid.metadata["_ply_raw"]["face"]["data"]
+        return solid.vertices, {n: np.ravel(stored[n]) for n in ("lambda2", "J", "window_lambda2")}
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOHDF import vtkHDFReader
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+
+    reader = vtkHDFReader() if name == "vtkhdf" else vtkXMLPolyDataReader()
+    reader.SetFileName(str(path if name == "vtkhdf" else path / f"{STEPS[1]}.vtp"))
+    if name == "vtkhdf":
+        reader.SetStep(1)
+    reader.Update()
+    surface = reader.GetOutputDataObject(0)
+    cells = surface.GetCellData()
+    fields = {cells.GetArrayName(i): vtk_to_numpy(cells.GetArray(i)) for i in range(cells.GetNumberOfArrays())}
+    return vtk_to_numpy(surface.GetPoints().GetData()), fields
+
+
+@pytest.mark.parametrize("name", ["npz", "mat", "csv", "vtkhdf", "vtp", "ply"])
+def test_without_rigid_motion_and_over_a_window_is_carried_through(session: Path, tmp_path: Path, name: str) -> None:
+    result = bent_sheet()
+    how = Evaluation(rigid_motion_removed=True, window=30.0)
+    points, fields = last_step(session, tmp_path / "out", name, how)
+    back = result.motion(1).apply(result.vertices[1])
+    whole = ~(result.faces == LOST).any(axis=1)
+    truth = result.deformation(1, window=strain_window(result.mesh, 30.0))
+    if name == "ply":
+        np.testing.assert_allclose(points, np.delete(back, LOST, axis=0), atol=1e-5)
+        np.testing.assert_allclose(fields["window_lambda2"], truth.lambda2[whole], rtol=1e-6)
+        return
+    known = np.arange(30) != LOST
+    np.testing.assert_allclose(points[known], back[known], atol=1e-6)
+    over = fields["lambda2" if name == "mat" else "window_lambda2"]  # the structure has one place for a deformation
+    np.testing.assert_allclose(over, truth.lambda2, rtol=2e-6)
+    assert np.isfinite(over[whole]).all()
+
+
+def test_steps_may_be_compared_with_the_one_before(tmp_path: Path) -> None:
+    sheet = bent_sheet()
+    third = sheet.vertices[1] * [1.0, 1.0, 1.1]
+    longer = {n: np.concatenate([v := getattr(sheet, n), v[1:]]) for n in ("correlation", "sigma_xyz", "status")}
+    again = replace(
+        sheet, steps=(*STEPS, "0005-specimen"), vertices=np.concatenate([sheet.vertices, third[None]]), **longer
+    )
+    (tmp_path / "results" / "0001").mkdir(parents=True)
+    write_results(tmp_path / "results" / "0001" / "results.h5", again)
+    whole = ~(sheet.faces == LOST).any(axis=1)
+    for previous, last in ((False, 1.21), (True, 1.1)):
+        with np.load(export(tmp_path, "npz", evaluation=Evaluation(previous=previous))) as arrays:
+            np.testing.assert_allclose(arrays["J"][1][whole], 1.1, atol=1e-12)
+            np.testing.assert_allclose(arrays["J"][2][whole], last, atol=1e-12)
+        folder = export(tmp_path, "csv", evaluation=Evaluation(previous=previous, exponent=0.25))
+        points = pandas.read_csv(folder / "0005-specimen-points.csv")
+        before = again.vertices[1 if previous else 0]
+        np.testing.assert_allclose(points["z_reference [mm]"], before[:, 2], atol=1e-6)
+        np.testing.assert_allclose(points["displacement_z [mm]"], third[:, 2] - before[:, 2], atol=1e-5)
+        faces = pandas.read_csv(folder / "0005-specimen-faces.csv")
+        np.testing.assert_allclose(faces["seth_hill2:0.25"][whole], (last**0.5 - 1) / 0.5, atol=1e-6)
+
+
+def test_matlab_reads_what_multidic_would_have_made(shared_data: Path, tmp_path: Path) -> None:
+    truth = np.load(shared_data / "multidic_rig" / "reference.npz")
+    F, N = truth["points3d"].shape[:2]
+    M = len(truth["faces"])
+    measured = Results(
+        rig="pair", steps=("1", "2", "3"), cameras=(), pairs=(("201", "202"),), vertices_ref=truth["points3d"][0],
+        vertices=truth["points3d"], faces=truth["faces"], pair=np.zeros(M, dtype=np.int64),
+        vertex_pair=np.zeros(N, dtype=np.int64), correlation=truth["corr_combined"],
+        sigma_xyz=np.full((F, N, 3), 0.01), status=np.zeros((F, N), dtype=np.int8),
+    )  # fmt: skip
+    (tmp_path / "results" / "0001").mkdir(parents=True)
+    write_results(tmp_path / "results" / "0001" / "results.h5", measured)
+    found = loadmat(export(tmp_path, "mat"), simplify_cells=True)["DIC3DPPresults"]
+    np.testing.assert_array_equal(found["Faces"], truth["faces"] + 1)
+    np.testing.assert_array_equal(found["pairIndices"], [201, 202])
+    same = {"Lamda1": "lambda1", "Lamda2": "lambda2", "J": "J", "Emgn": "E_mgn", "emgn": "almansi_mgn", "Epc1": "E_pc1",
+            "Epc2": "E_pc2", "epc1": "almansi_pc1", "epc2": "almansi_pc2", "Eeq": "E_eq", "eeq": "almansi_eq",
+            "EShearMax": "E_shear_max", "eShearMax": "almansi_shear_max", "d3": "normal_cur"}  # fmt: skip
+    for step in (1, 2):
+        for theirs, name in same.items():
+            np.testing.assert_allclose(found["Deform"][theirs][step], truth[name][step - 1], atol=2e-7, err_msg=theirs)
+        for theirs, name in (("Fmat", "F"), ("Emat", "E_tensor"), ("emat", "almansi_tensor")):
+            theirs_first = np.moveaxis(found["Deform"][theirs][step], -1, 0)
+            np.testing.assert_allclose(theirs_first, truth[name][step - 1], atol=2e-7)
+        np.testing.assert_allclose(found["Deform"]["Area"][step], truth["area_ref_mm2"], rtol=1e-6)
+        np.testing.assert_allclose(found["FaceIsoInd"][step], truth["face_isotropy_index"][step], atol=1e-9)
+        np.testing.assert_allclose(found["Points3D_ARBM"][step], truth["points3d_rbm_removed"][step], atol=1e-8)
+        np.testing.assert_allclose(found["RBM"]["RotMat"][step], truth["rbm_R"][step], atol=1e-9)
+        np.testing.assert_allclose(found["corrComb"][step], truth["corr_combined"][step], rtol=1e-6)
+        np.testing.assert_allclose(found["FaceCorrComb"][step], truth["face_corr_combined"][step], rtol=1e-6)
+        moved = truth["points3d"][step] - truth["points3d"][0]
+        np.testing.assert_allclose(found["Disp"]["DispVec"][step], moved, atol=1e-9)
+        np.testing.assert_allclose(found["Disp"]["DispMgn"][step], np.linalg.norm(moved, axis=1), atol=1e-9)
+        # Without its rigid motion the strain is the same and the turn is gone.
+        np.testing.assert_allclose(found["Deform_ARBM"]["Emgn"][step], found["Deform"]["Emgn"][step], atol=2e-7)
+        turned = np.abs(found["Deform_ARBM"]["Fmat"][step] - np.eye(3)[:, :, None]).mean()
+        assert turned < np.abs(found["Deform"]["Fmat"][step] - np.eye(3)[:, :, None]).mean()
+
+
+def test_surfaces_are_coloured_by_the_field_that_is_asked_for(session: Path, tmp_path: Path) -> None:
+    for name in ("ply", "glb"):
+        folder = export(session, name, tmp_path / name, colour="lambda2")
+        loaded = trimesh.load(folder / f"{STEPS[1]}.{name}", process=False)
+        solid = loaded if name == "ply" else next(iter(loaded.geometry.values()))
+        rgb = np.unique(solid.visual.vertex_colors[:, :3], axis=0)
+        assert len(rgb) == 1  # the stretch is 1.1 everywhere: the upper end of a scale about 1
+        assert rgb[0, 0] > 150 > rgb[0, 2]  # red
+    with pytest.raises(InputError, match="no field 'stress'"):
+        export(session, "ply", tmp_path / "none", colour="stress")
+    assert not (tmp_path / "none").exists()
+    with pytest.raises(InputError, match="'npz' has no colours; ply and glb have"):
+        export(session, "npz", tmp_path / "x.npz", colour="lambda2")
 
 
 def test_bad_requests_are_refused_and_leave_nothing(session: Path, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from processing.camera import Camera, Intrinsics
 from processing.errors import InputError
-from processing.fields import FIELDS
+from processing.fields import FIELDS, Field
 from processing.results import (
     Matches,
     Results,
@@ -20,6 +20,7 @@ from processing.results import (
     read_summary,
     write_results,
 )
+from processing.strain_window import strain_window
 
 LOST = 7
 
@@ -42,7 +43,7 @@ def a_result() -> Results:
     lens = Intrinsics(K, np.array([0.1, -0.2, 1e-4, 2e-4, 0.0]), (1640, 1232))
     n = 36
     matches = Matches(
-        pair=("201", "202"), xy=rng.uniform(0, 900, (n, 2)), px=rng.uniform(0, 900, (3, 2, n, 2)),
+        cameras=("201", "202"), xy=rng.uniform(0, 900, (n, 2)), px=rng.uniform(0, 900, (3, 2, n, 2)),
         c_ls=rng.uniform(0, 0.1, (3, n)), sigma=rng.uniform(0, 0.1, (3, 2, n, 2)), status=status,
         vertex=np.arange(n), seconds={"refine": 1.5},
     )  # fmt: skip
@@ -78,7 +79,7 @@ def test_what_is_written_comes_back(written: Path) -> None:
     assert found.summary == {"points": 36, "unknown": None, "list": [0.0, 1.0, 2.0]}
     for name in ("xy", "px", "c_ls", "sigma", "status", "vertex"):
         np.testing.assert_array_equal(getattr(found.matches[0], name), getattr(result.matches[0], name))
-    assert found.matches[0].pair == ("201", "202")
+    assert found.matches[0].cameras == ("201", "202")
     assert found.matches[0].seconds == {"refine": 1.5}
     point = np.array([[10.0, 20.0, 30.0]])
     for before, after in zip(result.cameras, found.cameras, strict=True):
@@ -127,10 +128,15 @@ def test_without_its_rigid_motion_a_turned_plate_has_not_moved(written: Path) ->
     np.testing.assert_allclose(result.deformation(1, rigid_motion_removed=True).e, 0.0, atol=1e-12)
 
 
+def optional(entry: Field) -> bool:
+    """Whether a result need not have the field."""
+    return (entry.group in ("Over the strain window", "Uncertainty") and entry.name != "sigma") or entry.name == "chi2"
+
+
 def test_every_field_of_the_table_can_be_read_at_every_step(written: Path) -> None:
     summary = read_summary(written)
     assert (summary["points"], summary["faces"], len(summary["steps"])) == (36, 50, 3)
-    assert [row["name"] for row in summary["fields"]] == [entry.name for entry in FIELDS]
+    assert [row["name"] for row in summary["fields"]] == [entry.name for entry in FIELDS if not optional(entry)]
     for row in summary["fields"]:
         for step in range(3):
             for removed in (False, True):
@@ -142,6 +148,61 @@ def test_every_field_of_the_table_can_be_read_at_every_step(written: Path) -> No
     lambda2 = next(row for row in summary["fields"] if row["name"] == "lambda2")
     assert lambda2["range"] == pytest.approx([1.0, 1.2])
     assert lambda2["centre"] == 1.0
+
+
+def everything_known() -> Results:
+    """The same with a strain window and with every deviation that can be known."""
+    result, rng = a_result(), np.random.default_rng(6)
+    return replace(
+        result, settings="[strain]\nwindow_mm = 12.0\n", sigma_displacement=rng.uniform(0, 0.01, (3, 36, 3)),
+        sigma_lambda=rng.uniform(0, 1e-3, (3, 50, 2)), chi2=rng.uniform(0, 3, (3, 36)),
+    )  # fmt: skip
+
+
+def test_what_is_known_beside_the_rest_has_its_fields(tmp_path: Path) -> None:
+    result, path = everything_known(), tmp_path / "results.h5"
+    write_results(path, result)
+    summary = read_summary(path)
+    assert [row["name"] for row in summary["fields"]] == [entry.name for entry in FIELDS]
+    back = read_results(path)
+    for name in ("sigma_displacement", "sigma_lambda", "chi2"):
+        np.testing.assert_allclose(getattr(back, name), getattr(result, name), rtol=1e-6)
+    np.testing.assert_allclose(read_field(path, "sigma_lambda2", 1)[0], result.sigma_lambda[1, :, 1], rtol=1e-6)
+    found = result.deformation(2)
+    whole = np.isfinite(found.J)
+    sigma_E2, _ = read_field(path, "sigma_E2", 2)  # dE = λ dλ
+    np.testing.assert_allclose(sigma_E2[whole], (found.lambda2 * result.sigma_lambda[2, :, 1])[whole], rtol=1e-6)
+    over = result.deformation(2, window=strain_window(result.mesh, 12.0))
+    for name in ("lambda2", "E2", "E_equivalent"):
+        np.testing.assert_allclose(read_field(path, f"window_{name}", 2)[0], getattr(over, name), rtol=1e-6, atol=1e-7)
+    hencky, _ = read_field(path, "window_hencky2", 2)
+    np.testing.assert_allclose(hencky, np.log(over.lambda2), atol=1e-7)
+    seth_hill, _ = read_field(path, "seth_hill2:0.25", 2)
+    np.testing.assert_allclose(seth_hill, (found.lambda2**0.5 - 1) * 2, atol=1e-7)
+
+
+def test_from_one_step_to_the_next_nothing_is_claimed_of_deviations() -> None:
+    result = everything_known()
+    since_reference, since_before = result.fields(2), result.fields(2, previous=True)
+    assert {"sigma_displacement", "sigma_lambda1"} <= since_reference.names
+    assert not {"sigma_displacement", "sigma_lambda1"} & since_before.names
+    moved = result.vertices[2] - result.vertices[1]
+    np.testing.assert_array_equal(since_before.point["displacement"], moved)
+
+
+def test_a_run_without_a_window_says_how_to_have_one(written: Path) -> None:
+    with pytest.raises(InputError, match=r"no field 'window_E2': the run had no strain window.*--window 5"):
+        read_field(written, "window_E2", 1)
+    with pytest.raises(InputError, match="no field 'sigma_E1': the run did not find it"):
+        read_field(written, "sigma_E1", 1)
+
+
+def test_a_step_takes_a_bounded_number_of_bytes(tmp_path: Path) -> None:
+    write_results(tmp_path / "results.h5", everything_known())
+    with h5py.File(tmp_path / "results.h5") as file:
+        sizes = {place: sum(d.nbytes for d in file[f"VTKHDF/{place}"].values()) for place in ("PointData", "CellData")}
+    assert sizes["PointData"] / (3 * 36) <= 70 - 24  # a position takes 24
+    assert sizes["CellData"] / (3 * 50) <= 125
 
 
 def test_a_mesh_is_read_alone(written: Path) -> None:
@@ -164,8 +225,9 @@ def test_the_vtkhdf_group_has_no_missing_points_and_consistent_offsets(written: 
         for place, rows in (("PointData", points), ("CellData", faces)):
             assert set(group[place]) == set(group[f"Steps/{place}Offsets"])
             for name, values in group[place].items():
-                assert len(values) == steps * rows, name
-                assert group[f"Steps/{place}Offsets"][name][:].tolist() == [0, rows, 2 * rows]
+                same = name in ("area", "pair")  # at all steps: stored once
+                assert len(values) == (rows if same else steps * rows), name
+                assert group[f"Steps/{place}Offsets"][name][:].tolist() == ([0] * 3 if same else [0, rows, 2 * rows])
 
 
 def test_vtk_reads_every_step(written: Path) -> None:
@@ -183,6 +245,8 @@ def test_vtk_reads_every_step(written: Path) -> None:
         np.testing.assert_array_equal(points[finite], expected[finite])
         values, _ = read_field(written, "lambda2", step)
         np.testing.assert_array_equal(vtk_to_numpy(data.GetCellData().GetArray("lambda2")), values)
+        pair = vtk_to_numpy(data.GetCellData().GetArray("pair"))
+        np.testing.assert_array_equal(pair, a_result().pair)
         assert data.GetNumberOfCells() == 50
 
 

@@ -54,9 +54,9 @@ def test_the_correlation_understands_its_group() -> None:
         ("correlation.subset=hexagon", ["correlation.subset", "'circle' or 'square'", "hexagon"]),
         ("calibration.method=guess", ["calibration.method", "'dlt' or 'bundle'", "guess"]),
         ("calibration.print_error_mm=-0.1", ["calibration.print_error_mm", "-0.1"]),
-        ("surface.method=global", ["surface.method", "not available", "pairs"]),
-        ("surface.method=magic", ["surface.method", "magic"]),
-        ("strain.window_mm=5", ["strain.window_mm", "not available"]),
+        ("surface.curvature=guess", ["surface.curvature", "'geometry' or 'none'", "guess"]),
+        ("surface.method=magic", ["surface.method", "'pairs' or 'global'", "magic"]),
+        ("strain.window_mm=-1", ["strain.window_mm", "greater than or equal to 0", "-1"]),
         ("strain=5", ["group.name=value"]),
     ],
 )

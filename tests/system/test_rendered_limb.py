@@ -1,4 +1,7 @@
-"""Twelve cameras from a renderer that is not this project's: a deforming limb, imported and processed with no click."""
+"""Twelve cameras from a renderer that is not this project's: a deforming limb, imported and processed with no click.
+
+Both ways are judged by the same truth: the pairs one by one, and one surface from all cameras together.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,10 +12,32 @@ import numpy as np
 import pytest
 from scipy.interpolate import RectBivariateSpline
 
+from processing.deformation import deformation
 from processing.results import Results, read_results
 from processing.session import newest_results
+from processing.topology import holes, inconsistent_edges, is_closed_tube, non_manifold_vertices, overlap_area
 
 TURN = 2 * np.pi
+
+
+@dataclass(frozen=True)
+class Way:
+    """How the session is processed, and what is demanded: mm, and the share of the area that two cameras see."""
+
+    name: str
+    settings: tuple[str, ...]
+    shape: float
+    displacement: float
+    covered: float
+    control: float
+
+
+PAIRS = Way("pairs", (), 0.08, 0.05, 0.9, 0.05)
+# What can be had on this rig at full scale, where the noise is half as large and no JPEG takes its share.
+WHOLE = Way("all cameras", ("calibration.method=bundle", "surface.method=global"), 0.01, 0.005, 0.98, 0.01)
+STRETCHES = 1.1e-3
+only_pairs = pytest.mark.parametrize("way", [PAIRS], ids=lambda way: way.name, indirect=True)
+only_whole = pytest.mark.parametrize("way", [WHOLE], ids=lambda way: way.name, indirect=True)
 
 
 @dataclass
@@ -58,12 +83,21 @@ def _splines(theta: np.ndarray, z: np.ndarray, positions: np.ndarray) -> list[Re
 
 
 @pytest.fixture(scope="module")
-def results(ringdic: Callable, shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Results:
+def session(ringdic: Callable, shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     session = tmp_path_factory.mktemp("limb") / "session"
-    source = shared_data / "rendered_ring" / "limb"
-    settings = ["--set", "correlation.radius_px=12", "--set", "correlation.step_px=6"]
-    ringdic("import", source, session, timeout_s=500)
-    ringdic("process", session, *settings, timeout_s=500)
+    ringdic("import", shared_data / "rendered_ring" / "limb", session, timeout_s=500)
+    return session
+
+
+@pytest.fixture(scope="module", params=[PAIRS, WHOLE], ids=lambda way: way.name)
+def way(request: pytest.FixtureRequest) -> Way:
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def results(ringdic: Callable, session: Path, way: Way) -> Results:
+    settings = ("correlation.radius_px=12", "correlation.step_px=6", *way.settings)
+    ringdic("process", session, *(word for setting in settings for word in ("--set", setting)), timeout_s=800)
     return read_results(newest_results(session))
 
 
@@ -78,7 +112,7 @@ def material(results: Results, truth: Truth) -> tuple[np.ndarray, np.ndarray, np
     return theta, z, distance, (z >= truth.z[0]) & (z <= truth.z[-1])  # the truth covers the speckled band
 
 
-def test_all_cameras_and_pairs_take_part(results: Results, shared_data: Path, figures) -> None:
+def test_all_cameras_and_pairs_take_part(results: Results, shared_data: Path, way: Way, figures) -> None:
     centres = np.load(shared_data / "rendered_ring" / "limb" / "target_truth.npz")["projected_px"]
     assert len(results.cameras) == 12
     assert len(results.pairs) == 12
@@ -90,41 +124,43 @@ def test_all_cameras_and_pairs_take_part(results: Results, shared_data: Path, fi
         offset = np.linalg.norm(np.array(dots["px"]) - centres[k, rows, columns], axis=1)
         worst = max(worst, float(offset.max()))
         assert len(rows) >= 100
-    figures("rendered limb: dots numbered rightly, largest offset", f"{worst:.2f} px", "a column is over 20 px")
+    figures(
+        f"rendered limb, {way.name}: dots numbered rightly, largest offset", f"{worst:.2f} px", "a column is over 20 px"
+    )
     assert worst < 0.5
 
 
-def test_control_points(results: Results, figures) -> None:
+def test_control_points(results: Results, way: Way, figures) -> None:
     rms = [pair["rms_mm"] for pair in results.calibration["pairs"]]
-    figures("rendered limb: control points, RMS, worst of 12 pairs", f"{max(rms):.4f} mm", "≤ 0.05")
+    figures(f"rendered limb, {way.name}: control points, RMS, worst pair", f"{max(rms):.4f} mm", f"≤ {way.control}")
     assert len(rms) == 12
-    assert max(rms) <= 0.05
+    assert max(rms) <= way.control
 
 
-def test_the_shape(material, figures) -> None:
+def test_the_shape(material, way: Way, figures) -> None:
     _, _, distance, inside = material
     rms, worst = float(np.sqrt(np.mean(distance[inside] ** 2))), float(np.abs(distance[inside]).max())
-    figures("rendered limb: distance from the true surface, RMS", f"{rms:.4f} mm", "≤ 0.08")
-    figures("rendered limb: largest distance from the surface", f"{worst:.3f} mm", "≤ 1")
+    figures(f"rendered limb, {way.name}: distance from the true surface, RMS", f"{rms:.4f} mm", f"≤ {way.shape}")
+    figures(f"rendered limb, {way.name}: largest distance from the surface", f"{worst:.3f} mm", "≤ 1")
     assert inside.mean() > 0.95
-    assert rms <= 0.08
+    assert rms <= way.shape
     assert worst <= 1.0
 
 
 @pytest.mark.parametrize("step", [1, 2])
-def test_the_displacement(results: Results, truth: Truth, material, figures, step: int) -> None:
+def test_the_displacement(results: Results, truth: Truth, material, way: Way, figures, step: int) -> None:
     theta, z, _, inside = material
     moved = truth.at(step, theta, z) - truth.at(0, theta, z)
     error = np.linalg.norm(results.vertices[step] - results.vertices_ref - moved, axis=1)[inside]
     rms, worst = float(np.sqrt(np.nanmean(error**2))), float(np.nanmax(error))
-    figures(f"rendered limb: displacement of step {step}, RMS", f"{rms:.4f} mm", "≤ 0.05")
-    figures(f"rendered limb: largest error of step {step}", f"{worst:.3f} mm", "≤ 1")
+    figures(f"rendered limb, {way.name}: displacement of step {step}, RMS", f"{rms:.4f} mm", f"≤ {way.displacement}")
+    figures(f"rendered limb, {way.name}: largest error of step {step}", f"{worst:.3f} mm", "≤ 1")
     assert np.isfinite(error).mean() > 0.98
-    assert rms <= 0.05
+    assert rms <= way.displacement
     assert worst <= 1.0
 
 
-def test_the_coverage(results: Results, truth: Truth, material, figures) -> None:
+def test_the_coverage(results: Results, truth: Truth, material, way: Way, figures) -> None:
     theta, z, _, _ = material
     fine = 8
     picture = np.zeros((len(truth.z) * fine, len(truth.theta) * fine), np.uint8)
@@ -140,5 +176,54 @@ def test_the_coverage(results: Results, truth: Truth, material, figures) -> None
     area = np.linalg.norm(np.cross(truth.at(0, *grid, dx=1), truth.at(0, *grid, dy=1)), axis=-1)
     seen = truth.seen_by >= 2
     share = float((area * (covered & seen)).sum() / (area * seen).sum())
-    figures("rendered limb: covered share of what two cameras see", f"{share:.1%}", "≥ 90 %")
-    assert share >= 0.9
+    figures(f"rendered limb, {way.name}: covered share of what two cameras see", f"{share:.1%}", f"≥ {way.covered:.0%}")
+    assert share >= way.covered
+
+
+def test_one_closed_tube(results: Results, way: Way, figures) -> None:
+    mesh = results.mesh
+    outwards = np.einsum("mi,mi->m", mesh.area_vectors[:, :2], mesh.centroids[:, :2])
+    largest = max((hole.area for hole in holes(mesh)), default=0.0)
+    overlap = overlap_area(mesh, reach=2.0)
+    figures(f"rendered limb, {way.name}: area covered twice", f"{overlap:.2f} mm²", "0")
+    figures(f"rendered limb, {way.name}: largest hole", f"{largest:.2f} mm²", "≤ 5")
+    assert (outwards > 0).all()
+    assert is_closed_tube(mesh, largest_hole=5.0)
+    assert len(non_manifold_vertices(mesh)) == 0
+    assert len(inconsistent_edges(mesh)) == 0
+    assert overlap == 0.0
+    assert set(results.pair) == {-1, *range(12)}
+
+
+@only_whole
+@pytest.mark.parametrize("step", [1, 2])
+def test_the_stretches_of_all_cameras_together(
+    results: Results, truth: Truth, material, way: Way, figures, step: int
+) -> None:
+    theta, z, _, inside = material
+    true = deformation(truth.at(0, theta, z), truth.at(step, theta, z), results.faces)
+    measured = results.deformation(step)
+    whole = inside[results.faces].all(axis=1)
+    for name in ("lambda1", "lambda2"):
+        error = (getattr(measured, name) - getattr(true, name))[whole]
+        scatter = float(np.nanstd(error))
+        figures(f"rendered limb, {way.name}: {name} of step {step}, STD", f"{scatter:.1e}", f"≤ {STRETCHES:.1e}")
+        assert np.isfinite(error).mean() > 0.98
+        assert scatter <= STRETCHES
+        assert abs(np.nanmean(error)) < 0.1 * STRETCHES
+
+
+@only_pairs
+def test_few_triangles_join_two_pairs(results: Results, figures) -> None:
+    joining = float((results.pair == -1).mean())
+    figures("rendered limb: merged pairs, triangles that join two", f"{joining:.1%}", "≤ 10 %")
+    assert joining <= 0.1
+
+
+@only_pairs
+def test_pairs_agree_where_they_overlap(results: Results, figures) -> None:
+    """First-order subsets between cameras are off by up to 0.1 px, that is 0.02 mm of depth, in opposite directions."""
+    agreement = results.summary["agreement"]
+    mean, std = agreement["mismatch_mm"], agreement["mismatch_std_mm"]
+    figures("rendered limb: distance between neighbouring pairs", f"{mean:.4f} ± {std:.4f} mm", "≤ 0.04 (paper 0.06)")
+    assert mean <= 0.04

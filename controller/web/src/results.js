@@ -5,12 +5,6 @@ import { SCALES, cssGradient, ticks } from "./colours.js";
 import { byId, counted, element, figure, notice, setOptions } from "./dom.js";
 import { state } from "./live.js";
 
-const GROUPS = [
-  ["Displacement", /^displacement/],
-  ["Stretch", /^(J|lambda\d)$/],
-  ["Strain", /^[Ee][\d_]/],
-  ["Quality", /./],
-];
 const FIRST_FIELD = "lambda2";
 const PLAY_EVERY = 900; // ms
 
@@ -80,12 +74,11 @@ async function openRun() {
     wirePicking();
   });
   await viewer;
-  const options = header.fields.map(({ name, label, unit }) => ({
+  const options = header.fields.map(({ name, label, unit, group }) => ({
     value: name,
     label: unit ? `${label} (${unit})` : label,
-    group: GROUPS.find(([, pattern]) => pattern.test(name))[0],
+    group,
   }));
-  options.sort((a, b) => GROUPS.findIndex(([g]) => g === a.group) - GROUPS.findIndex(([g]) => g === b.group));
   const before = byId("field").value;
   setOptions(byId("field"), options, options.some(({ value }) => value === before) ? before : FIRST_FIELD);
   byId("step").max = String(header.steps.length - 1);

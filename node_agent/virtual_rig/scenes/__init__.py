@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from node_agent.virtual_rig.scenes.board import Board
+from node_agent.virtual_rig.scenes.damage import Bar, Damage, Patch
 from node_agent.virtual_rig.scenes.specimen import Cylinder, Limb, Specimen
 from node_agent.virtual_rig.scenes.target import Target
 
 Scene = Board | Target | Specimen
 
-__all__ = ["Board", "Cylinder", "Limb", "Scene", "Specimen", "Target", "scene"]
+__all__ = ["Bar", "Board", "Cylinder", "Damage", "Limb", "Patch", "Scene", "Specimen", "Target", "scene"]
 
 _SPECIMENS = {"limb": Limb, "cylinder": Cylinder}
 

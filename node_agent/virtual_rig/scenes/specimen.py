@@ -6,12 +6,13 @@ Material points are named by (theta, z) of the reference configuration, step 0.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from node_agent.virtual_rig import body
+from node_agent.virtual_rig.scenes.damage import Damage
 from node_agent.virtual_rig.texture import RADIUS
 
 Array = NDArray[np.float64]
@@ -83,6 +84,7 @@ class Specimen:
     surface: Cylinder | Limb
     step: int
     seed: int = 0
+    damage: Damage = field(default_factory=Damage)
 
     @property
     def band(self) -> tuple[float, float]:

@@ -265,6 +265,9 @@ def test_the_diameter_is_right_where_the_dlt_s_is_not(request, fits, shape, figu
     assert abs(after) < 0.003
     assert fit.px_sigma == pytest.approx(0.01, rel=0.1)
     assert fit.print_sigma < 0.002
+    # Some three hundred numbers a camera, each of variance one but for Huber's weights.
+    assert np.abs(fit.chi2 - 1).max() < 0.35
+    assert 1.0 <= fit.lens_scale < 1.3
 
 
 def test_print_errors_are_found_and_leave_the_diameter_alone(true_cameras, fits, figures) -> None:
@@ -290,6 +293,11 @@ def test_a_target_of_another_size_is_measured_where_that_is_allowed(half_ring, f
     assert (np.abs(error) < 4 * fit.sheet_sigma).all()
     assert fit.sheet_sigma[0] < 0.004
     assert fit.sheet.seam(TARGET) == pytest.approx(2 * np.pi * 57.02 - 29 * 12.01, abs=0.02)
+    told = fit.figures(TARGET)
+    assert told["radius_mm"] == pytest.approx(57.02, abs=4 * told["radius_sigma_mm"])
+    assert told["tilt_deg"] == pytest.approx(np.degrees(0.001), abs=4 * told["tilt_sigma_deg"])
+    assert [row["camera"] for row in told["cameras"]] == list(half_ring)
+    assert all(0 < row["focal_sigma_px"][0] < 1 for row in told["cameras"])
     assert abs(diameter_error(half_ring, cameras)) < 0.005
     held, _ = adjust_ring(start, TARGET)
     assert diameter_error(half_ring, held) < -0.03  # a radius believed 0.02 too small makes everything so
@@ -336,6 +344,16 @@ def test_a_lens_that_contradicts_the_target_is_told(half_ring, fits) -> None:
     assert fit.lens_chi2.max() > 10
     _, good = adjust_ring(seen_by_all(half_ring, fits, 10), TARGET)
     assert good.lens_chi2.max() < 4
+
+
+def test_a_camera_that_is_worse_than_the_others_is_told(half_ring, fits) -> None:
+    start = seen_by_all(half_ring, fits, 10)
+    shaken = start["c02"].dots
+    px = shaken.px + np.random.default_rng(5).normal(0, 0.025, shaken.px.shape)
+    start["c02"] = replace(start["c02"], dots=replace(shaken, px=px))
+    _, fit = adjust_ring(start, TARGET)
+    others = [value for id_, value in zip(fit.cameras, fit.chi2, strict=True) if id_ != "c02"]
+    assert fit.chi2[1] > 2.5 * max(others)
 
 
 def test_a_given_lens_is_held_and_a_bare_camera_needs_none(true_cameras) -> None:

@@ -8,8 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
+from processing.calibration import dlt
 from processing.calibration.dots import Dots, find_dots
 from processing.calibration.target import DotObservations, dot_points, identify
+from processing.camera import Camera
 from processing.errors import InputError
 from processing.rig import RigCamera, Target, read_rig
 
@@ -138,6 +140,36 @@ def test_a_hidden_or_miscounted_row_is_refused(ring):
     fewer = replace(target, rows=19)
     with pytest.raises(InputError, match="20 rows of dots are seen"):
         identify(find_dots(images["cam_05"], fewer), fewer, 120.0)
+
+
+@pytest.mark.parametrize("rotation", [0, 90])
+@pytest.mark.parametrize("cut", [slice(420, None), slice(0, 1160)])  # some rows above and below are outside
+def test_rows_number_themselves_where_the_image_shows_an_end_of_the_target(ring, cut, rotation):
+    target, _, images, truth = ring
+    part = np.ascontiguousarray(np.rot90(images["cam_05"][cut], -rotation // 90))
+    found = identify(find_dots(part, target), target, 120.0, rotation_deg=rotation)
+    assert len(found) > 90
+    assert found.rows.max() - found.rows.min() < 18
+    places = truth["cam_05"] - [0, cut.start or 0]
+    if rotation:
+        places = np.stack([part.shape[1] - 1 - places[..., 1], places[..., 0]], axis=-1)
+    assert distances(found, places).max() < 0.5
+
+
+def test_rows_without_an_end_in_view_need_the_camera_s_height(ring):
+    target, _, images, truth = ring
+    dots = find_dots(images["cam_05"][430:1150], target)
+    with pytest.raises(InputError, match=r"camera c: 1\d rows .* neither the lowest nor the highest .* height_mm"):
+        identify(dots, target, 120.0, camera="c")
+    whole = identify(find_dots(images["cam_05"], target), target, 120.0)
+    height = float(dlt_centre(whole)[2])
+    for off in (-4.0, 4.0):
+        found = identify(dots, target, 120.0, height_mm=height + off)
+        assert distances(found, truth["cam_05"] - [0, 430]).max() < 0.5
+
+
+def dlt_centre(found: DotObservations) -> np.ndarray:
+    return Camera("", dlt.to_projection(dlt.solve_dlt(found.xyz, found.px)), (1, 1)).centre
 
 
 def test_too_few_dots_are_counted_for_the_operator(ring, shared_data):

@@ -1,0 +1,46 @@
+"""Where in the image a board was seen, and what is left over there in common: two figures of a lens's calibration."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Cells along the longer side of the image, for the area covered and for the residuals.
+_AREA_CELLS, _CELLS = 120, 10
+#: A cell with fewer corners tells nothing.
+_FEWEST = 8
+
+
+def coverage(views: Array, size: tuple[int, int]) -> float:
+    """Part of the image, 0 to 1, that lies inside the outline of at least one view.
+
+    views : (v, n, 2) corners, px. size : (width, height), px.
+    """
+    scale = _AREA_CELLS / max(size)
+    seen = np.zeros((max(1, round(size[1] * scale)), max(1, round(size[0] * scale))), np.uint8)
+    for view in views:
+        hull = cv2.convexHull(np.asarray(view, dtype=np.float32)).reshape(-1, 2)
+        cv2.fillConvexPoly(seen, np.rint((hull + 0.5) * scale - 0.5).astype(np.int32), 1)
+    return float(seen.mean())
+
+
+def residual_distortion(px: Array, residuals: Array, size: tuple[int, int]) -> float:
+    """RMS over cells of the image of the mean residual in a cell, the share of random errors taken off. px.
+
+    px, residuals : (..., 2). size : (width, height). NaN where no cell has corners enough.
+    """
+    places, residuals = px.reshape(-1, 2), residuals.reshape(-1, 2)
+    cell = max(size) / _CELLS
+    column, row = np.floor(places.T / cell).astype(int)
+    _, index, count = np.unique(row * 1000 + column, return_inverse=True, return_counts=True)
+    mean = np.stack([np.bincount(index, weights=axis) for axis in residuals.T], axis=1) / count[:, None]
+    spread = np.sum((residuals - mean[index]) ** 2, axis=1)
+    enough = count >= _FEWEST
+    if not enough.any():
+        return float("nan")
+    variance = np.bincount(index, weights=spread)[enough] / (count[enough] - 1)
+    own = np.sum(mean[enough] ** 2, axis=1) - variance / count[enough]
+    return float(np.sqrt(max(np.mean(own), 0.0)))

@@ -1,0 +1,118 @@
+"""How many terms a lens gets: as many as the views of the board determine, or as few as explain them.
+
+The first is the safe choice: a term that is not needed costs little, and its uncertainty is carried along. For the
+second, models are compared by Akaike's criterion ``N ln(Σ r² / N) + 2 k`` (1974) over the same corners. Neighbouring
+corners share the bend of the board and its blur, and so are not so many observations as they are numbers: with the
+correlation ρ of neighbours' residuals, N = 2 n ((1 − ρ) / (1 + ρ))² for n corners, as for a first-order autoregressive
+process along both edges of the board.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+Array = NDArray[np.float64]
+
+#: However alike neighbours are, a view is worth one corner and a half.
+_FEWEST_PER_VIEW = 3.0
+
+
+@dataclass(frozen=True)
+class LensModel:
+    """Which terms of the distortion are free: radial terms 2 or 3, the tangential pair, the skew."""
+
+    radial: int
+    tangential: bool = True
+    skew: bool = True
+
+    def __post_init__(self) -> None:
+        if self.radial not in (2, 3):
+            raise ValueError(f"a lens has 2 or 3 radial terms, not {self.radial}")
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """(10,) of fx fy s cx cy k1 k2 p1 p2 k3."""
+        t = self.tangential
+        return np.array([True, True, self.skew, True, True, True, True, t, t, self.radial == 3])
+
+    def __str__(self) -> str:
+        parts = [f"{self.radial} radial terms"]
+        parts += ["tangential"] if self.tangential else []
+        parts += ["skew"] if self.skew else []
+        return ", ".join(parts)
+
+
+def possible(radial: int | None, tangential: bool, skew: bool, fewest: bool) -> list[LensModel]:
+    """Models to choose from, the largest first.
+
+    radial : terms, None for 3 or 2. tangential, skew : False excludes them. fewest : also models without the terms
+    that are allowed.
+    """
+    radials = (3, 2) if radial is None or (fewest and radial == 3) else (radial,)
+    if not fewest:
+        return [LensModel(each, tangential, skew) for each in radials]
+    either = (True, False)
+    return [
+        LensModel(*terms)
+        for terms in itertools.product(radials, either if tangential else (False,), either if skew else (False,))
+    ]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The model taken and why, as words for the operator."""
+
+    model: LensModel
+    reason: str
+
+
+def independent(residuals: Array, board_xy: Array) -> float:
+    """How many independent observations residuals are worth.
+
+    residuals : (v, n, 2) of the corners at board_xy (n, 2) in v views.
+    """
+    distance, _ = cKDTree(board_xy).query(board_xy, k=2)
+    pitch = float(np.median(distance[:, 1]))
+    pairs = cKDTree(board_xy).query_pairs(1.2 * pitch, output_type="ndarray")
+    if not len(pairs):
+        return float(residuals.size)
+    power = float(np.mean(residuals**2))
+    alike = float(np.mean(residuals[:, pairs[:, 0]] * residuals[:, pairs[:, 1]])) / power if power > 0 else 0.0
+    alike = min(max(alike, 0.0), 0.99)
+    worth = residuals.size * ((1 - alike) / (1 + alike)) ** 2
+    return max(worth, _FEWEST_PER_VIEW * len(residuals))
+
+
+def choose(
+    models: list[LensModel], fit: Callable[[LensModel], tuple[float, float]], N: float, limit: float, fewest: bool
+) -> Choice:
+    """The first model that is determined, or of all determined ones that of the smallest criterion.
+
+    models : to choose from, the largest first. fit : of a model, the mean square residual a component, px², and the
+    standard error of k3. N : independent observations. limit : a model whose k3 is less certain than this is not
+    determined. fewest : compare all.
+    """
+    if len(models) == 1:
+        return Choice(models[0], "as set")
+    scores: list[tuple[float, LensModel]] = []
+    unsure = ""
+    for model in models:
+        square, k3_sigma = fit(model)
+        if model.radial == 3 and not k3_sigma <= limit:
+            unsure = f"; a third radial term would be known to ± {k3_sigma:.2f} only"
+        elif fewest:
+            scores.append((N * math.log(max(square, 1e-18)) + 2 * int(model.free.sum()), model))
+        else:
+            return Choice(model, f"the most terms that the views determine{unsure}")
+    scores.sort(key=lambda each: each[0])
+    if len(scores) == 1:
+        return Choice(scores[0][1], f"the most terms that the views determine{unsure}")
+    (best, model), (second, other) = scores[:2]
+    return Choice(model, f"information criterion {second - best:.1f} below that of {other}{unsure}")

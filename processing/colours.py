@@ -1,0 +1,50 @@
+"""Colours of field values: a sequential scale for magnitudes, a diverging one for what has a middle.
+
+The scales are those of the page, made in the perceptual space OKLCH (Ottosson 2020) so that equal steps look equal.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+UNMEASURED = (0.5, 0.5, 0.5)
+_FROM_OKLAB = np.array([[0.3963377774, 0.2158037573], [-0.1055613458, -0.0638541728], [-0.0894841775, -1.291485548]])
+_LINEAR_FROM_CUBES = np.array(
+    [
+        [4.0767416621, -3.3077115913, 0.2309699292],
+        [-1.2684380046, 2.6097574011, -0.3413193965],
+        [-0.0041960863, -0.7034186147, 1.707614701],
+    ]
+)
+
+
+def colours(values: Array, low: float, high: float, diverging: bool = False) -> Array:
+    """sRGB colours (..., 3) from 0 to 1 of values (...) between two limits; what is not finite is grey.
+
+    Sequential: dark violet over blue and green to light yellow. Diverging: blue over near-white to red.
+    """
+    values = np.asarray(values, dtype=float)
+    share = np.clip((values - low) / max(high - low, 1e-300), 0.0, 1.0)
+    t = np.where(np.isfinite(share), share, 0.0)
+    if diverging:
+        side = 2.0 * t - 1.0
+        away = np.abs(side)
+        lightness, chroma, hue = 0.96 - 0.54 * away, 0.19 * away**0.85, np.where(side < 0, 258.0, 27.0)
+    else:
+        lightness, chroma, hue = 0.26 + 0.67 * t, 0.09 + 0.24 * t * (1.0 - t) + 0.06 * t, 305.0 - 200.0 * t
+    rgb = _encoded(_linear(lightness, chroma, np.radians(hue)))
+    return np.asarray(np.where(np.isfinite(values)[..., None], rgb, UNMEASURED))
+
+
+def _linear(lightness: Array, chroma: Array, hue: Array) -> Array:
+    plane = np.stack([chroma * np.cos(hue), chroma * np.sin(hue)], axis=-1)
+    cubes = (lightness[..., None] + plane @ _FROM_OKLAB.T) ** 3
+    return np.clip(cubes @ _LINEAR_FROM_CUBES.T, 0.0, 1.0)
+
+
+def _encoded(linear: Array) -> Array:
+    """sRGB's transfer curve (IEC 61966-2-1)."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)

@@ -1,0 +1,115 @@
+"""How far two surfaces lie apart where both measured the same place (Solav et al. 2018, Fig. 7a)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.mesh import Mesh
+from processing.projection import Projector
+
+Array = NDArray[np.float64]
+
+
+class Surface(Protocol):
+    """Vertices (N, 3) mm and faces (M, 3), normals outwards."""
+
+    @property
+    def vertices(self) -> Array: ...
+    @property
+    def faces(self) -> NDArray[np.int64]: ...
+
+
+@dataclass(frozen=True)
+class Mismatch:
+    """Of two sheets, by their numbers: distances between them where they lie over one another, both ways, mm.
+
+    points : how many vertices were compared. mean, std : of the distances' lengths, the paper's figure. bias : mean
+    with sign, positive where ``second`` lies outside ``first``. rms : of the distances. largest : of their lengths.
+    """
+
+    first: int
+    second: int
+    points: int
+    mean: float
+    std: float
+    bias: float
+    rms: float
+    largest: float
+
+
+def mismatches(sheets: Sequence[Surface], reach: float, fewest: int = 20) -> tuple[Mismatch, ...]:
+    """The mismatch of every two sheets that share at least ``fewest`` vertices; reach : mm, of one to the other."""
+    curved = [Curved(Mesh(sheet.vertices, sheet.faces).without_lost(), reach) for sheet in sheets]
+    found = []
+    for i, first in enumerate(curved):
+        for j in range(i + 1, len(curved)):
+            signed = np.concatenate([first.outside(curved[j]), -curved[j].outside(first)])
+            signed = signed[np.isfinite(signed)]
+            if len(signed) >= fewest:
+                found.append(_summary(i, j, signed))
+    return tuple(found)
+
+
+class Curved:
+    """A surface that is curved between its vertices, by their normals: exactly for one of the second degree.
+
+    (Half of what Phong tessellation adds, Boubekeur and Alexa 2008.) A flat triangle's middle lies below a convex
+    body by edge²/8R, which is no mismatch of two surfaces. reach : mm, how far off a point may lie.
+    """
+
+    def __init__(self, mesh: Mesh, reach: float) -> None:
+        self.mesh = mesh
+        self.used = np.unique(mesh.faces)
+        self.normals = _averaged_normals(mesh)
+        self._projector = Projector(mesh, reach)
+        on_border = np.zeros(len(mesh.vertices), bool)
+        on_border[mesh.boundary_edges()] = True
+        self._inner: NDArray[np.bool_] = ~np.asarray(on_border[mesh.faces].any(axis=1))
+
+    def outside(self, other: Curved) -> Array:
+        """How far the vertices (N,) of another surface lie outside this one, along its normal, mm.
+
+        NaN for a vertex over no triangle, or over one at the border, whose normals are one-sided.
+        """
+        result = np.full(len(other.mesh.vertices), np.nan)
+        points, directions = other.mesh.vertices[other.used], other.normals[other.used]
+        hits = self._projector.hits(points, directions)
+        over = self._inner[hits.face]
+        point, face, weights = hits.point[over], self.mesh.faces[hits.face[over]], hits.weights[over]
+        normal = np.einsum("nk,nki->ni", weights, self.normals[face])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        # From the plane of the triangle to its corners' tangent planes: the curved surface lies midway.
+        foot = points[point] - hits.height[over, None] * directions[point]
+        tangents = np.einsum("nk,nki,nki->n", weights, foot[:, None] - self.mesh.vertices[face], self.normals[face])
+        cosine = np.einsum("ni,ni->n", normal, directions[point])
+        result[other.used[point]] = hits.height[over] * cosine + 0.5 * tangents
+        return result
+
+
+def _averaged_normals(mesh: Mesh) -> Array:
+    """Unit normals of the vertices, averaged with those of their neighbours: measured slopes are noisy."""
+    normals = np.nan_to_num(mesh.vertex_normals)
+    total = normals.copy()
+    edges, _ = mesh.edges()
+    np.add.at(total, edges[:, 0], normals[edges[:, 1]])
+    np.add.at(total, edges[:, 1], normals[edges[:, 0]])
+    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12))
+
+
+def _summary(first: int, second: int, signed: Array) -> Mismatch:
+    length = np.abs(signed)
+    return Mismatch(
+        first=first,
+        second=second,
+        points=len(signed),
+        mean=float(length.mean()),
+        std=float(length.std()),
+        bias=float(signed.mean()),
+        rms=float(np.sqrt(np.mean(signed**2))),
+        largest=float(length.max()),
+    )

@@ -1,0 +1,194 @@
+"""A lattice of angle and height about the z axis, and smooth pieces fitted to a radius known on some of its nodes.
+
+The pieces are polynomials of the second or third degree in the arc a = R (θ - θ₀) and the height b = z - z₀ about each
+node, fitted by weighted least squares to the nodes within reach. On a lattice the sums of the normal equations are
+correlations of the known nodes with fixed kernels, so all nodes are fitted at once.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+TURN = 2.0 * math.pi
+#: Powers of a and b of the coefficients, the second degree first.
+POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+_QUADRATIC = 6
+_RIDGE = 1e-9
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Nodes (columns, rows): columns close round the axis at equal angles, rows at equal heights.
+
+    radius : mm, of the cylinder whose arcs measure the columns. columns : their number. z : (rows,) mm, rising.
+    """
+
+    radius: float
+    columns: int
+    z: Array
+
+    def __post_init__(self) -> None:
+        if not (self.radius > 0 and self.columns >= 8 and len(self.z) >= 2):
+            raise ValueError("a lattice needs a radius, at least 8 columns and 2 rows")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(columns, rows)."""
+        return self.columns, len(self.z)
+
+    @property
+    def theta(self) -> Array:
+        """Angles of the columns. (columns,) rad, from 0."""
+        return np.asarray(np.arange(self.columns) * (TURN / self.columns))
+
+    @property
+    def spacing(self) -> tuple[float, float]:
+        """Distance of columns along the arc, and of rows, mm."""
+        return TURN * self.radius / self.columns, float(self.z[1] - self.z[0])
+
+    @property
+    def places(self) -> tuple[Array, Array]:
+        """θ rad and z mm of all nodes, (columns, rows) each."""
+        theta, z = np.meshgrid(self.theta, self.z, indexing="ij")
+        return theta, z
+
+    def nearest(self, theta: Array, z: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Mask]:
+        """Column and row of the node nearest to θ, z (n,), and whether the lattice reaches there."""
+        column = np.rint(np.nan_to_num(theta) / (TURN / self.columns)).astype(np.int64) % self.columns
+        row = np.rint((np.nan_to_num(z, nan=-1e9) - self.z[0]) / self.spacing[1]).astype(np.int64)
+        inside = (row >= 0) & (row < len(self.z)) & np.isfinite(theta)
+        return column, np.clip(row, 0, len(self.z) - 1), inside
+
+    def arc(self, theta: Array, theta_0: Array) -> Array:
+        """R (θ - θ₀) the short way round, mm."""
+        return self.radius * ((theta - theta_0 + math.pi) % TURN - math.pi)
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """A smooth piece of surface about each node.
+
+    coefficients : (columns, rows, 10) of ``POWERS``, mm; NaN where too little is known around. The first is the radius.
+    support : (columns, rows), nodes known within reach, by weight, as a share of all.
+    """
+
+    lattice: Lattice
+    coefficients: Array
+    support: Array
+
+    @property
+    def radius(self) -> Array:
+        """Fitted radius of the nodes. (columns, rows) mm."""
+        return self.coefficients[..., 0]
+
+    @property
+    def normals(self) -> Array:
+        """Outward unit normals (columns, rows, 3)."""
+        theta, _ = self.lattice.places
+        radius, along, up = np.moveaxis(self.coefficients[..., :3], -1, 0)
+        along = along * self.lattice.radius  # d radius / dθ
+        cos, sin = np.cos(theta), np.sin(theta)
+        normals = np.stack([radius * cos + along * sin, radius * sin - along * cos, -radius * up], axis=-1)
+        return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+    @property
+    def xyz(self) -> Array:
+        """Fitted positions of the nodes. (columns, rows, 3) mm."""
+        theta, z = self.lattice.places
+        return np.stack([self.radius * np.cos(theta), self.radius * np.sin(theta), z + 0 * self.radius], axis=-1)
+
+
+def fit_pieces(lattice: Lattice, radius: Array, reach: float, degree: int = 3, least: float = 0.2) -> Pieces:
+    """Fit a piece about every node that has enough known nodes within reach.
+
+    radius : (columns, rows) mm, NaN where unknown. reach : mm; weights fall from the node to zero there.
+    degree : 2 or 3; where the known nodes lie to one side, at a rim, always 2. least : share of known nodes, by
+    weight, below which a node is left without a piece.
+    """
+    known = np.isfinite(radius)
+    level = float(np.mean(radius[known])) if known.any() else 0.0
+    a, b, weight = _window(lattice, reach)
+    values = np.where(known, radius - level, 0.0)
+    sums: dict[tuple[int, int], Array] = {}
+    for power in {(p + r, q + s) for p, q in POWERS for r, s in POWERS}:
+        sums[power] = _correlate(known.astype(float), weight * a ** power[0] * b ** power[1])
+    right = np.stack([_correlate(values, weight * a**p * b**q) for p, q in POWERS], axis=-1)
+    total = float(weight.sum())
+    support = sums[0, 0] / total
+    off_centre = np.hypot(sums[1, 0], sums[0, 1]) / np.maximum(sums[0, 0], 1e-9)
+    coefficients = np.full((*lattice.shape, len(POWERS)), np.nan)
+    enough = (support > least) & (off_centre < 0.75) & (sums[0, 0] > 1e-6)
+    inner = enough & (support > 0.6) & (off_centre < 0.2) & (degree > 2)
+    for chosen, count in ((enough & ~inner, _QUADRATIC), (inner, len(POWERS))):
+        if not chosen.any():
+            continue
+        powers = POWERS[:count]
+        normal = np.stack([np.stack([sums[p + r, q + s][chosen] for r, s in powers], -1) for p, q in powers], -1)
+        normal += _RIDGE * normal[:, :1, :1] * np.eye(count)
+        found = np.linalg.solve(normal, right[chosen][:, :count, None])[..., 0]
+        coefficients[chosen] = 0.0
+        coefficients[chosen, :count] = found
+    scale = np.array([reach ** -(p + q) for p, q in POWERS])
+    coefficients *= scale
+    coefficients[..., 0] += level
+    return Pieces(lattice, coefficients, support)
+
+
+def robust_pieces(
+    lattice: Lattice, radius: Array, reach: float, degree: int = 3, *, least: float = 0.2, floor: float = 0.1
+) -> tuple[Pieces, Mask]:
+    """The same without the nodes that lie off; returns the pieces and which known nodes (columns, rows) were kept.
+
+    A node lies off by more than ``floor`` mm and 6 standard deviations of the usual residual. The most distant ones
+    go first, so that they do not drag good ones along.
+    """
+    kept = np.isfinite(radius)
+    for factor in (20.0, 10.0, 6.0, 6.0):
+        pieces = fit_pieces(lattice, np.where(kept, radius, np.nan), reach, degree, least)
+        residual = np.abs(radius - pieces.radius)
+        usual = 1.4826 * float(np.nanmedian(residual[kept])) if np.isfinite(residual[kept]).any() else 0.0
+        with np.errstate(invalid="ignore"):
+            kept = np.isfinite(radius) & (residual <= max(factor * usual, floor))
+    return fit_pieces(lattice, np.where(kept, radius, np.nan), reach, degree, least), kept
+
+
+def evaluate(coefficients: Array, a: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Radius (...) of pieces (..., 10) at a, b (...) mm from their nodes, and its derivatives by a and b."""
+    c = np.moveaxis(coefficients, -1, 0)
+    value = (
+        c[0]
+        + a * (c[1] + a * (c[3] + a * c[6]) + b * (c[4] + a * c[7] + b * c[8]))
+        + b * (c[2] + b * (c[5] + b * c[9]))
+    )
+    by_a = c[1] + a * (2 * c[3] + 3 * a * c[6]) + b * (c[4] + 2 * a * c[7] + b * c[8])
+    by_b = c[2] + b * (2 * c[5] + 3 * b * c[9]) + a * (c[4] + a * c[7] + 2 * b * c[8])
+    return value, by_a, by_b
+
+
+def _window(lattice: Lattice, reach: float) -> tuple[Array, Array, Array]:
+    """a, b and weights of the nodes within reach; a and b in units of the reach."""
+    along, up = lattice.spacing
+    half = (max(2, math.ceil(reach / along)), max(2, math.ceil(reach / up)))
+    half = (min(half[0], lattice.columns // 2 - 1), half[1])
+    a, b = np.meshgrid(
+        np.arange(-half[0], half[0] + 1) * (along / reach),
+        np.arange(-half[1], half[1] + 1) * (up / reach),
+        indexing="ij",
+    )
+    return a, b, np.maximum(1.0 - (a * a + b * b), 0.0)
+
+
+def _correlate(values: Array, kernel: Array) -> Array:
+    """Σ kernel · values about each node (columns, rows): round the ring, and nothing beyond the rows."""
+    over, up = kernel.shape[0] // 2, kernel.shape[1] // 2
+    padded = np.pad(np.pad(values, ((over, over), (0, 0)), mode="wrap"), ((0, 0), (up, up)))
+    found = cv2.filter2D(padded, cv2.CV_64F, kernel, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(found[over : over + values.shape[0], up : up + values.shape[1]])

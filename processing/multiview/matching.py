@@ -1,0 +1,163 @@
+"""Nodes of the surface matched from the camera that faces them to the others, with start values from the shape."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.camera import Camera
+from processing.correlation import (
+    Correlation,
+    CorrelationSettings,
+    Current,
+    Reference,
+    Status,
+    correlate,
+    prepare_current,
+    prepare_reference,
+)
+from processing.errors import ComputationError
+from processing.multiview.lattice import Pieces
+from processing.multiview.warps import surface_stencil, warps_to
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+
+_KEPT = 6  # filtered images held at a time: those of a camera's neighbours
+_FELT = 0.6  # share of the subset's radius over which the warp's differences are taken
+_HOP = 16  # px about the expected places that are filtered too
+
+
+@dataclass
+class Ring:
+    """The cameras and their reference images.
+
+    image : gives the grey image of a camera's id, or None where it has none. masks : regions drawn by the user.
+    """
+
+    cameras: Sequence[Camera]
+    image: Callable[[str], Image | None]
+    masks: Mapping[str, Mask]
+    settings: CorrelationSettings
+    _filtered: OrderedDict[int, Current] = field(default_factory=OrderedDict)
+
+    def grey(self, k: int) -> Image:
+        """The image of camera k. ComputationError where it has none."""
+        found = self.image(self.cameras[k].id)
+        if found is None:
+            raise ComputationError(f"camera {self.cameras[k].id}: the reference capture lacks an image")
+        return found
+
+    def current(self, k: int) -> Current:
+        """The image of camera k, filtered to be searched in; the latest few are kept."""
+        if k not in self._filtered:
+            while len(self._filtered) >= _KEPT:
+                self._filtered.popitem(last=False)
+            self._filtered[k] = prepare_current(self.grey(k), settings=self.settings)
+        self._filtered.move_to_end(k)
+        return self._filtered[k]
+
+    def reference(self, k: int, px: Array) -> Reference:
+        """The image of camera k about px (n, 2), filtered to be searched for."""
+        grey = self.grey(k)
+        mask = np.zeros(grey.shape, bool)
+        margin = self.settings.radius + 2
+        left, top = np.maximum(px.min(axis=0) - margin, 0).astype(int)
+        right, bottom = (px.max(axis=0) + margin + 1).astype(int)
+        mask[top:bottom, left:right] = True
+        drawn = self.masks.get(self.cameras[k].id)
+        return prepare_reference(grey, mask if drawn is None else mask & drawn, self.settings)
+
+
+@dataclass(frozen=True)
+class NodeMatches:
+    """Matches of n nodes in C cameras. px, sigma : (C, n, 2), NaN where a camera has none; c_ls : (C, n).
+
+    The reference camera's pixel is whole and given, its sigma zero. status : (n,), why a node has fewer than two
+    views, 0 where it has.
+    """
+
+    px: Array
+    sigma: Array
+    c_ls: Array
+    status: NDArray[np.int8]
+    made: int = 0
+    seconds: float = 0.0
+
+
+def match_nodes(
+    ring: Ring,
+    pieces: Pieces,
+    nodes: tuple[Ints, Ints],
+    reference: Ints,
+    partners: Mask,
+    *,
+    order: int,
+    curved: bool = True,
+    progress: Callable[[float], None] = lambda _: None,
+) -> NodeMatches:
+    """Match the nodes (columns (n,), rows (n,)) from their reference camera (n,) to their partners (C, n).
+
+    order : of the subsets. curved : second derivatives from the shape, as start of the second order and held by the
+    first; otherwise zero.
+    """
+    settings = replace(ring.settings, order=order)
+    count, n = len(ring.cameras), len(reference)
+    px, sigma = np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan)
+    c_ls, status = np.full((count, n), np.nan), np.full(n, Status.NOT_REACHED, np.int8)
+    made, seconds = 0, 0.0
+    xyz = pieces.xyz[nodes]
+    theta, z = (place[nodes] for place in pieces.lattice.places)
+    reach = max(2.0, _FELT * settings.radius)
+    jobs = [(a, b) for a in range(count) for b in range(count) if (partners[b] & (reference == a)).any()]
+    own = np.empty(0, np.int64)
+    before = -1
+    for job, (a, b) in enumerate(jobs):
+        progress(job / len(jobs))
+        if a != before:
+            own, before = np.flatnonzero(reference == a), a
+            at = np.rint(ring.cameras[a].project(xyz[own]))
+            stencil = surface_stencil(
+                pieces.lattice, pieces.coefficients[nodes][own], theta[own], z[own], ring.cameras[a], at, reach
+            )
+            filtered = ring.reference(a, at)
+            px[a, own], sigma[a, own], c_ls[a, own] = at, 0.0, 0.0
+        start = warps_to(ring.cameras[b], at, stencil, reach)
+        if not curved:
+            start[:, 6:] = 0.0
+        chosen = np.flatnonzero(partners[b, own] & np.isfinite(start).all(axis=1))
+        if not len(chosen):
+            continue
+        found = _correlate(filtered, ring.current(b), at[chosen], settings, start[chosen])
+        made += len(chosen)
+        seconds += found.seconds["refine"]
+        who = own[chosen]
+        px[b, who], sigma[b, who], c_ls[b, who] = at[chosen] + found.uv, found.sigma, found.c_ls
+        status[who] = np.where(status[who] == Status.GOOD, Status.GOOD, found.status)
+    px[:, status != Status.GOOD] = np.nan
+    progress(1.0)
+    return NodeMatches(px, sigma, c_ls, status, made, seconds)
+
+
+def _correlate(
+    reference: Reference, current: Current, xy: Array, settings: CorrelationSettings, start: Array
+) -> Correlation:
+    """Matches with every point's own curvature held: one reached from a neighbour is refined again with its own."""
+    found = correlate(reference, current, xy, settings, start=start)
+    if settings.order != 1:
+        return found
+    held = found.curvature.reshape(-1, 6)
+    foreign = np.flatnonzero(found.good & (np.abs(held - start[:, 6:]) > 1e-12).any(axis=1))
+    if not len(foreign):
+        return found
+    again = np.concatenate([found.uv[foreign], found.gradient[foreign].reshape(-1, 4), start[foreign, 6:]], axis=1)
+    once_more = correlate(reference, current, xy[foreign], settings, start=again)
+    for name in ("uv", "gradient", "curvature", "zncc", "c_ls", "iterations", "status", "sigma"):
+        getattr(found, name)[foreign] = getattr(once_more, name)
+    return found

@@ -1,0 +1,255 @@
+"""The reference shape: all cameras' reference images to one set of points and the triangles between them.
+
+Sweeps of the camera pairs find the surface roughly. Then the nodes of a lattice over it are matched from the camera
+that faces them to two others, with second-order subsets; the radius so measured is fitted with smooth pieces, which
+give every subset the curvature of its warp and reach a little beyond the rim. With that curvature held, all cameras
+that see a node are matched once more to first order, which is free of the bias of flat subsets and of the noise of
+curved ones.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.camera import Camera
+from processing.correlation import CorrelationSettings, Status
+from processing.errors import ComputationError
+from processing.multiview.agreement import triangulate_agreeing
+from processing.multiview.depth import lay_lattice, px_per_mm, rough_surface
+from processing.multiview.lattice import Pieces, evaluate, robust_pieces
+from processing.multiview.matching import Image, NodeMatches, Ring, match_nodes
+from processing.multiview.tube import lattice_faces
+from processing.multiview.views import seen
+from processing.outliers import Lost
+from processing.sweep import Search, radii_of, sweep
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ShapeSettings:
+    """How the reference shape is measured. Lengths mm, angles degrees.
+
+    incidence : the steepest view that is used. spacing : of the lattice, 0 for the correlation's step as the cameras
+    see it. curvature : "geometry" holds the second derivatives that the measured shape gives each warp; "none" leaves
+    flat subsets flat. piece : reach of the smooth pieces. sigma_max : px, the least certain match that is believed.
+    floor : px, what a match between cameras is uncertain by beside the images' noise.
+    """
+
+    incidence: float = 65.0
+    spacing: float = 0.0
+    curvature: str = "geometry"
+    piece: float = 6.0
+    sigma_max: float = 0.05
+    floor: float = 0.01
+
+
+@dataclass(frozen=True)
+class ReferenceShape:
+    """The measured nodes of the surface and the triangles between them. n points, C cameras, M triangles.
+
+    xyz : (n, 3) mm. node : (n, 2) column and row on the lattice. reference : (n,) index of the camera that the point
+    was matched from, where it lies on a whole pixel. px, sigma : (C, n, 2), NaN for a camera that was not used; sigma
+    with the floor in it. covariance : (n, 3, 3) mm². chi2, degrees : (n,). c_ls : (n,), the largest over the cameras.
+    faces : (M, 3), outwards. pieces : the surface as fitted. status : (columns, rows) of all nodes, 0 where measured;
+    NOT_REACHED also where there is no surface. made, seconds : matches and the time they took.
+    """
+
+    xyz: Array
+    node: Ints
+    reference: Ints
+    px: Array
+    sigma: Array
+    covariance: Array
+    chi2: Array
+    degrees: Ints
+    c_ls: Array
+    faces: Ints
+    pieces: Pieces
+    status: NDArray[np.int8]
+    made: int
+    seconds: float
+
+
+def reference_shape(
+    cameras: Sequence[Camera],
+    image: Callable[[str], Image | None],
+    masks: Mapping[str, Mask],
+    pairs: Sequence[tuple[int, int]],
+    search: Search,
+    correlation: CorrelationSettings,
+    settings: ShapeSettings | None = None,
+    progress: Callable[[float, str], None] = lambda *_: None,
+) -> ReferenceShape:
+    """Measure the surface in the reference images of all cameras.
+
+    image : gives a camera id's grey reference image, None where there is none: that camera takes no part. masks :
+    regions drawn by the user, by camera id. pairs : indices of neighbouring cameras, for the sweeps.
+    Raises ComputationError where no two cameras share a textured surface.
+    """
+    settings = settings or ShapeSettings()
+    ring = Ring(cameras, image, masks, correlation)
+    samples = _samples(ring, pairs, search, lambda share: progress(0.3 * share, "searching for the surface"))
+    lattice = lay_lattice(samples, settings.spacing or _spacing(cameras, samples, correlation))
+    surface = _Surface(ring, settings, rough_surface(lattice, samples))
+    surface.measure(2, 2, lambda share: progress(0.3 + 0.2 * share, "first pass"))
+    surface.fit()
+    for _ in range(3):
+        gained = surface.measure(1, 2, lambda _: None, only_lost=True)
+        surface.fit()
+        if gained < 0.002 * surface.known.sum():
+            break
+    progress(0.5, "with the curvature of the shape")
+    surface.measure(correlation.order, len(cameras), lambda share: progress(0.5 + 0.5 * share, "all views"))
+    return surface.result()
+
+
+def _spacing(cameras: Sequence[Camera], samples: Array, correlation: CorrelationSettings) -> float:
+    radius = float(np.median(np.hypot(samples[:, 0], samples[:, 1])))
+    return correlation.step / px_per_mm(cameras, radius)
+
+
+def _samples(ring: Ring, pairs: Sequence[tuple[int, int]], search: Search, progress: Callable[[float], None]) -> Array:
+    """Places (n, 3) mm where the sweeps of the pairs found the surface."""
+    found = []
+    for k, (a, b) in enumerate(pairs):
+        progress(k / len(pairs))
+        cameras = (ring.cameras[a], ring.cameras[b])
+        mask = ring.masks.get(cameras[0].id)
+        seen_at = sweep(cameras, ring.grey(a), ring.current(b), mask, radii_of(cameras, search), search, ring.settings)
+        found.append(seen_at.xyz[seen_at.good])
+        log.debug("cameras %s, %s: %d places of the surface", cameras[0].id, cameras[1].id, len(found[-1]))
+    samples = np.concatenate(found)
+    if len(samples) < 12:
+        raise ComputationError(
+            "no textured surface that two neighbouring cameras both see was found; check that the specimen is speckled "
+            "and stands where the target stood, that masks cover it, and that the images are in focus"
+        )
+    return samples
+
+
+class _Surface:
+    """The surface while it is being measured: what is known of each node."""
+
+    def __init__(self, ring: Ring, settings: ShapeSettings, pieces: Pieces) -> None:
+        count, (columns, rows) = len(ring.cameras), pieces.lattice.shape
+        self.ring, self.settings, self.pieces = ring, settings, pieces
+        self.xyz = np.full((columns, rows, 3), np.nan)
+        self.px = np.full((count, columns, rows, 2), np.nan)
+        self.sigma = np.full((count, columns, rows, 2), np.nan)
+        self.covariance = np.full((columns, rows, 3, 3), np.nan)
+        self.chi2 = np.full((columns, rows), np.nan)
+        self.degrees = np.zeros((columns, rows), np.int64)
+        self.c_ls = np.full((columns, rows), np.nan)
+        self.reference = np.full((columns, rows), -1, np.int64)
+        self.status = np.full((columns, rows), Status.NOT_REACHED, np.int8)
+        self.made, self.seconds = 0, 0.0
+
+    @property
+    def known(self) -> Mask:
+        """Measured nodes. (columns, rows)."""
+        return self.status == Status.GOOD
+
+    def measure(self, order: int, views: int, progress: Callable[[float], None], only_lost: bool = False) -> int:
+        """Match the nodes that have a piece in up to so many cameras beside the reference; how many are new."""
+        ring, settings = self.ring, self.settings
+        sight, cosine = seen(self.pieces, ring.cameras, ring.masks, settings.incidence, 2.0)
+        for k, camera in enumerate(ring.cameras):
+            if ring.image(camera.id) is None:
+                sight[k] = False
+        wanted = (sight.sum(axis=0) >= 2) & np.isfinite(self.pieces.radius)
+        if only_lost:
+            wanted &= ~self.known
+        nodes = _indices(wanted)
+        if not len(nodes[0]):
+            return 0
+        rank = np.where(sight, cosine, -1.0)[:, wanted]
+        reference = np.argmax(rank, axis=0)
+        order_of = np.argsort(np.argsort(-rank, axis=0), axis=0)
+        partners = (rank > 0) & (order_of <= views) & (np.arange(len(rank))[:, None] != reference)
+        curved = settings.curvature == "geometry" or order == 2
+        found = match_nodes(
+            ring, self.pieces, nodes, reference, partners, order=order, curved=curved, progress=progress
+        )
+        before = int(self.known.sum())
+        self._keep(nodes, reference, found)
+        self.made, self.seconds = self.made + found.made, self.seconds + found.seconds
+        log.debug("order %d: %d of %d nodes measured", order, int(self.known[nodes].sum()), len(nodes[0]))
+        return int(self.known.sum()) - before
+
+    def fit(self) -> None:
+        """Smooth pieces through the measured nodes; a node off its piece is lost."""
+        lattice = self.pieces.lattice
+        radius = self._node_radius()
+        self.pieces, kept = robust_pieces(lattice, radius, self.settings.piece)
+        off = self.known & ~kept
+        self.status[off] = Lost.SURFACE
+        self.xyz[off] = np.nan
+
+    def _node_radius(self) -> Array:
+        """Radius at the nodes from points measured near them: what is left to the piece is the same at both."""
+        lattice, coefficients = self.pieces.lattice, self.pieces.coefficients
+        theta, z = lattice.places
+        x, y, height = np.moveaxis(self.xyz, -1, 0)
+        there, _, _ = evaluate(coefficients, lattice.arc(np.arctan2(y, x), theta), height - z)
+        return np.hypot(x, y) - there + coefficients[..., 0]
+
+    def _keep(self, nodes: tuple[Ints, Ints], reference: Ints, found: NodeMatches) -> None:
+        settings, cameras = self.settings, self.ring.cameras
+        with np.errstate(invalid="ignore"):
+            uncertain: Mask = np.asarray((found.sigma > settings.sigma_max).any(axis=2))
+        px = np.where(uncertain[..., None], np.nan, found.px)
+        sigma = np.sqrt(found.sigma**2 + settings.floor**2)
+        points, used = triangulate_agreeing(cameras, px, sigma, reference)
+        status = np.where(found.status != 0, found.status, 0)
+        status = np.where((status == 0) & ~np.isfinite(points.xyz).all(axis=1), Lost.RESIDUAL, status)
+        few = (np.isfinite(found.px[..., 0]) & ~uncertain).sum(axis=0) < 2
+        status = np.where((status == Lost.RESIDUAL) & few & uncertain.any(axis=0), Lost.UNCERTAIN, status)
+        good = status == 0
+        used &= good
+        self.status[nodes] = status
+        self.reference[nodes] = reference
+        self.xyz[nodes] = np.where(good[:, None], points.xyz, np.nan)
+        self.px[:, nodes[0], nodes[1]] = np.where(used[..., None], px, np.nan)
+        self.sigma[:, nodes[0], nodes[1]] = np.where(used[..., None], sigma, np.nan)
+        self.covariance[nodes] = points.covariance
+        self.chi2[nodes], self.degrees[nodes] = points.chi2, points.degrees
+        self.c_ls[nodes] = np.nanmax(np.where(used, found.c_ls, -np.inf), axis=0)
+
+    def result(self) -> ReferenceShape:
+        """What was measured, without points off the surface and without points in no triangle."""
+        self.fit()
+        if not self.known.any():
+            raise ComputationError("no point of the surface could be measured in two cameras; check focus and speckle")
+        faces, used = lattice_faces(self.xyz)
+        node = np.stack(used, axis=1)
+        return ReferenceShape(
+            xyz=self.xyz[used],
+            node=node,
+            reference=self.reference[used],
+            px=self.px[:, used[0], used[1]],
+            sigma=self.sigma[:, used[0], used[1]],
+            covariance=self.covariance[used],
+            chi2=self.chi2[used],
+            degrees=self.degrees[used],
+            c_ls=self.c_ls[used],
+            faces=faces,
+            pieces=self.pieces,
+            status=self.status,
+            made=self.made,
+            seconds=self.seconds,
+        )
+
+
+def _indices(which: Mask) -> tuple[Ints, Ints]:
+    columns, rows = np.nonzero(which)
+    return columns, rows

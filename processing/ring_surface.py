@@ -1,0 +1,180 @@
+"""One surface from all cameras at once: from calibrated cameras and images to results.
+
+The reference shape is measured first, then its points are followed by every camera against its own reference image
+and placed by all cameras together. The pair of a point is the two cameras that face it most squarely.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.camera import Camera
+from processing.correlation import CorrelationSettings
+from processing.errors import ComputationError
+from processing.multiview.motion import CameraTrack, Motion, measure_motion
+from processing.multiview.shape import ReferenceShape, ShapeSettings, reference_shape
+from processing.multiview.tracking import Tracking
+from processing.multiview.views import incidence
+from processing.outliers import Lost
+from processing.results import Matches, Results
+from processing.settings import Settings
+from processing.sweep import Search
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+Tell = Callable[[float, str, str], None]
+
+_SHAPE_SHARE = 0.5  # of the time, with few steps
+
+
+@dataclass(frozen=True)
+class RingSurface:
+    """Results and, for each camera, the mean vertical residual of each step, px."""
+
+    results: Results
+    drift: dict[str, Array]
+
+
+def ring_surface(
+    rig: str,
+    cameras: Sequence[Camera],
+    pairs: Sequence[tuple[str, str]],
+    image: Callable[[str, int], Image | None],
+    masks: Mapping[str, Mask],
+    steps: Sequence[str],
+    search: Search,
+    settings: Settings,
+    tell: Tell = lambda *_: None,
+) -> RingSurface:
+    """Measure the surface that all cameras see, and its motion through the steps.
+
+    pairs : ids of neighbouring cameras. image : the grey image of a camera id and a step, None where there is none.
+    masks : drawn regions by camera id. steps : names, the reference first. tell(share, what, rate) is told progress.
+    Raises ComputationError where no two cameras share a textured surface.
+    """
+    ids = [camera.id for camera in cameras]
+    correlation = CorrelationSettings(**settings.correlation.keywords)
+    shape_share = _SHAPE_SHARE if len(steps) > 1 else 1.0
+    shape = reference_shape(
+        cameras,
+        lambda id_: image(id_, 0),
+        masks,
+        [(ids.index(first), ids.index(second)) for first, second in pairs],
+        search,
+        correlation,
+        ShapeSettings(
+            incidence=settings.surface.incidence_deg,
+            spacing=settings.surface.spacing_mm,
+            curvature=settings.surface.curvature,
+            sigma_max=settings.surface.sigma_max_px,
+        ),
+        lambda share, what: tell(shape_share * share, what, ""),
+    )
+    rate = f"{shape.made / shape.seconds:,.0f} points/s" if shape.seconds else ""
+    motion = measure_motion(
+        cameras,
+        shape,
+        image,
+        len(steps),
+        masks,
+        correlation,
+        _tracking(settings),
+        settings.surface.sigma_max_px,
+        lambda share, what: tell(shape_share + (1 - shape_share) * share, what, rate),
+    )
+    if not len(shape.faces):
+        raise ComputationError("too few neighbouring points of the surface were measured to make a triangle")
+    return RingSurface(
+        _results(rig, cameras, pairs, steps, shape, motion, settings),
+        {camera.id: motion.drift[:, k] for k, camera in enumerate(cameras)},
+    )
+
+
+def _tracking(settings: Settings) -> Tracking:
+    order = settings.correlation.order
+    return Tracking(
+        two_pass=settings.tracking.two_pass and order == 1,
+        update_reference=settings.tracking.update_reference,
+        order=order,
+    )
+
+
+def _results(
+    rig: str,
+    cameras: Sequence[Camera],
+    pairs: Sequence[tuple[str, str]],
+    steps: Sequence[str],
+    shape: ReferenceShape,
+    motion: Motion,
+    settings: Settings,
+) -> Results:
+    facing, vertex_pair = _facing_pairs(cameras, pairs, shape)
+    corners = vertex_pair[shape.faces]
+    alike = (corners == corners[:, :1]).all(axis=1)
+    moved = np.einsum("fnii->fni", motion.covariance)
+    at_reference = np.einsum("nii->ni", shape.covariance)
+    lost = motion.status != 0
+    with np.errstate(invalid="ignore"):
+        chi2 = motion.chi2 / np.where(motion.degrees > 0, motion.degrees, 1)
+    return Results(
+        rig=rig,
+        steps=tuple(steps),
+        cameras=tuple(cameras),
+        pairs=facing,
+        vertices_ref=shape.xyz,
+        vertices=motion.xyz,
+        faces=shape.faces,
+        pair=np.where(alike, corners[:, 0], -1),
+        vertex_pair=vertex_pair,
+        correlation=motion.c_ls,
+        sigma_xyz=np.where(lost[..., None], np.nan, np.sqrt(at_reference + moved)),
+        status=motion.status,
+        matches=tuple(_matches(cameras, one, shape) for one in motion.tracks),
+        settings=settings.to_toml(),
+        sigma_displacement=np.where(lost[..., None], np.nan, np.sqrt(moved)),
+        chi2=chi2,
+    )
+
+
+def _facing_pairs(
+    cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]], shape: ReferenceShape
+) -> tuple[tuple[tuple[str, str], ...], Ints]:
+    """The pairs and, for each point (n,), which of them are the two cameras used that face it most squarely.
+
+    Two cameras that are no pair of the rig are added to the list, in the order of the ring.
+    """
+    squarely = incidence(shape.pieces, cameras)[:, shape.node[:, 0], shape.node[:, 1]]
+    squarely = np.where(np.isfinite(shape.px[..., 0]) & np.isfinite(squarely), squarely, -1.0)
+    best = np.sort(np.argsort(-squarely, axis=0)[:2], axis=0)
+    listed = [(first, second) for first, second in pairs]
+    index = {frozenset(pair): k for k, pair in enumerate(listed)}
+    vertex_pair = np.empty(len(shape.xyz), np.int64)
+    for a, b in np.unique(best, axis=1).T:
+        pair = (cameras[a].id, cameras[b].id)
+        if frozenset(pair) not in index:
+            index[frozenset(pair)] = len(listed)
+            listed.append(pair)
+        vertex_pair[(best[0] == a) & (best[1] == b)] = index[frozenset(pair)]
+    return tuple(listed), vertex_pair
+
+
+def _matches(cameras: Sequence[Camera], one: CameraTrack, shape: ReferenceShape) -> Matches:
+    """One camera's matches. Good ones that contradicted the other cameras' are marked."""
+    sigma = one.sigma.copy()
+    sigma[0] = shape.sigma[one.camera, one.vertex]
+    status = np.where((one.status == 0) & ~one.used, Lost.RESIDUAL, one.status).astype(np.int8)
+    return Matches(
+        cameras=(cameras[one.camera].id,),
+        xy=shape.px[one.camera, one.vertex],
+        px=one.px[:, None],
+        c_ls=one.c_ls,
+        sigma=sigma[:, None],
+        status=status,
+        vertex=one.vertex,
+    )

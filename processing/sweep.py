@@ -1,0 +1,114 @@
+"""Looking for the surface between two cameras: a lattice of image positions tried against a row of proxy cylinders.
+
+Nothing is known of the shape but that it lies within reach of a cylinder about the target's axis. A match is believed
+where it looks alike, where no other depth looks nearly as alike, and where its neighbours lie at a like depth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.camera import Camera
+from processing.correlation import CorrelationSettings, Current, prepare_reference, search_hypotheses
+from processing.proxy import stereo_hypotheses, sweep_radii
+from processing.region import Lattice, coherent, contrast, lattice
+
+# Beside the speckled surface there may be bare skin that matches, but poorly: less contrast than this share of the
+# usual is no speckle.
+_LEAST_CONTRAST = 0.3
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Search:
+    """How the surface is looked for. Lengths mm, angles degrees.
+
+    radius, reach : the proxy cylinder and how far from it the surface may lie.
+    incidence : the steepest angle at which both cameras must see the surface.
+    zncc_min : of a convincing match of the sweep.
+    """
+
+    radius: float
+    reach: float
+    incidence: float
+    zncc_min: float = 0.75
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Where the surface was found. Lattice of rows x columns positions in the first image, flat where (n, ...).
+
+    points : the lattice. px : (n, 2). warps : (n, 6) into the second image. xyz : (rows, columns, 3) mm.
+    good : (rows, columns), convincing and at the depth of its neighbours.
+    """
+
+    points: Lattice
+    px: Array
+    warps: Array
+    xyz: Array
+    good: Mask
+
+
+def radii_of(cameras: tuple[Camera, Camera], search: Search) -> Array:
+    """Radii (K,) mm of the sweep, so close that the match moves by 1.5 px from one to the next."""
+    first, second = cameras
+    towards = first.centre[:2] + second.centre[:2]
+    towards = towards / np.linalg.norm(towards)
+    height = 0.5 * (first.centre[2] + second.centre[2])
+    ends = [np.array([*(radius * towards), height]) for radius in (search.radius, search.radius + 1.0)]
+    seen = [camera.project(np.array(ends)) for camera in cameras]
+    px_per_mm = float(np.linalg.norm(np.diff(seen[1], axis=0) - np.diff(seen[0], axis=0)))
+    return sweep_radii(search.radius, search.reach, float(np.clip(1.5 / max(px_per_mm, 1e-6), 0.1, 2.0)))
+
+
+def sweep(
+    cameras: tuple[Camera, Camera],
+    image: Image,
+    current: Current,
+    mask: Mask | None,
+    radii: Array,
+    search: Search,
+    settings: CorrelationSettings,
+) -> Sweep:
+    """Look for the surface from the first camera's image in the second's, inside the mask if there is one.
+
+    image : of the first camera. radii : (K,) mm. The lattice is a multiple of the correlation's step.
+    """
+    first, second = cameras
+    spacing = settings.step * max(1, round(1.5 * settings.radius / settings.step))
+    points = lattice(first.size, spacing, settings.radius + 2)
+    shape = points.xy.shape[:2]
+    px = points.xy.reshape(-1, 2)
+    hypotheses = stereo_hypotheses(first, second, px, radii, settings.radius)
+    everywhere = prepare_reference(image, np.ones(image.shape, bool), settings)
+    warps, zncc, second_best = search_hypotheses(everywhere, current, px, hypotheses.warps, settings.radius)
+    which = _nearest(hypotheses.warps, warps)
+    believed = convincing(search, zncc, second_best)
+    believed &= (which > 0) & (which < len(radii) - 1)
+    if mask is None:
+        texture = contrast(image, px, settings.radius)
+        usual = float(np.median(texture[believed])) if believed.any() else 0.0
+        believed &= texture > _LEAST_CONTRAST * usual
+    else:
+        believed &= mask[px[:, 1].astype(int), px[:, 0].astype(int)]
+    good = coherent(radii[which].reshape(shape), believed.reshape(shape), tolerance=2.0)
+    xyz = hypotheses.xyz[np.arange(len(px)), which].reshape(*shape, 3)
+    return Sweep(points, px, warps, xyz, good)
+
+
+def convincing(search: Search, zncc: Array, second_best: Array) -> Mask:
+    """Matches (n,) of a sweep that look alike enough, and more so than any other place on the line."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray((zncc > search.zncc_min) & (second_best < 0.9 * zncc))
+
+
+def _nearest(candidates: Array, chosen: Array) -> NDArray[np.int_]:
+    """Index (n,) of the chosen warp among the candidates (n, K, 6)."""
+    distance = np.abs(candidates[..., :2] - chosen[:, None, :2]).sum(axis=-1)
+    return np.argmin(np.where(np.isfinite(distance), distance, np.inf), axis=1)

@@ -1,0 +1,72 @@
+"""Local quadratics: exact on quadratics, and as uncertain as they say."""
+
+import numpy as np
+import pytest
+
+from processing.correlation.quadratic import Neighbourhoods
+
+GRADIENT = np.array([[0.3, -0.2], [0.05, 0.4]])
+CURVATURE = np.array([[4e-3, -1e-3, 2e-3], [-3e-3, 5e-4, 1e-3]])
+
+
+def scattered(n=400, size=200.0, seed=3):
+    return np.random.default_rng(seed).uniform(0, size, (n, 2))
+
+
+def quadratic(xy):
+    x, y = xy[:, 0, None], xy[:, 1, None]
+    p, q, r = CURVATURE.T
+    return 1.5 + xy @ GRADIENT.T + 0.5 * p * x**2 + q * x * y + 0.5 * r * y**2
+
+
+def test_a_quadratic_field_is_its_own_fit_at_every_point_and_at_lost_ones():
+    xy = scattered()
+    values = quadratic(xy)
+    measured = values.copy()
+    measured[::7] = np.nan
+    fit = Neighbourhoods(xy, 40.0).fit(measured)
+    known = np.isfinite(fit.value).all(axis=1)
+    assert known.mean() > 0.95
+    assert known[::7].any()
+    p, q, r = CURVATURE.T
+    x, y = xy[:, 0, None], xy[:, 1, None]
+    slope = np.stack([GRADIENT[:, 0] + p * x + q * y, GRADIENT[:, 1] + q * x + r * y], axis=-1)
+    np.testing.assert_allclose(fit.value[known], values[known], atol=1e-6)
+    np.testing.assert_allclose(fit.gradient[known], slope[known], atol=1e-6)
+    np.testing.assert_allclose(fit.curvature[known], np.broadcast_to(CURVATURE, (known.sum(), 2, 3)), atol=1e-7)
+    assert np.nanmax(np.abs(fit.leave_out)) < 1e-5
+    assert np.isnan(fit.leave_out[::7]).all()
+
+
+def test_the_scatter_of_second_derivatives_is_the_stated_one():
+    x, y = np.meshgrid(np.arange(0.0, 300.0, 10.0), np.arange(0.0, 300.0, 10.0))
+    xy = np.stack([x.ravel(), y.ravel()], axis=1)
+    around = Neighbourhoods(xy, 35.0)
+    rng = np.random.default_rng(0)
+    sigma = 0.01
+    found, stated = [], None
+    for _ in range(40):
+        fit = around.fit(rng.normal(0.0, sigma, (len(xy), 2)), np.full(len(xy), sigma))
+        found.append(fit.curvature[:, 0])
+        stated = fit.curvature_sigma
+    ratio = np.std(found, axis=0) / stated
+    assert np.sqrt((ratio**2).mean(axis=0)) == pytest.approx(1.0, abs=0.02)  # 36,000 samples
+
+
+def test_a_point_that_is_off_shows_by_as_much_against_the_others():
+    xy = scattered()
+    values = quadratic(xy)
+    values[50] += (0.4, -0.3)
+    fit = Neighbourhoods(xy, 40.0).fit(values)
+    np.testing.assert_allclose(fit.leave_out[50], (0.4, -0.3), atol=1e-6)
+
+
+def test_points_on_one_line_claim_no_certainty_across_it():
+    xy = np.stack([np.arange(0.0, 60.0), np.zeros(60)], axis=1)
+    fit = Neighbourhoods(xy, 20.0).fit(xy * 0.1, np.full(60, 0.01))
+    assert (fit.curvature_sigma[:, 2] > 1e3 * fit.curvature_sigma[:, 0]).all()
+
+
+def test_too_few_neighbours_give_nothing():
+    xy = scattered(8)
+    assert np.isnan(Neighbourhoods(xy, 300.0).fit(quadratic(xy)).value).all()

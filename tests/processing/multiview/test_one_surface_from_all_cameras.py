@@ -1,0 +1,257 @@
+"""The surface that several cameras see together, from exact geometry and from rendered images with truth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from node_agent.virtual_rig.render import render
+from node_agent.virtual_rig.rig import paper_rig
+from node_agent.virtual_rig.scenes.specimen import Limb, Specimen
+from processing.camera import Camera, Intrinsics
+from processing.correlation import CorrelationSettings
+from processing.deformation import deformation
+from processing.errors import ComputationError
+from processing.mesh import Mesh
+from processing.multiview.agreement import triangulate_agreeing
+from processing.multiview.lattice import Lattice, Pieces, fit_pieces
+from processing.multiview.motion import measure_motion
+from processing.multiview.shape import reference_shape
+from processing.multiview.tracking import Tracking
+from processing.multiview.tube import lattice_faces
+from processing.multiview.views import seen
+from processing.multiview.warps import surface_stencil, warps_to
+from processing.proxy import on_cylinder
+from processing.sweep import Search
+from processing.topology import holes, inconsistent_edges, is_closed_tube, non_manifold_vertices
+
+SCALE = 0.25
+LATTICE = Lattice(radius=57.0, columns=240, z=np.arange(10.0, 230.1, 1.5))
+
+
+def ring(cameras: int = 12, scale: float = 1.0) -> list[Camera]:
+    """The virtual rig's cameras as a perfect calibration has them."""
+    found = []
+    for camera in paper_rig(cameras, scale).cameras:
+        lens = Intrinsics(camera.K, np.array(camera.distortion), (camera.width, camera.height))
+        P = lens.K_undistorted @ np.column_stack([camera.R, camera.t])
+        found.append(Camera(camera.id, P / P[2, 3], lens.size, lens))
+    return found
+
+
+CAMERAS = ring()
+
+
+def cylinder(radius: float = 57.0) -> Pieces:
+    return fit_pieces(LATTICE, np.full(LATTICE.shape, radius), 6.0)
+
+
+def test_warps_are_those_of_exact_lines_of_sight_to_a_cylinder() -> None:
+    """Second differences over one pixel of lines of sight cut with the cylinder itself, no pieces."""
+    first, second = CAMERAS[0], CAMERAS[1]
+    pieces = cylinder()
+    sight, _ = seen(pieces, (first, second), {}, 40.0, 30.0)
+    nodes = tuple(index[::53] for index in np.nonzero(sight.all(axis=0)))
+    theta, z = (place[nodes] for place in LATTICE.places)
+    px = np.rint(first.project(pieces.xyz[nodes]))
+    stencil = surface_stencil(LATTICE, pieces.coefficients[nodes], theta, z, first, px, 3.0)
+    assert np.abs(np.hypot(stencil[..., 0], stencil[..., 1]) - 57.0).max() < 1e-9
+    warps = warps_to(second, px, stencil, 3.0)
+
+    def moved(dx: float, dy: float) -> np.ndarray:
+        at = px + np.array([dx, dy])
+        return second.project(on_cylinder(first, at, np.array([57.0]))[:, 0]) - at
+
+    assert len(px) > 50
+    np.testing.assert_allclose(warps[:, :2], moved(0, 0), rtol=0, atol=1e-7)
+    along_x, along_y = (moved(1, 0) - moved(-1, 0)) / 2, (moved(0, 1) - moved(0, -1)) / 2
+    slopes = np.stack([along_x, along_y], axis=-1).reshape(-1, 4)
+    # Over 3 px the third derivative shows too: up to 2e-5 /px², a sixth of which times 3² is 3e-5.
+    np.testing.assert_allclose(warps[:, 2:6], slopes, rtol=0, atol=5e-5)
+    xx = moved(1, 0) - 2 * moved(0, 0) + moved(-1, 0)
+    yy = moved(0, 1) - 2 * moved(0, 0) + moved(0, -1)
+    assert np.abs(xx[:, 0]).max() > 5e-4
+    np.testing.assert_allclose(warps[:, [6, 9]], xx, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(warps[:, [8, 11]], yy, rtol=0, atol=1e-5)
+
+
+def test_cameras_see_the_nodes_that_face_them() -> None:
+    pieces = cylinder()
+    sight, cosine = seen(pieces, CAMERAS, {}, 60.0, 0.0)
+    towards = np.array([camera.centre for camera in CAMERAS])[:, None, None] - pieces.xyz
+    normal = pieces.xyz * np.array([1, 1, 0]) / 57.0
+    true = np.sum(towards * normal, axis=-1) / np.linalg.norm(towards, axis=-1)
+    np.testing.assert_allclose(cosine, true, atol=1e-9)
+    assert not sight[true < 0.5].any()
+    inside = [((px := camera.project(pieces.xyz)) >= 0).all(-1) & (px < camera.size).all(-1) for camera in CAMERAS]
+    assert sight[(true > 0.5) & np.array(inside)].mean() > 0.99
+    assert np.median(sight.sum(axis=0)) >= 3
+
+
+def test_a_mask_and_a_hidden_place_are_not_seen() -> None:
+    theta, z = LATTICE.places
+    collar = 57.0 + 12.0 * np.exp(-(((z - 120.0) / 4.0) ** 2))  # stands 12 mm out at half height
+    down = np.array([-np.sqrt(0.5), 0.0, -np.sqrt(0.5)])  # a camera 45° above the middle looks down on it
+    right = np.array([0.0, 1.0, 0.0])
+    R = np.stack([right, np.cross(down, right), down])
+    centre = np.array([0.0, 0.0, 120.0]) - 350.0 * down
+    P = np.diag([1000.0, 1000.0, 1.0]) @ np.column_stack([R, -R @ centre])
+    P[:2] += np.outer([600.0, 600.0], P[2])
+    above = Camera("above", P / P[2, 3], (1200, 1200))
+    free, _ = seen(fit_pieces(LATTICE, collar, 4.0), [above], {}, 80.0, 0.0)
+    plain, _ = seen(cylinder(), [above], {}, 80.0, 0.0)
+    # The collar's shadow ends where the line over its edge meets the cylinder again.
+    assert not free[0][(np.abs(z - 111.0) < 2) & plain[0]].any()
+    assert plain[0][np.abs(z - 111.0) < 2].any()
+    clear = (z < 95.0) & (np.cos(theta) > 0.9) & plain[0]
+    assert clear.any()
+    assert free[0][clear].all()
+    camera = CAMERAS[0]
+    mask = np.zeros((camera.size[1], camera.size[0]), bool)
+    mask[:, : camera.size[0] // 2] = True
+    masked, _ = seen(cylinder(), [camera], {camera.id: mask}, 60.0, 0.0)
+    assert masked.any()
+    assert (camera.project(cylinder().xyz[masked[0]])[:, 0] < camera.size[0] / 2).all()
+
+
+def test_a_lattice_with_lost_nodes_is_still_one_sheet() -> None:
+    xyz = cylinder().xyz
+    whole, used = lattice_faces(xyz)
+    mesh = Mesh(xyz[used], whole)
+    assert is_closed_tube(mesh)
+    assert len(whole) == 2 * LATTICE.columns * (len(LATTICE.z) - 1)
+    assert np.einsum("mi,mi->m", mesh.area_vectors[:, :2], mesh.centroids[:, :2]).min() > 0
+    rng = np.random.default_rng(0)
+    xyz[rng.random(LATTICE.shape) < 0.02] = np.nan
+    xyz[30:33, 40:43] = np.nan
+    faces, used = lattice_faces(xyz)
+    mesh = Mesh(xyz[used], faces)
+    assert len(np.unique(faces)) == len(mesh.vertices)
+    assert len(inconsistent_edges(mesh)) == 0
+    assert len(non_manifold_vertices(mesh)) == 0
+    assert np.einsum("mi,mi->m", mesh.area_vectors[:, :2], mesh.centroids[:, :2]).min() > 0
+
+
+def test_a_view_that_contradicts_the_others_is_dropped_and_two_that_do_are_no_point() -> None:
+    rng = np.random.default_rng(3)
+    xyz = np.column_stack([rng.uniform(40, 55, 300), rng.uniform(-20, 20, 300), rng.uniform(60, 180, 300)])
+    cameras = [CAMERAS[k] for k in (11, 0, 1)]
+    noise = 0.01
+    px = np.stack([camera.project(xyz) for camera in cameras]) + noise * rng.standard_normal((3, 300, 2))
+    px[2, :20] += [0.0, 3.0]
+    px[2, 20:40] = np.nan
+    px[1, 20:40] += [0.0, 3.0]
+    points, used = triangulate_agreeing(cameras, px, np.full(px.shape, noise))
+    assert not used[2, :20].any()
+    assert used[:2, :20].all()
+    assert np.isnan(points.xyz[20:40]).all()
+    assert used[:, 40:].all()
+    good = np.r_[0:20, 40:300]
+    error = (points.xyz - xyz)[good]
+    whitened = np.einsum("ni,nij,nj->n", error, np.linalg.inv(points.covariance[good]), error)
+    assert whitened.mean() == pytest.approx(3.0, abs=4 * np.sqrt(6 / len(good)))
+
+
+@dataclass(frozen=True)
+class Images:
+    """Rendered images of three neighbouring cameras at two steps of the limb."""
+
+    cameras: list[Camera]
+    grey: dict[tuple[str, int], np.ndarray]
+
+    def __call__(self, camera_id: str, step: int) -> np.ndarray | None:
+        return self.grey.get((camera_id, step))
+
+
+STEP = 2  # of the limb's load: strains of several per cent
+
+
+@pytest.fixture(scope="module")
+def limb() -> Images:
+    rig = paper_rig(12, SCALE)
+    chosen = (11, 0, 1)
+    grey = {
+        (rig.cameras[k].id, n): render(rig.cameras[k], Specimen(Limb(), step), seed=10 * k + n)
+        for k in chosen
+        for n, step in enumerate((0, STEP))
+    }
+    cameras = ring(12, SCALE)
+    return Images([cameras[k] for k in chosen], grey)
+
+
+CORRELATION = CorrelationSettings(radius=8, step=5)
+SEARCH = Search(radius=57.0, reach=20.0, incidence=65.0)
+
+
+def measured(images: Images, **more):
+    masks = more.get("masks", {})
+    return reference_shape(images.cameras, lambda id_: images(id_, 0), masks, [(0, 1), (1, 2)], SEARCH, CORRELATION)
+
+
+@pytest.fixture(scope="module")
+def shape(limb: Images):
+    return measured(limb)
+
+
+def test_the_shape_of_a_limb_from_three_cameras(limb: Images, shape, figures) -> None:
+    _, z, distance = Limb().material_coordinates(shape.xyz)
+    speckled = (z > 5) & (z < 245)
+    rms, worst = float(np.sqrt(np.mean(distance[speckled] ** 2))), float(np.abs(distance[speckled]).max())
+    normals = shape.pieces.normals[shape.node[:, 0], shape.node[:, 1]]
+    sigma = np.sqrt(np.einsum("ni,nij,nj->n", normals, shape.covariance, normals))
+    figures("three cameras at quarter scale: limb's shape, RMS", f"{1e3 * rms:.1f} µm", "≤ 40")
+    assert rms < 0.04  # a tenth of a pixel
+    assert worst < 0.4
+    assert np.median(np.abs(distance / sigma)[speckled]) < 1.0  # 0.67 of a normal distribution, the floor included
+    mesh = Mesh(shape.xyz, shape.faces)
+    assert len(non_manifold_vertices(mesh)) == 0
+    assert len(holes(mesh, above=5.0)) == 0
+    # The part of the limb that two of the three cameras see under 60° is there.
+    theta, height = np.meshgrid(np.linspace(0, 2 * np.pi, 200, endpoint=False), np.arange(12.0, 230.0, 3.0))
+    place = Limb().position(theta, height, 0)
+    along, up = np.moveaxis(Limb().tangents(theta, height, 0), -2, 0)
+    normal = np.cross(along, up)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    seen_by = sum(camera.incidence_cosine(place, normal) > 0.5 for camera in limb.cameras)
+    inside = sum(
+        ((px := camera.project(place)) > 10).all(-1) & (px < np.array(camera.size) - 10).all(-1)
+        for camera in limb.cameras
+    )
+    wanted = place[(seen_by >= 2) & (inside == 3)]
+    gap = np.array([np.linalg.norm(shape.xyz - p, axis=1).min() for p in wanted])
+    assert (gap < 2.0).mean() > 0.98
+
+
+def test_points_rest_on_whole_pixels_of_their_reference_camera(shape) -> None:
+    own = shape.px[shape.reference, np.arange(len(shape.xyz))]
+    assert (own == np.rint(own)).all()
+    assert (np.isfinite(shape.px[..., 0]).sum(axis=0) >= 2).all()
+
+
+def test_the_motion_of_the_limb_from_three_cameras(limb: Images, shape, figures) -> None:
+    motion = measure_motion(limb.cameras, shape, limb, 2, {}, CORRELATION, Tracking(), 0.1)
+    theta, z, _ = Limb().material_coordinates(shape.xyz)
+    speckled = (z > 5) & (z < 245)
+    true = [Limb().position(theta, z, step) for step in (0, STEP)]
+    error = np.linalg.norm(motion.xyz[1] - shape.xyz - (true[1] - true[0]), axis=1)[speckled]
+    rms = float(np.sqrt(np.nanmean(error**2)))
+    figures("three cameras at quarter scale: displacement, RMS", f"{1e3 * rms:.1f} µm", "≤ 20")
+    assert np.isfinite(error).mean() > 0.98
+    assert rms < 0.02
+    assert np.nanmax(error) < 0.4
+    whole = speckled[shape.faces].all(axis=1)
+    found = deformation(shape.xyz, motion.xyz[1], shape.faces)
+    exact = deformation(true[0], true[1], shape.faces)
+    assert np.nanstd((found.lambda2 - exact.lambda2)[whole]) < 3e-3
+    # A camera that drops out does not move the points: they are labels that all cameras share.
+    without = Images(limb.cameras, {key: grey for key, grey in limb.grey.items() if key != (limb.cameras[2].id, 1)})
+    fewer = measure_motion(limb.cameras, shape, without, 2, {}, CORRELATION, Tracking(), 0.1)
+    both = np.isfinite(fewer.xyz[1, :, 0]) & speckled
+    assert 0.3 < both.mean() < 0.9
+    assert np.abs(np.median((fewer.xyz - motion.xyz)[1, both], axis=0)).max() < 1e-3
+
+
+def test_cameras_that_see_nothing_in_common_are_refused(limb: Images) -> None:
+    blank = {key: np.full_like(grey, 128) for key, grey in limb.grey.items()}
+    with pytest.raises(ComputationError, match="speckled"):
+        measured(Images(limb.cameras, blank))
