@@ -19,7 +19,7 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from processing.correlation.lanes import LANES, floor, load, magnitude, number, picked, put, ramp, select
+from processing.correlation.lanes import LANES, floor, load, magnitude, number, picked, put, ramp, select, store
 
 FAST = {"contract", "reassoc", "arcp", "nsz"}
 # What sixteen pixels cross: nothing, one whole number along an axis or both; WIDE + n: n whole numbers in y, any in x.
@@ -155,15 +155,18 @@ _c44, _c54, _c45, _c55 = _make_sum(_row4, 4), _make_sum(_row5, 4), _make_sum(_ro
 _q66, _q76, _q67, _q77 = _make_sum(_row6, 6), _make_sum(_row7, 6), _make_sum(_row6, 7), _make_sum(_row7, 7)
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
-def _wide(c, p, stride, tx, ty, rows, quintic):  # type: ignore[no-untyped-def]
-    """Any gradients that 32 coefficients of a row cover: taps picked by permutation, ``rows`` rows of them."""
-    x = tx + ramp(c)
+@nb.njit(fastmath=FAST, nogil=True, cache=True)
+def _wide(c, p, stride, tx, sx, qx, ty, sy, qy, rows, quintic, g):  # type: ignore[no-untyped-def]
+    """Any gradients that 32 coefficients of a row cover: taps picked by permutation, ``rows`` more rows of them.
+
+    g : where to put the sixteen grey levels.
+    """
+    e = ramp(c)
+    x, y = e * (e * qx + sx) + tx + e, e * (e * qy + sy) + ty
     whole = floor(x)
-    out, fraction = ramp(c) * _F(0), x - whole
+    out, t = ramp(c) * _F(0), x - whole
     if quintic:
-        w = _quintic(fraction)
-        row = ty + _F(2)
+        w, row = _quintic(t), y + _F(2)
         for _ in range(rows + _U(6)):
             taps = w[0] * picked(c, p, whole) + w[1] * picked(c, p, whole + _F(1)) + w[2] * picked(c, p, whole + _F(2))
             taps += w[3] * picked(c, p, whole + _F(3)) + w[4] * picked(c, p, whole + _F(4))
@@ -171,15 +174,14 @@ def _wide(c, p, stride, tx, ty, rows, quintic):  # type: ignore[no-untyped-def]
             row -= _F(1)
             p += stride
     else:
-        v = _cubic(fraction)
-        row = ty + _F(1)
+        v, row = _cubic(t), y + _F(1)
         for _ in range(rows + _U(4)):
             taps = v[0] * picked(c, p, whole) + v[1] * picked(c, p, whole + _F(1))
             taps += v[2] * picked(c, p, whole + _F(2)) + v[3] * picked(c, p, whole + _F(3))
             out += _cubic_at(row) * taps
             row -= _F(1)
             p += stride
-    return out
+    store(g, _U(0), out)
 
 
 @nb.njit(fastmath=FAST, nogil=True, cache=True)
@@ -204,37 +206,41 @@ def _scattered(c, p, stride, tx, sx, qx, ty, sy, qy, quintic, g):  # type: ignor
         put(g, lane, out)
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
-def interpolate(c, p, stride, case, tx, sx, qx, ty, sy, qy, quintic, spare):  # type: ignore[no-untyped-def]
-    """Sixteen grey levels of the current image, those whose taps begin at p + lane where t < 1.
-
-    c : pointer to the coefficients; case : what the lanes cross; spare : pointer to 16 numbers of scratch.
-    """
-    e = ramp(c)
-    x, y = e * (e * qx + sx) + tx, e * (e * qy + sy) + ty
-    if case >= WIDE:
-        out = _wide(c, p, stride, x, y, _U(case - WIDE), quintic)
-    elif case == SCATTERED:
-        _scattered(c, p, stride, tx, sx, qx, ty, sy, qy, quintic, spare)
-        out = load(spare, _U(0))
-    elif quintic:
-        if case == 0:
-            out = _q66(c, p, stride, _quintic(x), _quintic(y))
-        elif case == ACROSS_X:
-            out = _q76(c, p, stride, _quintic_across(x), _quintic(y))
-        elif case == ACROSS_Y:
-            out = _q67(c, p, stride, _quintic(x), _quintic_across(y))
-        else:
-            out = _q77(c, p, stride, _quintic_across(x), _quintic_across(y))
-    elif case == 0:
-        out = _c44(c, p, stride, _cubic(x), _cubic(y))
-    elif case == ACROSS_X:
-        out = _c54(c, p, stride, _cubic_across(x), _cubic(y))
-    elif case == ACROSS_Y:
-        out = _c45(c, p, stride, _cubic(x), _cubic_across(y))
+@nb.njit(nogil=True, cache=True)
+def _general(c, p, stride, case, tx, sx, qx, ty, sy, qy, quintic, g):  # type: ignore[no-untyped-def]
+    if case == SCATTERED:
+        _scattered(c, p, stride, tx, sx, qx, ty, sy, qy, quintic, g)
     else:
-        out = _c55(c, p, stride, _cubic_across(x), _cubic_across(y))
-    return out
+        _wide(c, p, stride, tx, sx, qx, ty, sy, qy, _U(case - WIDE), quintic, g)
+
+
+def make_interpolation(quintic: bool) -> Any:
+    """The interpolation of one degree."""
+    weights, across = (_quintic, _quintic_across) if quintic else (_cubic, _cubic_across)
+    still, over_x, over_y, over = (_q66, _q76, _q67, _q77) if quintic else (_c44, _c54, _c45, _c55)
+
+    @nb.njit(forceinline=True, fastmath=FAST)
+    def interpolate(c, p, stride, case, tx, sx, qx, ty, sy, qy, spare):  # type: ignore[no-untyped-def]
+        """Sixteen grey levels of the current image, those whose taps begin at p + lane where t < 1.
+
+        c : pointer to the coefficients; case : what the lanes cross; spare : pointer to 16 numbers of scratch.
+        """
+        e = ramp(c)
+        x, y = e * (e * qx + sx) + tx, e * (e * qy + sy) + ty
+        if case == 0:
+            g = still(c, p, stride, weights(x), weights(y))
+        elif case == ACROSS_X:
+            g = over_x(c, p, stride, across(x), weights(y))
+        elif case == ACROSS_Y:
+            g = over_y(c, p, stride, weights(x), across(y))
+        elif case == ACROSS_X + ACROSS_Y:
+            g = over(c, p, stride, across(x), across(y))
+        else:
+            _general(c, p, stride, case, tx, sx, qx, ty, sy, qy, quintic, spare)
+            g = load(spare, _U(0))
+        return g
+
+    return interpolate
 
 
 @nb.njit(forceinline=True, fastmath=FAST)

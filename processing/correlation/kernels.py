@@ -20,6 +20,7 @@ all of it is double.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -31,8 +32,8 @@ from processing.correlation.interpolation import (
     REACH_OF_WINDOW,
     SCATTERED,
     WIDE,
-    interpolate,
     largest,
+    make_interpolation,
 )
 from processing.correlation.lanes import LANES, chosen, floor, load, pointer, ramp, select, store, store_whole, total
 from processing.correlation.spline import PAD
@@ -45,6 +46,7 @@ _F, _U = np.float32, np.uint64
 _L = np.uint64(LANES)
 _LAST_DIGIT = 1e-5  # px; steps below it that shrink no more are the rounding of single precision
 _CHUNK = 64  # points that share their scratch memory
+_SURE = 0.9  # ZNCC of a match that others may follow
 _PAD = PAD
 
 
@@ -117,50 +119,6 @@ def _stays(shape, x, y, p, corner, bits):  # type: ignore[no-untyped-def]
     return True
 
 
-@nb.njit(fastmath=FAST, nogil=True, cache=True)
-def _accumulate(  # type: ignore[no-untyped-def]
-    coef, stride, origin, place, cell, bend, quintic, px, bits, corner, strips, second, level, scratch, sums
-):  # fmt: skip
-    """One pass over the subset in the current image, g taken about ``level``.
-
-    coef : flat, origin : index of the centre's first tap; place, cell of the vectors; bend : (2,) their quadratic
-    terms; scratch : (16, 16). sums : (16,), Σg, Σg², Σfg, spare, then Σ g ∂f/∂x φ_k (6) and Σ g ∂f/∂y φ_k (6) with
-    φ = 1 dx dy dx²/2 dxdy dy²/2.
-    """
-    ref, gx, gy = pointer(px[REF]), pointer(px[GX]), pointer(px[GY])
-    c, at_sum, spare, qx, qy = pointer(coef), pointer(scratch), pointer(scratch[3]), bend[0], bend[1]
-    scratch[:] = 0.0
-    for s in range(strips.shape[0] - 1):
-        sg = sgg = sfg = a0 = a1 = a2 = b0 = b1 = b2 = ramp(c) * _F(0)
-        for v in range(_U(strips[s]), _U(strips[s + 1])):
-            at, y = v * _L, corner[1, v]
-            first = _U(origin + np.int64(cell[1, v]) * np.int64(stride) + np.int64(cell[0, v]))
-            g = interpolate(
-                c, first, stride, cell[2, v], place[0, v], place[1, v], qx, place[2, v], place[3, v], qy, quintic, spare
-            )
-            g = select(chosen(bits[v]), g - level, _F(0))
-            sg += g
-            sgg += g * g
-            sfg += g * load(ref, at)
-            ga, gb = g * load(gx, at), g * load(gy, at)
-            a0 += ga
-            b0 += gb
-            a1 += ga * y
-            b1 += gb * y
-            if second:
-                a2 += ga * (y * y)
-                b2 += gb * (y * y)
-        x = ramp(c) + corner[0, strips[s]]
-        add(at_sum, 0, sg)
-        add(at_sum, 1, sgg)
-        add(at_sum, 2, sfg)
-        _by_power(at_sum, 4, x, a0, a1, a2, second)
-        _by_power(at_sum, 10, x, b0, b1, b2, second)
-    for k in range(16):
-        if k < 3 or k in (4, 5, 6, 10, 11, 12) or (second and k > 3):
-            sums[k] = total(load(at_sum, _U(k) * _L))
-
-
 @nb.njit(forceinline=True, fastmath=FAST)
 def _by_power(at, row, x, q0, q1, q2, second):  # type: ignore[no-untyped-def]
     """Lanes of q φ of a strip added to three or six rows of scratch; q_k : Σ q dy^k."""
@@ -172,6 +130,72 @@ def _by_power(at, row, x, q0, q1, q2, second):  # type: ignore[no-untyped-def]
         add(at, row + 3, _F(0.5) * (qx * x))
         add(at, row + 4, q1 * x)
         add(at, row + 5, _F(0.5) * q2)
+
+
+def _make_pass(quintic: bool, second: bool) -> Any:
+    """The pass over a subset of one degree and order."""
+    interpolate = make_interpolation(quintic)
+
+    @nb.njit(fastmath=FAST, nogil=True)
+    def accumulate(  # type: ignore[no-untyped-def]
+        coef, stride, origin, place, cell, bend, px, bits, corner, strips, level, scratch, sums
+    ):  # fmt: skip
+        """One pass over the subset in the current image, g taken about ``level``.
+
+        coef : flat, origin : index of the centre's first tap; place, cell of the vectors; bend : (2,) their quadratic
+        terms; scratch : (17, 16). sums : (16,), Σg, Σg², Σfg, spare, then Σ g ∂f/∂x φ_k (6) and Σ g ∂f/∂y φ_k (6)
+        with φ = 1 dx dy dx²/2 dxdy dy²/2.
+        """
+        ref, gx, gy = pointer(px[REF]), pointer(px[GX]), pointer(px[GY])
+        c, at_sum, spare, qx, qy = pointer(coef), pointer(scratch), pointer(scratch[16]), bend[0], bend[1]
+        scratch[:] = 0.0
+        for s in range(strips.shape[0] - 1):
+            sg = sgg = sfg = a0 = a1 = a2 = b0 = b1 = b2 = ramp(c) * _F(0)
+            for v in range(_U(strips[s]), _U(strips[s + 1])):
+                at, y = v * _L, corner[1, v]
+                p = _U(origin + np.int64(cell[1, v]) * np.int64(stride) + np.int64(cell[0, v]))
+                tx, sx, ty, sy = place[0, v], place[1, v], place[2, v], place[3, v]
+                g = interpolate(c, p, stride, cell[2, v], tx, sx, qx, ty, sy, qy, spare)
+                g = select(chosen(bits[v]), g - level, _F(0))
+                sg += g
+                sgg += g * g
+                sfg += g * load(ref, at)
+                ga, gb = g * load(gx, at), g * load(gy, at)
+                a0 += ga
+                b0 += gb
+                a1 += ga * y
+                b1 += gb * y
+                if second:
+                    a2 += ga * (y * y)
+                    b2 += gb * (y * y)
+            x = ramp(c) + corner[0, strips[s]]
+            add(at_sum, 0, sg)
+            add(at_sum, 1, sgg)
+            add(at_sum, 2, sfg)
+            _by_power(at_sum, 4, x, a0, a1, a2, second)
+            _by_power(at_sum, 10, x, b0, b1, b2, second)
+        for k in range(16):
+            if k < 3 or k in (4, 5, 6, 10, 11, 12) or (second and k > 3):
+                sums[k] = total(load(at_sum, _U(k) * _L))
+
+    return accumulate
+
+
+_cubic_first, _cubic_second = _make_pass(False, False), _make_pass(False, True)
+_quintic_first, _quintic_second = _make_pass(True, False), _make_pass(True, True)
+
+
+@nb.njit(nogil=True, cache=True)
+def _accumulate(quintic, second, *given):  # type: ignore[no-untyped-def]
+    if quintic:
+        if second:
+            _quintic_second(*given)
+        else:
+            _quintic_first(*given)
+    elif second:
+        _cubic_second(*given)
+    else:
+        _cubic_first(*given)
 
 
 @nb.njit(cache=True, nogil=True)
@@ -202,8 +226,9 @@ def _refine_point(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """IC-GN of one subset from the parameters p (12,), refined in place.
 
-    (x_ref, y_ref) and (x_cur, y_cur) : the centre in the two images' own crops; corner, uncut, strips : the
-    template, corner_f the same as floats, filled up to a multiple of 16; the last line is scratch. Returns status, ZNCC, iterations, sigma of u and of v (px).
+    (x_ref, y_ref) and (x_cur, y_cur) : the centre in the two images' own crops; corner, uncut, strips : the template,
+    corner_f the same as floats, filled up to a multiple of 16; the last line is scratch. Returns status, ZNCC,
+    iterations, sigma of u and of v (px).
     """
     n, size, second, kind = corner.shape[1], 2 * terms, terms == 6, px.dtype.type
     sums, sum_J, sum_fJ, b, d = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4]
@@ -236,22 +261,9 @@ def _refine_point(  # type: ignore[no-untyped-def]
         bend[0], bend[1] = 0.5 * p[3], 0.5 * p[9]
         about = float(kind(about))
         _accumulate(
-            coef,
-            stride,
-            origin,
-            place,
-            cell,
-            bend,
-            quintic,
-            px,
-            bits,
-            corner_f,
-            strips,
-            second,
-            kind(about),
-            lanes,
-            sums,
-        )
+            quintic, second,
+            coef, stride, origin, place, cell, bend, px, bits, corner_f, strips, kind(about), lanes, sums,
+        )  # fmt: skip
         mean_g = sums[0] / pixels
         variance = sums[1] - pixels * mean_g * mean_g
         if not variance > 1e-9 * pixels:
@@ -286,6 +298,22 @@ def _refine_point(  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
+def _follow(source, offset, reach, p):  # type: ignore[no-untyped-def]
+    """p (12,) becomes what the source's parameters (12,) are at an offset (2,) px, unless they say otherwise than p."""
+    dx, dy = offset
+    if max(abs(dx), abs(dy)) > reach:
+        return
+    q = source.copy()
+    for at in (0, 6):
+        xx, xy, yy = source[at + 3], source[at + 4], source[at + 5]
+        q[at] += source[at + 1] * dx + source[at + 2] * dy + 0.5 * xx * dx * dx + xy * dx * dy + 0.5 * yy * dy * dy
+        q[at + 1] += xx * dx + xy * dy
+        q[at + 2] += xy * dx + yy * dy
+    if abs(q[0] - p[0]) < 1.0 and abs(q[6] - p[6]) < 1.0:
+        p[:] = q
+
+
+@nb.njit(cache=True, nogil=True)
 def _scratch(rows, columns, kind):  # type: ignore[no-untyped-def]
     """(rows, columns) of the type of ``kind``, from a multiple of 64 bytes on: a vector is one line of the cache."""
     raw = np.empty(rows * columns + 64 // kind.itemsize, kind.dtype)
@@ -296,7 +324,7 @@ def _scratch(rows, columns, kind):  # type: ignore[no-untyped-def]
 @nb.njit(cache=True, nogil=True, parallel=True)
 def refine(  # type: ignore[no-untyped-def]
     image, gx, gy, coef_ref, mask, origin_ref, coef, origin_cur, xy, parameters, known,
-    radius, circle, terms, quintic, tolerance, max_iterations, texture, noise,
+    radius, circle, terms, quintic, tolerance, max_iterations, texture, noise, follow,
     status, zncc, iterations, sigma,
 ):  # fmt: skip
     """IC-GN of many subsets in parallel; each is independent of the others, so of the number of threads too.
@@ -304,7 +332,9 @@ def refine(  # type: ignore[no-untyped-def]
     image, gx, gy, mask : (h, w) crop of the reference at origin_ref (x, y), coef_ref its coefficients, padded.
     coef : padded coefficients of the crop of the current image at origin_cur.
     xy : (n, 2) px. parameters : (n, 12), start values in and results out. known : (n,) bool, points to refine.
-    status, zncc, iterations (n,) and sigma (n, 2) are filled where known.
+    follow : px; a point no farther from the one before it starts from that one's result where it is a good match and
+    agrees with the point's own start value; 0 never. status, zncc, iterations (n,) and sigma (n, 2) are filled where
+    known.
     """
     corner, uncut, strips = template(radius, circle)
     flat_ref, flat, n = coef_ref.ravel(), coef.ravel(), corner.shape[1]
@@ -317,8 +347,11 @@ def refine(  # type: ignore[no-untyped-def]
         bits, cell, bend = np.empty(n, np.uint16), np.empty((3, m), np.int32), np.empty(2, coef.dtype)
         H, moment, vectors = np.empty((2 * terms, 2 * terms)), np.empty((7, 15)), np.empty((5, 16))
         A, B = np.empty((6, 6)), np.empty((6, 6))
+        before = -1
         for k in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, xy.shape[0])):
             if known[k]:
+                if before >= 0:
+                    _follow(parameters[before], xy[k] - xy[before], follow, parameters[k])
                 result = _refine_point(
                     image_, gx_, gy_, flat_ref, _U(coef_ref.shape[1]), mask_, image.shape, flat, coef.shape,
                     xy[k, 0] - origin_ref[0], xy[k, 1] - origin_ref[1], xy[k, 0] - origin_cur[0],
@@ -331,3 +364,4 @@ def refine(  # type: ignore[no-untyped-def]
                 iterations[k] = result[2]
                 sigma[k, 0] = result[3]
                 sigma[k, 1] = result[4]
+                before = k if follow > 0.0 and result[0] == GOOD and result[1] > _SURE else -1

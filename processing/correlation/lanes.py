@@ -14,11 +14,13 @@ from typing import Any
 
 import llvmlite.ir as ir
 from llvmlite.binding import get_host_cpu_features
+from numba import extending
 from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, models, register_model
+from numba.extending import lower_builtin, models, register_model
 
 LANES = 16
+intrinsic: Any = extending.intrinsic  # its own type hides the arguments of what it makes
 _FLAGS = ("contract", "reassoc", "arcp", "nsz")  # no order of sums is promised, NaN is
 _INDEX = ir.VectorType(ir.IntType(32), LANES)
 
@@ -88,13 +90,17 @@ def _define(symbol: Callable[..., Any], result: Callable[[Lanes], Any], emit: Ca
         lower_builtin(symbol, *kinds)(lower)
 
 
+def _arithmetic(method: str) -> Callable[[Any, Any, Any], Any]:
+    return lambda builder, x, y: getattr(builder, method)(x, y, flags=_FLAGS)
+
+
 for _symbols, _method in (
     ((operator.add, operator.iadd), "fadd"),
     ((operator.sub, operator.isub), "fsub"),
     ((operator.mul, operator.imul), "fmul"),
 ):
     for _symbol in _symbols:
-        _define(_symbol, lambda k: k, lambda b, x, y, m=_method: getattr(b, m)(x, y, flags=_FLAGS))
+        _define(_symbol, lambda kind: kind, _arithmetic(_method))
 _define(operator.ge, lambda k: _CHOICE, lambda b, x, y: b.fcmp_ordered(">=", x, y))
 
 
@@ -117,7 +123,7 @@ def load(typingctx, start, index):  # type: ignore[no-untyped-def]
     """The sixteen numbers from start[index] on."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return builder.load(_address(builder, *args, _vector(sig.return_type.dtype)), align=_width(sig) // 8)
+        return builder.load(_address(builder, args[0], args[1], _vector(sig.return_type.dtype)), align=_width(sig) // 8)
 
     return Lanes(start.dtype)(start, index), codegen
 
