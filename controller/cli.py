@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from controller import measuring
+from controller import measuring, reporting
 from controller.console import narrated, show_table
 from processing.errors import InputError, RingdicError
 
@@ -30,6 +30,7 @@ Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="GROUP.NAM
 SettingsFile = Annotated[Path | None, typer.Option("--settings", help="Settings as a TOML file.")]
 app.add_typer(measuring.measure)
 app.command()(measuring.strain)
+app.command()(reporting.report)
 
 
 @app.command()
@@ -153,7 +154,7 @@ def export(
 
 @app.command()
 def validate(
-    scale: Annotated[float, typer.Option(min=0.1, max=1.0, help="Image size; 1 is 2464 x 3280 px.")] = 0.25,
+    scale: Annotated[float, typer.Option(min=0.1, max=1.0, help="Image size; 1 is 2464 x 3280 px.")] = 1.0,
     out: Annotated[Path, typer.Option(help="Folder for images, sessions and tables; kept for the next run.")] = Path(
         "ringdic-validate"
     ),

@@ -29,7 +29,7 @@ Lost points
 The rooms
 ---------
 ``session`` and ``rig`` read what was captured; ``images`` decodes; ``calibration`` finds the cameras;
-``correlation`` matches images; ``triangulation`` lifts matches into space; ``deformation`` and ``rigid_motion``
-turn positions into strain; ``results`` and ``export`` keep them. Stages do not know one another: ``pipeline`` is
-the only place that joins them.
+``correlation`` matches images; ``triangulation`` lifts matches into space; ``multiview`` measures one surface from
+all cameras together; ``deformation`` and ``rigid_motion`` turn positions into strain; ``results`` and ``export`` keep
+them. Stages do not know one another: ``pipeline`` is the only place that joins them.
 """

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from processing.errors import InputError
 from processing.fields import Field, StepFields, available, field, seth_hill_fields
 from processing.mesh import Mesh
-from processing.ranges import Ranges
+from processing.ranges import Ranges, even_limits
 from processing.results import Results, read_results
 from processing.strain_window import StrainWindow, strain_window
+from processing.uncertainty.window import WindowScatter
 
 Array = NDArray[np.float64]
 
@@ -58,11 +59,12 @@ class Evaluation:
 
 
 class Evaluated:
-    """Results under an evaluation. Steps are computed when asked for, one at a time."""
+    """Results under an evaluation. Steps are computed when they are asked for, one at a time."""
 
     def __init__(self, results: Results, evaluation: Evaluation = Evaluation()) -> None:
         self.results = results
         self.evaluation = evaluation
+        self._last: tuple[int, StepFields] | None = None
 
     @property
     def steps(self) -> tuple[str, ...]:
@@ -79,7 +81,15 @@ class Evaluated:
     def fields(self) -> tuple[Field, ...]:
         """The fields there are."""
         exponent = self.evaluation.exponent
-        return (*available(self.step(0).names), *(() if exponent is None else seth_hill_fields(exponent)))
+        return (*available(self._names), *(() if exponent is None else seth_hill_fields(exponent)))
+
+    @cached_property
+    def _scatter(self) -> WindowScatter | None:
+        return None if self.window is None else self.results.scatter(self.window)
+
+    @cached_property
+    def _names(self) -> set[str]:
+        return self.step(0).names
 
     def field(self, name: str) -> Field:
         """The field of a name. Raises InputError if these results, so evaluated, do not have it."""
@@ -87,16 +97,21 @@ class Evaluated:
             entry = field(name)
         except KeyError:
             entry = None
-        if entry is None or not set(entry.of) <= self.step(0).names:
+        if entry is None or not set(entry.of) <= self._names:
             known = ", ".join(known.name for known in self.fields)
             hint = "; give a window" if name.startswith("window_") and self.window is None else ""
             raise InputError(f"no field '{name}'; there are {known}{hint}")
         return entry
 
     def step(self, step: int) -> StepFields:
-        """The arrays of a step."""
-        how = self.evaluation
-        return self.results.fields(step, self.window, how.previous, how.rigid_motion_removed)
+        """The arrays of a step; those of the step asked for last are kept."""
+        if self._last is None or self._last[0] != step:
+            how = self.evaluation
+            self._last = (
+                step,
+                self.results.fields(step, self.window, how.previous, how.rigid_motion_removed, self._scatter),
+            )
+        return self._last[1]
 
     def positions(self, step: int) -> Array:
         """Positions of the vertices, (N, 3) mm, NaN where lost; moved back if the rigid motion is removed."""
@@ -118,11 +133,7 @@ class Evaluated:
         ranges = Ranges((entry,))
         for step in range(len(self.steps)):
             ranges.add(self.step(step))
-        low, high = ranges.table()[0]["range"] or (0.0, 1.0)
-        if entry.centre is not None:
-            reach = max(abs(low - entry.centre), abs(high - entry.centre), 1e-6)
-            low, high = entry.centre - reach, entry.centre + reach
-        return (low, high) if high > low else (low - 0.5, low + 0.5)
+        return even_limits(ranges.table()[0]["range"], entry.centre)
 
 
 def evaluated(results_path: Path, evaluation: Evaluation = Evaluation()) -> Evaluated:

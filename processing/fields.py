@@ -20,6 +20,7 @@ from processing import strain
 from processing.deformation import Deformation, deformation
 from processing.rigid_motion import RigidMotion
 from processing.strain_window import StrainWindow
+from processing.uncertainty.window import WindowScatter
 
 Array = NDArray[np.float64]
 
@@ -157,6 +158,10 @@ FIELDS = (
               (f"E{k}", f"sigma_lambda{k}"), _strain_sigma)
         for k in (1, 2)
     ),
+    *(
+        Field(f"window_sigma_lambda{k}", f"Window: Standard deviation of λ{k}", "", "face", None, False, "Uncertainty")
+        for k in (1, 2)
+    ),
     Field("chi2", "Disagreement of the cameras, χ² a degree of freedom", "", "point"),
     Field("correlation", "Correlation C_LS (0 best)", "", "point"),
     Field("face_correlation", "Correlation C_LS, worst corner", "", "face"),
@@ -245,6 +250,7 @@ def compute_fields(
     certainty: Certainty,
     pair: NDArray[np.int64],
     window: StrainWindow | None = None,
+    scatter: WindowScatter | None = None,
 ) -> StepFields:
     """All arrays of one step.
 
@@ -253,6 +259,7 @@ def compute_fields(
     reference, current : (N, 3) mm, NaN where lost. faces : (M, 3). pair : (M,).
     to_reference : the motion that takes the step back onto the reference.
     window : the windows of the triangles, for strain over a window beside that of each triangle.
+    scatter : of the windows, for its standard deviations where those of the displacements are known.
     """
     found = deformation(reference, current, faces)
     point = {
@@ -273,8 +280,11 @@ def compute_fields(
     if certainty.sigma_lambda is not None:
         face["sigma_lambda1"], face["sigma_lambda2"] = certainty.sigma_lambda.T
     if window is not None:
-        over = _of_deformation(window.deformation(current, reference))
-        face |= {f"window_{name}": values for name, values in over.items()}
+        over = window.deformation(current, reference)
+        face |= {f"window_{name}": values for name, values in _of_deformation(over).items()}
+        if scatter is not None and certainty.sigma_displacement is not None:
+            sigma = scatter.stretch_sigma(over, certainty.sigma_displacement)
+            face["window_sigma_lambda1"], face["window_sigma_lambda2"] = sigma.T
     return StepFields({name: values for name, values in point.items() if values is not None}, face)
 
 

@@ -62,15 +62,21 @@ class Mesh:
 
     def edges(self) -> tuple[Indices, Indices]:
         """Unique edges (K, 2), smaller vertex first, and the number of triangles at each (K,)."""
-        directed = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-        unique, count = np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
-        return unique, count
+        unique, count = np.unique(self._edge_numbers(), return_counts=True)
+        return np.stack(np.divmod(unique, len(self.vertices)), axis=1), count
 
     def boundary_edges(self) -> Indices:
         """Edges with one triangle, (K, 2), in the direction in which that triangle runs along them."""
-        directed = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-        _, inverse, count = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True)
-        return directed[count[inverse.reshape(-1)] == 1]
+        _, inverse, count = np.unique(self._edge_numbers(), return_inverse=True, return_counts=True)
+        return self._half_edges()[count[inverse.reshape(-1)] == 1]
+
+    def _half_edges(self) -> Indices:
+        return self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+
+    def _edge_numbers(self) -> Indices:
+        """One number for each edge of each triangle, (3M,), the same in both directions; ordered as the edges are."""
+        half = self._half_edges()
+        return half.min(axis=1) * len(self.vertices) + half.max(axis=1)
 
     def whole_faces(self) -> NDArray[np.bool_]:
         """Which triangles have three measured corners and an area. (M,)."""

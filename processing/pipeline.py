@@ -58,9 +58,7 @@ def process_session(path: Path, settings: Settings, report: Report = silent) -> 
     errors, warnings = _usable_pairs(session, ring, steps)
     if settings.surface.method == "global":
         whole = _whole_ring(session, ring, tuple(errors), steps, settings, stages)
-        results, drift = whole.results, whole.drift
-        more_warnings: list[str] = []
-        agreement: dict[str, Any] = {}
+        results, drift, agreement, more_warnings = whole.results, whole.drift, whole.agreement, whole.warnings
     else:
         surfaces, more_warnings = _surfaces(session, ring, tuple(errors), steps, settings, stages)
         results, agreement = pairs_surface(session, ring, surfaces, steps, settings)

@@ -45,16 +45,20 @@ class Projector:
         self._tree = cKDTree(centroids)
         radius = np.linalg.norm(self._corners - centroids[:, None], axis=2).max(axis=1)
         self._within = float(np.hypot(np.quantile(radius, 0.99), reach)) if len(radius) else 0.0
+        at = mesh.vertices[mesh.faces.ravel()]
+        self._low = at.min(axis=0, initial=np.inf) - reach
+        self._high = at.max(axis=0, initial=-np.inf) + reach
 
     def hits(self, points: Array, directions: Array) -> Hits:
         """Where lines through points (n, 3) mm along unit directions (n, 3), outwards, pass the surface."""
-        n, count = len(points), min(_CANDIDATES, len(self._corners))
+        there = np.flatnonzero(((points > self._low) & (points < self._high)).all(axis=1))
+        n, count = len(there), min(_CANDIDATES, len(self._corners))
         if not count or not n:
             return Hits(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
-        near, candidate = self._tree.query(points, k=count, distance_upper_bound=self._within)
+        near, candidate = self._tree.query(points[there], k=count, distance_upper_bound=self._within)
         near, candidate = near.reshape(n, count), candidate.reshape(n, count)
-        point, column = np.nonzero(np.isfinite(near))
-        face = candidate[point, column]
+        row, column = np.nonzero(np.isfinite(near))
+        point, face = there[row], candidate[row, column]
         weights, along = line_hits(points[point], directions[point], self._corners[face])
         hit = (weights > 1e-6).all(axis=1) & (np.abs(along) < self.reach)
         hit &= np.einsum("ni,ni->n", directions[point], self._normals[face]) > self.same_side

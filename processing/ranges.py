@@ -48,3 +48,12 @@ class Ranges:
         if not moving:
             return None, spans
         return [float(min(step[1] for step in moving)), float(max(step[2] for step in moving))], spans
+
+
+def even_limits(span: Sequence[float] | None, centre: float | None) -> tuple[float, float]:
+    """Limits of a colour scale that shows a span: even about the centre where there is one, and never of no width."""
+    low, high = (0.0, 1.0) if span is None else (float(span[0]), float(span[1]))
+    if centre is not None:
+        reach = max(abs(low - centre), abs(high - centre), 1e-6)
+        low, high = centre - reach, centre + reach
+    return (low, high) if high > low else (low - 0.5, low + 0.5)

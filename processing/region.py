@@ -35,11 +35,11 @@ def lattice(size: tuple[int, int], spacing: int, margin: int) -> Lattice:
     return Lattice(np.stack(np.meshgrid(x, y), axis=-1), spacing)
 
 
-def coherent(radius: Array, convincing: Mask, tolerance: float) -> Mask:
+def coherent(radius: Array, convincing: Mask, tolerance: float, least: int = 0) -> Mask:
     """Lattice positions whose radius (rows, columns) mm agrees with the convincing ones around it.
 
     At least three of the 8 neighbours must be convincing, and the radius must lie within ``tolerance`` mm of their
-    median; then the largest connected piece is kept.
+    median; then the largest connected piece is kept, or, where ``least`` is given, every piece of so many positions.
     """
     padded = np.pad(np.where(convincing, radius, np.nan), 1, constant_values=np.nan)
     rows, columns = radius.shape
@@ -58,7 +58,9 @@ def coherent(radius: Array, convincing: Mask, tolerance: float) -> Mask:
     labels_count, labels, stats, _ = cv2.connectedComponentsWithStats(good.astype(np.uint8), connectivity=8)
     if labels_count < 2:
         return np.zeros_like(good)
-    return labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    area = stats[1:, cv2.CC_STAT_AREA]
+    kept = area >= least if least else np.arange(len(area)) == np.argmax(area)
+    return np.asarray(np.append(False, kept)[labels])
 
 
 def contrast(image: NDArray[np.generic], xy: Array, half_width: int) -> Array:

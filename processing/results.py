@@ -40,6 +40,8 @@ from processing.mesh import Mesh
 from processing.ranges import Ranges
 from processing.rigid_motion import RigidMotion, motion_to_reference
 from processing.strain_window import StrainWindow, strain_window
+from processing.uncertainty.strain import overlap
+from processing.uncertainty.window import WindowScatter, window_scatter
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -50,6 +52,7 @@ _KEPT = (
     "displacement", "correlation", "sigma_xyz", "sigma_displacement", "chi2",
     "J", "lambda1", "lambda2", "E1", "E2", "E_tensor", "direction1_reference", "direction1_current", "isotropy",
     "face_correlation", "sigma_lambda1", "sigma_lambda2", "window_lambda1", "window_lambda2", "window_E1", "window_E2",
+    "window_sigma_lambda1", "window_sigma_lambda2",
 )  # fmt: skip
 #: Arrays that are the same at every step.
 _CONSTANT = ("area", "pair")
@@ -134,6 +137,36 @@ class Results:
         """Width of the strain window that the run was told to use; 0 for the triangles alone."""
         return float(tomllib.loads(self.settings).get("strain", {}).get("window_mm", 0.0))
 
+    @property
+    def radius_px(self) -> int | None:
+        """Radius of the subsets that the run was told to use; None where the settings do not say."""
+        return tomllib.loads(self.settings).get("correlation", {}).get("radius_px")
+
+    @property
+    def pixels_a_mm(self) -> float:
+        """How large a mm is in the images, px: the median over the points, across the line of sight of the first camera
+        of each one's pair. NaN where no camera is known."""
+        cameras = {camera.id: camera for camera in self.cameras}
+        scales = [np.empty(0)]
+        for index, pair in enumerate(self.pairs):
+            camera, xyz = cameras.get(pair[0]), self.vertices_ref[self.vertex_pair == index]
+            if camera is not None and len(xyz):
+                across = np.cross(xyz - camera.centre, [0.0, 0.0, 1.0])
+                across *= 0.5 / np.linalg.norm(across, axis=1, keepdims=True)
+                scales.append(np.linalg.norm(camera.project(xyz + across) - camera.project(xyz - across), axis=1))
+        scale = np.concatenate(scales)
+        return float(np.nanmedian(scale)) if np.isfinite(scale).any() else float("nan")
+
+    def scatter(self, window: StrainWindow) -> WindowScatter | None:
+        """What the windows make of the displacements' scatter; None where that or the size of the subsets is unknown.
+
+        Subsets are taken to lie as far apart in the images as the points do on the surface seen squarely.
+        """
+        scale, radius = self.pixels_a_mm, self.radius_px
+        if self.sigma_displacement is None or radius is None or not np.isfinite(scale):
+            return None
+        return window_scatter(window, lambda apart: overlap(apart * scale, radius), (2 * radius + 1) / scale)
+
     def before(self, step: int, previous: bool = False) -> Array:
         """Positions (N, 3) mm that a step is compared with: the reference, or the step before it (NaN where lost)."""
         return self.vertices[step - 1] if previous and step > 0 else self.vertices_ref
@@ -166,8 +199,12 @@ class Results:
         window: StrainWindow | None = None,
         previous: bool = False,
         rigid_motion_removed: bool = False,
+        scatter: WindowScatter | None = None,
     ) -> StepFields:
-        """The arrays of a step that every field follows from; the arguments as of :meth:`deformation`."""
+        """The arrays of a step that every field follows from; the arguments as of :meth:`deformation`.
+
+        scatter : of the windows, for the standard deviations of strain over them.
+        """
         motion, current = self.motion(step, previous), self.vertices[step]
         if rigid_motion_removed:
             motion, current = RigidMotion(np.eye(3), np.zeros(3)), motion.apply(current)
@@ -179,17 +216,20 @@ class Results:
             _at(self.sigma_lambda, of_motion),
             _at(self.chi2, step),
         )
-        return compute_fields(self.before(step, previous), current, self.faces, motion, certainty, self.pair, window)
+        return compute_fields(
+            self.before(step, previous), current, self.faces, motion, certainty, self.pair, window, scatter
+        )
 
 
 def write_results(path: Path, results: Results, progress: Callable[[float], None] = lambda _: None) -> None:
     """Compute all fields and write the file; ``path`` must not exist. ``progress`` is told the share done."""
     window = strain_window(results.mesh, results.window_mm) if results.window_mm > 0 else None
+    scatter = None if window is None else results.scatter(window)
     with h5py.File(path, "x") as file:
         group = vtkhdf.create(file, results.faces, len(results.vertices_ref), len(results.steps))
         ranges: Ranges | None = None
         for step in range(len(results.steps)):
-            fields = results.fields(step, window)
+            fields = results.fields(step, window, scatter=scatter)
             if ranges is None:
                 ranges = Ranges(available(fields.names))
                 for name in _CONSTANT:

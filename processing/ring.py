@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from processing.calibration.advice import camera_advice, pair_advice
 from processing.calibration.bundle import BundleFit, TargetPrior, adjust_ring
 from processing.calibration.camera_calibration import CameraCalibration, calibrate_camera
+from processing.calibration.dots import find_dots
 from processing.calibration.intrinsics import read_intrinsics
 from processing.calibration.quality import (
     CameraQuality,
@@ -32,6 +33,7 @@ from processing.calibration.quality import (
     camera_quality,
     pair_quality,
 )
+from processing.calibration.survey import Sight, sight, survey
 from processing.errors import ComputationError, InputError
 from processing.images import read_gray
 from processing.rig import Rig, Target
@@ -81,11 +83,16 @@ def calibrate_ring(
         for camera in session.rig.cameras
         if camera.id not in target.images
     )
+    rig, turned = _surveyed(session, {id_: target.images[id_] for id_ in taking_part})
+    warnings = (*warnings, *turned)
     done = 0
     calibrated: dict[str, CameraCalibration] = {}
     keys: list[str] = []
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        futures = {id_: pool.submit(_calibrated, session, id_, target.images[id_], settings) for id_ in taking_part}
+        futures = {
+            id_: pool.submit(_calibrated, replace(session, rig=rig), id_, target.images[id_], settings)
+            for id_ in taking_part
+        }
         for id_, future in futures.items():
             calibrated[id_], key = future.result()
             keys.append(key)
@@ -101,6 +108,31 @@ def calibrate_ring(
 def control_points(first: CameraCalibration, second: CameraCalibration) -> ReconstructionError:
     """Reconstruction error of the dots that two cameras both see (Solav et al. 2018, eq. 10-11)."""
     return pair_quality(first, second)[0]
+
+
+def _surveyed(session: Session, images: dict[str, Path]) -> tuple[Rig, tuple[str, ...]]:
+    """The rig with the azimuths at which the cameras stand, from the session's folder if they are there; sentences."""
+    target = session.rig.target
+    cameras = {camera.id: camera for camera in session.rig.cameras if camera.id in images}
+    digest = hashlib.sha256(f"{_VERSION} {target} {list(cameras.values())}".encode())
+    for path in images.values():
+        digest.update(hashlib.sha256(path.read_bytes()).digest())
+    kept = session.path / "calibration" / f"survey-{digest.hexdigest()[:16]}.json"
+    if kept.is_file():
+        values = json.loads(kept.read_text(encoding="utf-8"))
+    else:
+
+        def seen(id_: str) -> Sight:
+            image = read_gray(images[id_])
+            return sight(image, find_dots(image, target), cameras[id_], target)
+
+        with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+            found = survey(dict(zip(cameras, pool.map(seen, cameras), strict=True)), target)
+        values = {"azimuths": found.azimuths, "warnings": list(found.warnings)}
+        _keep(kept, values)
+    azimuths = values["azimuths"]
+    entries = (replace(c, azimuth_deg=azimuths.get(c.id, c.azimuth_deg)) for c in session.rig.cameras)
+    return replace(session.rig, cameras=tuple(entries)), tuple(values["warnings"])
 
 
 def _judged(rig: Rig, ring: Ring) -> Ring:

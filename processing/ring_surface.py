@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.camera import Camera
-from processing.correlation import CorrelationSettings
+from processing.correlation import CorrelationSettings, Status
 from processing.errors import ComputationError
+from processing.multiview.certainty import certainty
 from processing.multiview.motion import CameraTrack, Motion, measure_motion
 from processing.multiview.shape import ReferenceShape, ShapeSettings, reference_shape
 from processing.multiview.tracking import Tracking
@@ -23,6 +25,7 @@ from processing.outliers import Lost
 from processing.results import Matches, Results
 from processing.settings import Settings
 from processing.sweep import Search
+from processing.triangulation import reprojection_residuals
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -35,10 +38,17 @@ _SHAPE_SHARE = 0.5  # of the time, with few steps
 
 @dataclass(frozen=True)
 class RingSurface:
-    """Results and, for each camera, the mean vertical residual of each step, px."""
+    """Results, how well the cameras agree, and a sentence for each that took no part.
+
+    drift : (F,) px for each camera, the mean vertical residual of each step. agreement : views a point, RMS residual of
+    the cameras at the reference (px), and the places of the surface that two cameras see and none could be matched in,
+    by the reason.
+    """
 
     results: Results
     drift: dict[str, Array]
+    agreement: dict[str, Any]
+    warnings: list[str]
 
 
 def ring_surface(
@@ -76,6 +86,8 @@ def ring_surface(
         ),
         lambda share, what: tell(shape_share * share, what, ""),
     )
+    if not len(shape.faces):
+        raise ComputationError("too few neighbouring points of the surface were measured to make a triangle")
     rate = f"{shape.made / shape.seconds:,.0f} points/s" if shape.seconds else ""
     motion = measure_motion(
         cameras,
@@ -88,12 +100,54 @@ def ring_surface(
         settings.surface.sigma_max_px,
         lambda share, what: tell(shape_share + (1 - shape_share) * share, what, rate),
     )
-    if not len(shape.faces):
-        raise ComputationError("too few neighbouring points of the surface were measured to make a triangle")
+    residuals = reprojection_residuals(cameras, shape.xyz, shape.px)
     return RingSurface(
         _results(rig, cameras, pairs, steps, shape, motion, settings),
-        {camera.id: motion.drift[:, k] for k, camera in enumerate(cameras)},
+        _drift(cameras, residuals, motion),
+        _agreement(shape, residuals),
+        _idle(cameras, shape),
     )
+
+
+def _drift(cameras: Sequence[Camera], residuals: Array, motion: Motion) -> dict[str, Array]:
+    """Mean vertical residuals (F,) px of each camera that took part.
+
+    At the reference they are between the cameras; the points are followed from where the reference puts them, so what
+    the steps show is added.
+    """
+    found = {}
+    for k, camera in enumerate(cameras):
+        own = residuals[k, :, 1]
+        if np.isfinite(own).any():
+            found[camera.id] = float(np.nanmean(own)) + np.concatenate([[0.0], motion.drift[1:, k]])
+    return found
+
+
+def _agreement(shape: ReferenceShape, residuals: Array) -> dict[str, Any]:
+    reasons = {int(reason): reason.name.lower() for kind in (Status, Lost) for reason in kind}
+    lost, count = np.unique(shape.status, return_counts=True)
+    matched = residuals.copy()
+    matched[shape.reference, np.arange(len(shape.xyz))] = np.nan  # whole pixels by definition
+    return {
+        "views": float(np.isfinite(shape.px[..., 0]).sum(axis=0).mean()),
+        "residual_px": float(np.sqrt(np.nanmean(matched**2))),
+        "lattice_mm": list(shape.pieces.lattice.spacing),
+        "lost": {
+            reasons[int(reason)]: int(number)
+            for reason, number in zip(lost, count, strict=True)
+            if reason not in (Status.GOOD, Status.NOT_REACHED)
+        },
+    }
+
+
+def _idle(cameras: Sequence[Camera], shape: ReferenceShape) -> list[str]:
+    taking_part: Mask = np.asarray(np.isfinite(shape.px[..., 0]).any(axis=1))
+    return [
+        f"camera {camera.id} shares no measured point of the surface with another; check that it sees the specimen, "
+        "that it is in focus, and its mask"
+        for camera, busy in zip(cameras, taking_part, strict=True)
+        if not busy
+    ]
 
 
 def _tracking(settings: Settings) -> Tracking:
@@ -117,9 +171,8 @@ def _results(
     facing, vertex_pair = _facing_pairs(cameras, pairs, shape)
     corners = vertex_pair[shape.faces]
     alike = (corners == corners[:, :1]).all(axis=1)
-    moved = np.einsum("fnii->fni", motion.covariance)
-    at_reference = np.einsum("nii->ni", shape.covariance)
-    lost = motion.status != 0
+    tracking = settings.correlation
+    sure = certainty(cameras, shape, motion, tracking.radius_px, tracking.order)
     with np.errstate(invalid="ignore"):
         chi2 = motion.chi2 / np.where(motion.degrees > 0, motion.degrees, 1)
     return Results(
@@ -133,11 +186,12 @@ def _results(
         pair=np.where(alike, corners[:, 0], -1),
         vertex_pair=vertex_pair,
         correlation=motion.c_ls,
-        sigma_xyz=np.where(lost[..., None], np.nan, np.sqrt(at_reference + moved)),
+        sigma_xyz=sure.position,
         status=motion.status,
         matches=tuple(_matches(cameras, one, shape) for one in motion.tracks),
         settings=settings.to_toml(),
-        sigma_displacement=np.where(lost[..., None], np.nan, np.sqrt(moved)),
+        sigma_displacement=sure.displacement,
+        sigma_lambda=sure.stretches,
         chi2=chi2,
     )
 

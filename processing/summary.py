@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.calibration.quality import ReconstructionError
+from processing.drift import drift_sentences
 from processing.measure.window_study import gauge
 from processing.mesh import Mesh
 from processing.results import Results
@@ -29,7 +30,7 @@ def summarise(
     """Counts, calibration quality and one row of figures a step, as JSON values; ``table`` is for the terminal.
 
     drift : (F,) px by pair or camera, the mean vertical residual of each step: cameras that moved between frames.
-    agreement : of the surfaces of camera pairs, where there are any.
+    agreement : of the surfaces of camera pairs, or of the cameras about the points that all measured together.
     """
     steps = [_step(results, k) for k in range(len(results.steps))]
     control = {
@@ -48,7 +49,7 @@ def summarise(
         "agreement": dict(agreement),
         "strain": _strain(results),
         "steps": steps,
-        "warnings": list(warnings),
+        "warnings": [*warnings, *drift_sentences(drift, results.steps)],
     }
     return {**figures, "table": _table(figures)}
 
@@ -126,6 +127,13 @@ def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
             {
                 "figure": "distance between the surfaces of neighbouring pairs",
                 "value": f"{agreement['mismatch_mm']:.4f} ± {agreement['mismatch_std_mm']:.4f} mm",
+            }
+        )
+    if agreement.get("residual_px") is not None:
+        rows.append(
+            {
+                "figure": "cameras a point, how far they miss it",
+                "value": f"{agreement['views']:.1f}, {agreement['residual_px']:.4f} px",
             }
         )
     strain = figures["strain"]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from processing.camera import Camera
 from processing.correlation import CorrelationSettings, Current, prepare_reference, search_hypotheses
-from processing.proxy import stereo_hypotheses, sweep_radii
+from processing.proxy import on_cylinder, stereo_hypotheses, sweep_radii
 from processing.region import Lattice, coherent, contrast, lattice
 
 # Beside the speckled surface there may be bare skin that matches, but poorly: less contrast than this share of the
@@ -75,30 +75,35 @@ def sweep(
     radii: Array,
     search: Search,
     settings: CorrelationSettings,
+    least: int = 0,
 ) -> Sweep:
     """Look for the surface from the first camera's image in the second's, inside the mask if there is one.
 
-    image : of the first camera. radii : (K,) mm. The lattice is a multiple of the correlation's step.
+    image : of the first camera. radii : (K,) mm. The lattice is a multiple of the correlation's step. least : positions
+    of a connected piece of surface that is kept; 0 keeps the largest alone.
     """
     first, second = cameras
     spacing = settings.step * max(1, round(1.5 * settings.radius / settings.step))
     points = lattice(first.size, spacing, settings.radius + 2)
     shape = points.xy.shape[:2]
     px = points.xy.reshape(-1, 2)
-    hypotheses = stereo_hypotheses(first, second, px, radii, settings.radius)
+    drawn = np.ones(len(px), bool) if mask is None else mask[px[:, 1].astype(int), px[:, 0].astype(int)]
+    met = np.flatnonzero(drawn & np.isfinite(on_cylinder(first, px, radii[-1:])).all(axis=(1, 2)))
+    hypotheses = stereo_hypotheses(first, second, px[met], radii, settings.radius)
     everywhere = prepare_reference(image, np.ones(image.shape, bool), settings)
-    warps, zncc, second_best = search_hypotheses(everywhere, current, px, hypotheses.warps, settings.radius)
-    which = _nearest(hypotheses.warps, warps)
+    found = search_hypotheses(everywhere, current, px[met], hypotheses.warps, settings.radius)
+    nearest = _nearest(hypotheses.warps, found[0])
+    warps, zncc, second_best = (_spread(values, met, len(px)) for values in found)
+    which = np.zeros(len(px), np.int64)
+    which[met] = nearest
     believed = convincing(search, zncc, second_best)
     believed &= (which > 0) & (which < len(radii) - 1)
     if mask is None:
         texture = contrast(image, px, settings.radius)
         usual = float(np.median(texture[believed])) if believed.any() else 0.0
         believed &= texture > _LEAST_CONTRAST * usual
-    else:
-        believed &= mask[px[:, 1].astype(int), px[:, 0].astype(int)]
-    good = coherent(radii[which].reshape(shape), believed.reshape(shape), tolerance=2.0)
-    xyz = hypotheses.xyz[np.arange(len(px)), which].reshape(*shape, 3)
+    good = coherent(radii[which].reshape(shape), believed.reshape(shape), tolerance=2.0, least=least)
+    xyz = _spread(hypotheses.xyz[np.arange(len(met)), nearest], met, len(px)).reshape(*shape, 3)
     return Sweep(points, px, warps, xyz, good)
 
 
@@ -106,6 +111,13 @@ def convincing(search: Search, zncc: Array, second_best: Array) -> Mask:
     """Matches (n,) of a sweep that look alike enough, and more so than any other place on the line."""
     with np.errstate(invalid="ignore"):
         return np.asarray((zncc > search.zncc_min) & (second_best < 0.9 * zncc))
+
+
+def _spread(values: Array, index: NDArray[np.int_], count: int) -> Array:
+    """Values (k, ...) of some of ``count`` points in an array of all, NaN for the others."""
+    out = np.full((count, *values.shape[1:]), np.nan)
+    out[index] = values
+    return out
 
 
 def _nearest(candidates: Array, chosen: Array) -> NDArray[np.int_]:

@@ -61,15 +61,15 @@ def non_manifold_edges(mesh: Mesh) -> Indices:
 
 def inconsistent_edges(mesh: Mesh) -> Indices:
     """Edges (K, 2) along which two triangles run in the same direction: one of them is turned over."""
-    directed = _half_edges(mesh.faces)
-    unique, count = np.unique(directed, axis=0, return_counts=True)
-    return unique[count > 1]
+    half = _half_edges(mesh.faces)
+    unique, count = np.unique(half[:, 0] * len(mesh.vertices) + half[:, 1], return_counts=True)
+    return np.stack(np.divmod(unique[count > 1], len(mesh.vertices)), axis=1)
 
 
 def non_manifold_vertices(mesh: Mesh) -> Indices:
     """Vertices (K,) where triangles meet in more than one fan: two pieces or two borders touch in a point."""
-    each = np.unique(np.column_stack([mesh.faces.ravel(), fans(mesh)]), axis=0)
-    vertices, count = np.unique(each[:, 0], return_counts=True)
+    _, corner = np.unique(fans(mesh), return_index=True)
+    vertices, count = np.unique(mesh.faces.ravel()[corner], return_counts=True)
     return vertices[count > 1]
 
 

@@ -65,7 +65,7 @@ def table_1(rings: Mapping[str, Ring], true: Mapping[str, Camera], scale: float)
         figures += [
             Figure("Table 1", f"{name}, mean", unit, means, shown, digits=digits),
             Figure("Table 1", f"{name}, STD over cameras", unit, spread, deviation, digits=digits),
-            Figure("Table 1", f"{name}, RMS error", unit, rms, digits=digits),
+            Figure("Table 1", f"{name}, RMS error", unit, rms, digits=digits + 1),
         ]
     return Findings(tuple(figures), {"true": truth, **inner})
 

@@ -59,8 +59,10 @@ class Darkroom:
 
     def _take(self, shot: Shot) -> None:
         path = self.path(shot)
+        if path.is_file():  # another process was faster
+            return
         coding = _PNG if shot.jpeg is None else [cv2.IMWRITE_JPEG_QUALITY, shot.jpeg]
         _, coded = cv2.imencode(path.suffix, render(shot.camera, shot.scene, shot.seed), coding)
-        aside = path.with_suffix(".partial")
+        aside = path.with_name(f".{path.stem}-{os.getpid()}.partial")
         aside.write_bytes(coded.tobytes())
         aside.replace(path)

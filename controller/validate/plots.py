@@ -50,7 +50,7 @@ def _table_2(picture: Picture, found: Findings) -> None:
     axes = picture.subplots()
     for k, way in enumerate(_ways(found.curves["rms"])):
         values = np.array(found.curves["rms"][way])
-        axes.bar(np.arange(len(values)) + 0.4 * k, 1000 * values, 0.4, color=_COLOURS[way], label=way)
+        axes.bar(0.8 + np.arange(len(values)) + 0.4 * k, 1000 * values, 0.4, color=_COLOURS[way], label=way)
     _paper(axes, 47.0, "paper: 47 µm", horizontal=True)
     axes.set(xlabel="camera pair", ylabel="RMS of the control points, µm", yscale="log")
     axes.legend()

@@ -7,7 +7,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from controller.validate.figures import Figure
+from controller.validate.figures import BETTER, PAPER, Figure
+
+#: What tells of the systematic errors of calibration and matching is this many times larger the paper's way.
+_SEEN = 3.0
+#: The paper's figures of quality, by experiment and the beginning of their name.
+_QUALITY = (
+    ("Table 2", "control points, RMS"),
+    ("Fig. 6", "5 mm stage: superimposed RMS"),
+    ("Fig. 6", "5 mm stage: length"),
+    ("Fig. 7a", "merging mismatch, mean"),
+    ("Fig. 7b", "displacement, STD, all views, first step"),
+    ("Fig. 7b", "|E|, median, first step"),
+    ("diameter", "bias, all views"),
+)
 
 
 def rows(figures: Sequence[Figure], ways: Sequence[str]) -> list[dict[str, str]]:
@@ -18,6 +31,27 @@ def rows(figures: Sequence[Figure], ways: Sequence[str]) -> list[dict[str, str]]
     return [{name: row[name] for name in filled} for row in table]
 
 
+def blindness(figures: Sequence[Figure]) -> list[dict[str, str]]:
+    """Which figures of quality see that the paper's way is wrong: rows of both ways' magnitudes and a verdict."""
+    table = []
+    for experiment, name in _QUALITY:
+        for figure in figures:
+            both = {PAPER, BETTER} <= figure.values.keys()
+            if figure.experiment != experiment or not figure.quantity.startswith(name) or not both:
+                continue
+            paper, better = abs(figure.values[PAPER]), abs(figure.values[BETTER])
+            table.append(
+                {
+                    "figure": f"{experiment}: {figure.quantity}",
+                    "paper": figure.paper,
+                    PAPER: figure.text(paper),
+                    BETTER: figure.text(better),
+                    "sees the errors": "yes" if paper > _SEEN * better else "no",
+                }
+            )
+    return table
+
+
 def summary(figures: Sequence[Figure], about: Mapping[str, Any]) -> dict[str, Any]:
     """Everything as JSON values."""
     judged = [figure for figure in figures if figure.reached is not None]
@@ -26,6 +60,7 @@ def summary(figures: Sequence[Figure], about: Mapping[str, Any]) -> dict[str, An
         "reached": sum(bool(figure.reached) for figure in judged),
         "aimed_at": len(judged),
         "missed": [f"{figure.experiment}: {figure.quantity}" for figure in judged if not figure.reached],
+        "blindness": blindness(figures),
         "figures": [figure.to_dict() for figure in figures],
     }
 
@@ -41,8 +76,6 @@ def write(
 
 
 def _page(figures: Sequence[Figure], ways: Sequence[str], found: Mapping[str, Any], plots: Mapping[str, Path]) -> str:
-    table = rows(figures, ways)
-    head = list(table[0]) if table else []
     lines = [
         "# The paper's experiments on the virtual rig",
         "",
@@ -50,16 +83,22 @@ def _page(figures: Sequence[Figure], ways: Sequence[str], found: Mapping[str, An
         f"{found['radius_px']} px, step {found['step_px']} px; {found['reached']} of {found['aimed_at']} aims reached.",
         "The paper: D. Solav et al., IEEE Access 6 (2018) 30520.",
         "",
-        "| " + " | ".join(head) + " |",
-        "|" + "---|" * len(head),
-        *("| " + " | ".join(row[name].replace("|", "\\|") for name in head) + " |" for row in table),
-        "",
+        *_table(rows(figures, ways)),
         *(f"{figure.experiment}, {figure.quantity}: {figure.note}" for figure in figures if figure.note),
         "",
+    ]
+    blind = blindness(figures)
+    if blind:
+        lines += ["## Which figures see the systematic errors of the paper's way", "", *_table(blind)]
+    lines += [
         *(f"![{name}]({path.name})" for name, path in plots.items()),
         "",
-        "| step | seconds |",
-        "|---|---|",
-        *(f"| {name} | {value} |" for name, value in found["seconds"].items()),
+        *_table([{"step": name, "seconds": f"{value:.1f}"} for name, value in found["seconds"].items()]),
     ]
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines)
+
+
+def _table(table: Sequence[Mapping[str, str]]) -> list[str]:
+    head = list(table[0]) if table else []
+    rows = ("| " + " | ".join(row[name].replace("|", "\\|") for name in head) + " |" for row in table)
+    return ["| " + " | ".join(head) + " |", "|" + "---|" * len(head), *rows, ""]

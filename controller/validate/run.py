@@ -62,6 +62,7 @@ def run_validation(
     for experiment in dict.fromkeys(figure.experiment for figure in shown):
         own = [figure for figure in shown if figure.experiment == experiment]
         show_table(experiment, report.rows(own, list(ways)))
+    show_table("which figures see the systematic errors of the paper's way", report.blindness(shown))
     say(f"{written['reached']} of {written['aimed_at']} aims reached; tables and plots in {folder}")
     return written
 

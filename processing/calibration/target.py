@@ -163,6 +163,42 @@ def identify(
     return DotObservations(camera, rows, columns, dots.px[found], xyz, azimuth, numbering.margin)
 
 
+def possible_azimuths(dots: Dots, target: Target, rotation_deg: float = 0.0) -> Array:
+    """Azimuths, degrees, at which the camera may stand by its own image alone, best first: one where it sees the seam
+    or an edge of the columns, else one for each column. Empty where no lattice on a cylinder is seen.
+    """
+    upright = _upright(dots, rotation_deg)
+    spots, rows, columns = lattice.walk(upright, target)
+    if len(spots) < DOTS_NEEDED or len(np.unique(columns)) < COLUMNS_NEEDED:
+        return np.zeros(0)
+    bend = _find_bend(upright[spots], dot_points(target, rows + 1, columns + 1))
+    upright = _straightened(upright, bend)
+    last = target.columns if _closed(target) else target.columns - int(columns.max())
+    found = []
+    for shift in range(1, last + 1):
+        number = (columns + shift - 1) % target.columns + 1
+        xyz = dot_points(target, rows + 1, number)
+        try:
+            L = dlt.solve_dlt(xyz, upright.px[spots])
+            centre = Camera("", dlt.to_projection(L), (1, 1)).centre
+        except (ComputationError, np.linalg.LinAlgError):
+            continue
+        off = float(np.mean(np.linalg.norm(dlt.residuals(L, xyz, upright.px[spots]), axis=1)))
+        if np.hypot(centre[0], centre[1]) > target.radius_mm:
+            found.append((off, math.degrees(math.atan2(centre[1], centre[0])) % 360.0))
+    # A numbering that puts the seam, or none, where it is not leaves a column off its place.
+    best = min(found, default=(0.0, 0.0))[0]
+    if best > 0.25 * float(np.median(upright.height[spots])):
+        return np.zeros(0)
+    return np.array([azimuth for off, azimuth in sorted(found) if off <= 1.5 * best + 0.1])
+
+
+def _closed(target: Target) -> bool:
+    """Whether the columns go all the way round."""
+    step = math.degrees(target.column_angle)
+    return 360.0 - (target.columns - 1) * step < 1.6 * step
+
+
 def _prepared(dots: Dots, intrinsics: Intrinsics | None, rotation_deg: float) -> tuple[Dots, Dots]:
     """Dots that the lens can show, and the same undistorted, where it is known, and turned upright."""
     if intrinsics is None:
@@ -331,8 +367,7 @@ def _try(
     The rows are counted from any row at first: a target shifted by a row is the same camera shifted in height. That
     camera says where further rows must be, whether or not the lattice reached them.
     """
-    step = math.degrees(target.column_angle)
-    if 360.0 - (target.columns - 1) * step < 1.6 * step:  # the columns go all the way round
+    if _closed(target):
         columns = (columns - 1) % target.columns + 1
     inside = (columns >= 1) & (columns <= target.columns)
     spots, rows, columns = spots[inside], rows[inside], columns[inside]

@@ -8,6 +8,7 @@ them. The room knows images, masks and points only: no camera, no calibration, n
 ``propagation``  from matched points to their neighbours, in waves
 ``neighbours``   the neighbours' judgement: prediction, outliers, islands
 ``seeds``        first matches in time; ``features`` first matches between cameras
+``quadratic``    a quadratic of any field over the neighbours of each point
 ``hypotheses``   many given warps tried at each point, for start values that come from geometry
 ``command``      the same for two files
 """

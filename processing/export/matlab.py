@@ -15,6 +15,7 @@ from processing.errors import InputError
 from processing.evaluation import Evaluated
 from processing.export.arrays import arrays
 from processing.rigid_motion import RigidMotion
+from processing.strain_window import StrainWindow
 
 log = logging.getLogger(__name__)
 
@@ -27,8 +28,9 @@ def export_mat(seen: Evaluated, out: Path) -> None:
 
     ``DIC3DPPresults`` : the structure that MultiDIC's post-processing makes and its plots read: Points3D, Faces, Disp,
     RBM, Deform and their like as cells with one entry a step, the same with ``_ARBM`` after the rigid motion has been
-    taken out. Beside it the arrays of the npz: ``faces`` and ``pair`` count from 1 (0: a face joins two pairs);
-    ``steps`` and ``settings`` are text. Deformation is in single precision.
+    taken out, and Deform_window over the strain window if there is one; deformation in single precision. Beside it the
+    arrays of the npz: ``faces`` and ``pair`` count from 1 (0: a face joins two pairs); ``steps`` and ``settings`` are
+    text.
 
     Raises InputError where a level 5 file cannot hold it.
     """
@@ -48,17 +50,21 @@ def post_processing(seen: Evaluated) -> dict[str, Any]:
     results = seen.results
     F = len(results.steps)
     structure = _surface(seen)
-    a_step = len(results.faces) * 4 * _floats_a_face()
-    if F * a_step > _LARGEST:
+    bytes_each = F * len(results.faces) * 4 * _floats_a_face()
+    if bytes_each > _LARGEST:
         raise InputError(
             f"{F} steps of {len(results.faces):,} triangles are more than a MAT file of level 5 can hold; "
             "export npz or vtkhdf"
         )
-    structure["Deform"] = _deform(seen, rigid_motion_removed=False)
-    if 2 * F * a_step <= _LARGEST:
-        structure["Deform_ARBM"] = _deform(seen, rigid_motion_removed=True)
-    else:
-        log.warning("Deform_ARBM is left out: with it, the file would be larger than MATLAB's level 5 allows")
+    wanted: list[tuple[str, bool, StrainWindow | None]] = [("Deform", False, None)]
+    if seen.window is not None:
+        wanted.append(("Deform_window", False, seen.window))
+    wanted.append(("Deform_ARBM", True, None))
+    room = _LARGEST // bytes_each
+    for name, removed, window in wanted[:room]:
+        structure[name] = _deform(seen, removed, window)
+    for name, _, _ in wanted[room:]:
+        log.warning("%s is left out: with it, the file would be larger than MATLAB's level 5 allows", name)
     return structure
 
 
@@ -97,12 +103,10 @@ def _surface(seen: Evaluated) -> dict[str, Any]:
     }
 
 
-def _deform(seen: Evaluated, rigid_motion_removed: bool) -> dict[str, Any]:
+def _deform(seen: Evaluated, rigid_motion_removed: bool, window: StrainWindow | None) -> dict[str, Any]:
     how = seen.evaluation
     removed = rigid_motion_removed or how.rigid_motion_removed
-    steps = [
-        _named(seen.results.deformation(step, removed, how.previous, seen.window)) for step in range(len(seen.steps))
-    ]
+    steps = [_named(seen.results.deformation(step, removed, how.previous, window)) for step in range(len(seen.steps))]
     return {name: _cells([step[name] for step in steps]) for name in steps[0]}
 
 

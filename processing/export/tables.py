@@ -39,7 +39,7 @@ def _write(path: Path, columns: list[tuple[str, NDArray[np.generic]]]) -> None:
         if np.issubdtype(values.dtype, np.integer):
             texts.append([str(value) for value in values])
         else:
-            digits = ".6f" if values.dtype == np.float64 else ".7g"
+            digits = ".6f" if values.dtype == np.float64 else ".9g"
             texts.append(["" if np.isnan(value) else format(value, digits) for value in values.tolist()])
     with path.open("w", encoding="utf-8", newline="") as file:
         file.write(",".join(header for header, _ in columns) + "\n")

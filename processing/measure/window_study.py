@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,7 +17,6 @@ from processing.strain_window import Gauge, StrainWindow, strain_window
 Array = NDArray[np.float64]
 
 _RADIUS_PX = 20  # of a subset, where the results do not tell
-_PROBE = 0.5  # mm, by which points are moved to see how large a mm is in an image
 
 
 def window_study(results: Results, widths: Sequence[float], previous: bool = False) -> Table:
@@ -55,27 +53,8 @@ def gauge(results: Results, width: float) -> Gauge:
     step = (
         float(np.median(np.linalg.norm(np.diff(mesh.vertices[edges], axis=1)[:, 0], axis=1))) if len(edges) else np.nan
     )
-    radius = tomllib.loads(results.settings).get("correlation", {}).get("radius_px", _RADIUS_PX)
-    return Gauge(float(width), step, (2 * radius + 1) / _pixels_a_mm(results))
-
-
-def _pixels_a_mm(results: Results) -> float:
-    cameras = {camera.id: camera for camera in results.cameras}
-    scales = [np.empty(0)]
-    for index, pair in enumerate(results.pairs):
-        xyz = results.vertices_ref[results.vertex_pair == index]
-        camera = cameras.get(pair[0])
-        if camera is None or not len(xyz):
-            continue
-        sight = xyz - camera.centre
-        across = np.cross(sight, [0.0, 0.0, 1.0])
-        across *= _PROBE / np.linalg.norm(across, axis=1, keepdims=True)
-        scales.append(
-            np.linalg.norm(camera.project(xyz + across) - camera.project(xyz - across), axis=1) / (2 * _PROBE)
-        )
-    scale = np.concatenate(scales)
-    scale = scale[np.isfinite(scale)]
-    return float(np.median(scale)) if len(scale) else float("nan")
+    radius = _RADIUS_PX if results.radius_px is None else results.radius_px
+    return Gauge(float(width), step, (2 * radius + 1) / results.pixels_a_mm)
 
 
 def _points(window: StrainWindow | None) -> float:

@@ -139,7 +139,7 @@ def _without_overlap(
     reach, gap = seam.layers * edge, seam.gap * edge
     covered = cover(mesh, owner, reach)
     lost = np.isnan(correlation)
-    bad = badness(mesh, covered, np.where(lost, 0.0, correlation), weights)
+    bad = badness(mesh, owner, covered, np.where(lost, 0.0, correlation), weights)
     bad[lost] += 1 + np.ptp(bad)
     over = np.stack([covered.own, covered.other], axis=1)
     # First what covers one another's middles, then, of the little that is left, what overlaps or is too close at all.

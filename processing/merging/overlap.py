@@ -100,12 +100,12 @@ def _separation(first: Array, second: Array, normal: Array) -> Array:
     return widest
 
 
-def badness(mesh: Mesh, covered: Cover, correlation: Array, weights: Mapping[str, float]) -> Array:
+def badness(mesh: Mesh, owner: Indices, covered: Cover, correlation: Array, weights: Mapping[str, float]) -> Array:
     """How bad each triangle is, (M,), in medians over the overlaps: the weighted sum of the measures.
 
-    correlation : (M,) C_LS of the triangles. Measures: ``correlation``; ``distance`` to the other surfaces;
-    ``orientation``, the angle to the other surfaces' normals; ``margin``, how near the triangle lies to the border of
-    its own surface, where it was seen at the steepest angles.
+    owner : (M,) surface of each triangle. correlation : (M,) its C_LS. Measures: ``correlation``; ``distance`` to the
+    other surfaces; ``orientation``, the angle to the other surfaces' normals; ``margin``, how near the triangle lies
+    to the border of its own surface, where it was seen at the steepest angles.
     """
     M = len(mesh.faces)
     hits = np.bincount(covered.own, minlength=M)
@@ -123,7 +123,7 @@ def badness(mesh: Mesh, covered: Cover, correlation: Array, weights: Mapping[str
             usual = float(np.median(smooth[hidden])) if hidden.any() else 0.0
             total += weights[name] * smooth / (usual or 1.0)
     if weights.get("margin", 0.0):
-        depth = _rows_from_border(beside)
+        depth = _from_border(mesh, owner)
         usual = float(np.median(depth[hidden])) if hidden.any() else 0.0
         total -= weights["margin"] * depth / (usual or 1.0)
     return total
@@ -140,14 +140,15 @@ def _smoothed(values: Array, known: Mask, beside: Indices) -> Array:
     return np.asarray(total / np.maximum(weight, 1e-300) * (weight > 0))
 
 
-def _rows_from_border(beside: Indices) -> Array:
-    """Number of triangles to cross to the border, (M,): 0 for a triangle at it."""
-    depth = np.where((beside < 0).any(axis=1), 0, np.iinfo(np.int64).max // 2)
-    while True:
-        nearer = np.minimum(depth, np.where(beside >= 0, depth[beside], depth.max(initial=0)).min(axis=1) + 1)
-        if (nearer == depth).all():
-            return depth.astype(float)
-        depth = nearer
+def _from_border(mesh: Mesh, owner: Indices) -> Array:
+    """Distance of each triangle from the border of its own surface, (M,) mm; 0 for a closed surface."""
+    centroids, distance = mesh.centroids, np.zeros(len(mesh.faces))
+    for k in range(owner.max(initial=-1) + 1):
+        part = owner == k
+        border = Mesh(mesh.vertices, mesh.faces[part]).boundary_edges()
+        if len(border):
+            distance[part] = cKDTree(mesh.vertices[border].mean(axis=1)).query(centroids[part])[0]
+    return distance
 
 
 def peel(faces: Indices, alive: Mask, competing: Indices, bad: Array) -> Mask:

@@ -30,10 +30,12 @@ _PATIENCE = 20  # iterations of the first of two passes
 _ENOUGH = 0.5  # share of the start values that must hold before the images are searched for others
 _LEAST_EXCESS = 0.1  # of a second-order subset's variance, beyond that of the same subset of first order
 _OVERLAP = 1.2  # subsets share pixels: a mean of several is this much less certain than of independent ones
+_BIASED = 4.0  # Σ(b/σ)² of a bias below which it may be noise, of 2 numbers
+_CURVED = 20.0  # the same of second derivatives, of 6 numbers of overlapping subsets
 _LEFT = 0.25  # share of the bias that may be left: the neighbourhood is wider than the subset
 _SCATTERS = 8.0  # a point this many times off its neighbours' quadratic contradicts it
 _LEAST_OFF = 0.1  # px, and never less than this
-_UNLIKE = 8.0  # a mean square difference this many times the usual one is not noise
+_UNLIKE = 3.0  # a mean square difference this many times the usual one is not noise, which stays below 2
 
 
 @dataclass(frozen=True)
@@ -41,12 +43,13 @@ class Followed:
     """n points of one image in another; NaN where status is not 0.
 
     warp : (n, 12) at the points: u v ux uy vx vy and uxx uxy uyy vxx vxy vyy. sigma : (n, 2) px of u v.
-    c_ls : (n,). status : (n,), see ``Status``.
+    c_ls : (n,). rest : (n,), mean square difference of the two subsets, grey levels². status : (n,), see ``Status``.
     """
 
     warp: Array
     sigma: Array
     c_ls: Array
+    rest: Array
     status: NDArray[np.int64]
 
     @property
@@ -56,7 +59,7 @@ class Followed:
 
     def part(self, index: NDArray) -> Followed:
         """Some of the points, by indices or a mask."""
-        return Followed(self.warp[index], self.sigma[index], self.c_ls[index], self.status[index])
+        return Followed(self.warp[index], self.sigma[index], self.c_ls[index], self.rest[index], self.status[index])
 
 
 def follow(
@@ -141,7 +144,7 @@ def _fitted(found: Correlation, around: Neighbourhoods) -> QuadraticFit:
     """The quadratics of the displacement, points that contradict it left out."""
     uv, sigma = found.uv, np.hypot(*found.sigma.T)
     fit = around.fit(uv, sigma)
-    odd = _contradicts(fit)
+    odd = contradicts(fit)
     return around.fit(np.where(odd[:, None], np.nan, uv), sigma) if odd.any() else fit
 
 
@@ -150,21 +153,21 @@ def _held(fit: QuadraticFit, found: Correlation, radius: int) -> Array:
 
     A wrong second derivative δ moves a round first-order subset of radius r by δ r²/8, the mean of δ x²/2 over it.
     """
-    curvature = fit.curvature.reshape(-1, 6)
-    with np.errstate(invalid="ignore"):
+    size = np.hypot(*found.sigma.T)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sigma = (found.sigma / size[:, None])[:, :, None] * fit.curvature_sigma[:, None, :]
         harm = fit.curvature_sigma.max(axis=1) * radius**2 / 8.0
-        known = np.isfinite(curvature).all(axis=1) & (harm < np.hypot(*found.sigma.T))
+        known = np.isfinite(fit.curvature).all(axis=(1, 2)) & (harm < size)
     if not known.any():
-        return np.zeros_like(curvature)
+        return np.zeros((len(size), 6))
+    curvature = fit.curvature[known].reshape(-1, 6)
+    curvature *= _clear(curvature, sigma[known].reshape(-1, 6), _CURVED)
     _, nearest = cKDTree(found.xy[known]).query(found.xy)
-    return np.asarray(curvature[known][nearest])
+    return np.asarray(curvature[nearest])
 
 
 def _unbiased(first: Correlation, second: Correlation, around: Neighbourhoods) -> Correlation:
-    """The second pass less the smooth part of its difference from the first, as far as that is more than noise.
-
-    The part b̂ taken off is b³/(b² + s²) for a difference b of uncertainty s: all of a clear bias, none of noise.
-    """
+    """The second pass less the smooth part of its difference from the first, as far as that is more than noise."""
     difference = second.uv - first.uv
     with np.errstate(invalid="ignore"):
         each = np.sqrt(np.maximum(first.sigma**2 - second.sigma**2, _LEAST_EXCESS * first.sigma**2))
@@ -172,15 +175,25 @@ def _unbiased(first: Correlation, second: Correlation, around: Neighbourhoods) -
     fit = around.fit(difference, size)
     with np.errstate(invalid="ignore", divide="ignore"):
         s = _OVERLAP * fit.value_sigma[:, None] * each / size[:, None]
-        share = fit.value**2 / (fit.value**2 + s**2)
-    known = np.isfinite(share).all(axis=1) & second.good
+    share = _clear(fit.value, s, _BIASED)
+    known = np.isfinite(fit.value).all(axis=1) & np.isfinite(s).all(axis=1) & second.good
     uv = np.where(known[:, None], second.uv - share * fit.value, second.uv)
-    doubt = np.hypot(share * s, _LEFT * share * fit.value)
+    doubt = share * np.hypot(s, _LEFT * fit.value)
     sigma = np.where(known[:, None], np.hypot(second.sigma, doubt), second.sigma)
     return replace(second, uv=uv, sigma=sigma)
 
 
-def _contradicts(fit: QuadraticFit) -> NDArray[np.bool_]:
+def _clear(values: Array, sigma: Array, limit: float) -> Array:
+    """How much (n, 1) of vectors (n, k) stands clear of their uncertainty: 1 - limit / Σ(v/σ)², or nothing.
+
+    The estimator of James & Stein (1961), its positive part: noise alone gives 0, so it costs nothing.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        squares = np.sum((values / sigma) ** 2, axis=1, keepdims=True)
+        return np.nan_to_num(np.maximum(0.0, 1.0 - limit / squares))
+
+
+def contradicts(fit: QuadraticFit) -> NDArray[np.bool_]:
     """Points (n,) far off the quadratic of their neighbours, measured by the scatter of all."""
     off = np.hypot(*fit.leave_out.T)
     known = np.isfinite(off)
@@ -189,21 +202,23 @@ def _contradicts(fit: QuadraticFit) -> NDArray[np.bool_]:
         return np.asarray(known & (off > max(_LEAST_OFF, _SCATTERS * scatter)))
 
 
-def _unlike(found: Correlation, reference: Reference, radius: int, around: Neighbourhoods) -> NDArray[np.bool_]:
-    """Points (n,) whose subsets differ between the images by far more than those about them: partly covered, or worn.
+def most_unlike(rest: Array, around: Neighbourhoods) -> Array:
+    """The largest mean square difference (n,) of a good match, from those of all, (n,); NaN where nothing is known.
 
-    Compared are mean square differences in grey levels, C_LS times the variance of the subset: noise leaves the same
+    A point whose subsets differ by far more than those about it is partly covered, or worn. Noise leaves the same
     in weak and in strong texture, so weak texture is not taken for a difference.
     """
-    good = np.flatnonzero(found.good)
-    if not len(good):
-        return np.zeros(len(found.xy), bool)
+    known = np.isfinite(rest)
+    return _UNLIKE * np.fmax(around.median(rest), np.median(rest[known])) if known.any() else np.full(len(rest), np.nan)
+
+
+def _rest(found: Correlation, reference: Reference, radius: int) -> Array:
+    """C_LS times the variance of the reference's subset, and no less than rounding to whole grey levels makes. (n,)."""
+    good = found.good
     rest = np.full(len(found.xy), np.nan)
-    rest[good] = found.c_ls[good] * _variance(reference, found.xy[good], radius)
-    least = (reference.grey_range / 255.0) ** 2  # rounding to whole grey levels and a little more
-    usual = np.maximum(around.median(rest), max(float(np.median(rest[good])), least))
-    with np.errstate(invalid="ignore"):
-        return np.asarray(rest > _UNLIKE * usual)
+    least = (reference.grey_range / 255.0) ** 2
+    rest[good] = np.maximum(found.c_ls[good] * _variance(reference, found.xy[good], radius), least)
+    return rest
 
 
 def _variance(reference: Reference, xy: Array, radius: int) -> Array:
@@ -224,15 +239,17 @@ def _variance(reference: Reference, xy: Array, radius: int) -> Array:
 def _judged(found: Correlation, reference: Reference, shift: Array, around: Neighbourhoods, radius: int) -> Followed:
     """The matches at the points themselves; those unlike the reference or against their neighbours lost."""
     status = found.status.copy()
-    status[_unlike(found, reference, radius, around)] = Status.LOW_ZNCC
+    rest = _rest(found, reference, radius)
+    status[rest > most_unlike(rest, around)] = Status.LOW_ZNCC
     kept = status == Status.GOOD
     fit = around.fit(np.where(kept[:, None], found.uv, np.nan), np.hypot(*found.sigma.T))
-    status[kept & _contradicts(fit)] = Status.INCONSISTENT
+    status[kept & contradicts(fit)] = Status.INCONSISTENT
     good = status == Status.GOOD
     warp = shifted(_warp(found), -shift)
     return Followed(
         np.where(good[:, None], warp, np.nan),
         np.where(good[:, None], found.sigma, np.nan),
         np.where(good, found.c_ls, np.nan),
+        np.where(good, rest, np.nan),
         status,
     )

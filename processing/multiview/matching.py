@@ -23,6 +23,9 @@ from processing.correlation import (
 from processing.errors import ComputationError
 from processing.multiview.lattice import Pieces
 from processing.multiview.warps import surface_stencil, warps_to
+from processing.uncertainty.matches import match_parts
+from processing.uncertainty.noise import flat_noise
+from processing.uncertainty.texture import Texture, TextureMap, texture_map
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -46,6 +49,8 @@ class Ring:
     masks: Mapping[str, Mask]
     settings: CorrelationSettings
     _filtered: OrderedDict[int, Current] = field(default_factory=OrderedDict)
+    _textures: dict[int, TextureMap] = field(default_factory=dict)
+    _noise: dict[int, float] = field(default_factory=dict)
 
     def grey(self, k: int) -> Image:
         """The image of camera k. ComputationError where it has none."""
@@ -63,6 +68,20 @@ class Ring:
         self._filtered.move_to_end(k)
         return self._filtered[k]
 
+    def texture(self, k: int, px: Array) -> Texture:
+        """What the image of camera k shows about px (n, 2)."""
+        if k not in self._textures:
+            self._textures[k] = texture_map(self.grey(k), self.settings.radius)
+        return self._textures[k].at(px)
+
+    def noise(self, k: int) -> float:
+        """Variance of the grey levels of camera k by noise, from the middle of its image where the body stands."""
+        if k not in self._noise:
+            grey = self.grey(k)
+            height, width = grey.shape
+            self._noise[k] = flat_noise(grey[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4])
+        return self._noise[k]
+
     def reference(self, k: int, px: Array) -> Reference:
         """The image of camera k about px (n, 2), filtered to be searched for."""
         grey = self.grey(k)
@@ -79,12 +98,15 @@ class Ring:
 class NodeMatches:
     """Matches of n nodes in C cameras. px, sigma : (C, n, 2), NaN where a camera has none; c_ls : (C, n).
 
-    The reference camera's pixel is whole and given, its sigma zero. status : (n,), why a node has fewer than two
-    views, 0 where it has.
+    The reference camera's pixel is whole and given, its sigma zero. noise, systematic : (C, n, 2) px, what the noise of
+    each image alone and what is no noise leave uncertain, of the reference camera too. status : (n,), why a node has
+    fewer than two views, 0 where it has.
     """
 
     px: Array
     sigma: Array
+    noise: Array
+    systematic: Array
     c_ls: Array
     status: NDArray[np.int8]
     made: int = 0
@@ -110,6 +132,7 @@ def match_nodes(
     settings = replace(ring.settings, order=order)
     count, n = len(ring.cameras), len(reference)
     px, sigma = np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan)
+    parts = _Parts(np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan), np.zeros(n))
     c_ls, status = np.full((count, n), np.nan), np.full(n, Status.NOT_REACHED, np.int8)
     made, seconds = 0, 0.0
     xyz = pieces.xyz[nodes]
@@ -139,10 +162,37 @@ def match_nodes(
         seconds += found.seconds["refine"]
         who = own[chosen]
         px[b, who], sigma[b, who], c_ls[b, who] = at[chosen] + found.uv, found.sigma, found.c_ls
+        parts.add(ring, (a, b), found, who)
         status[who] = np.where(status[who] == Status.GOOD, Status.GOOD, found.status)
     px[:, status != Status.GOOD] = np.nan
     progress(1.0)
-    return NodeMatches(px, sigma, c_ls, status, made, seconds)
+    return NodeMatches(px, sigma, np.sqrt(parts.noise), np.sqrt(parts.systematic), c_ls, status, made, seconds)
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Variances (C, n, 2) px² by noise and by what is none, and the number (n,) of matches of each node."""
+
+    noise: Array
+    systematic: Array
+    matches: Array
+
+    def add(self, ring: Ring, cameras: tuple[int, int], found: Correlation, nodes: Ints) -> None:
+        """Add the matches found from the first camera to the second. The first has the mean of its nodes' matches.
+
+        Half of what is no noise is laid to either image.
+        """
+        a, b = cameras
+        textures = ring.texture(a, found.xy), ring.texture(b, found.xy + found.uv)
+        parts = match_parts(found.sigma, found.c_ls, textures, (ring.noise(a), ring.noise(b)), found.gradient)
+        self.noise[b, nodes], self.systematic[b, nodes] = parts.current**2, parts.systematic**2 / 2
+        known = np.isfinite(parts.current).all(axis=1) & np.isfinite(parts.reference_systematic).all(axis=1)
+        nodes = nodes[known]
+        share = 1.0 / (self.matches[nodes] + 1.0)[:, None]
+        for total, added in ((self.noise, parts.reference), (self.systematic, parts.reference_systematic / np.sqrt(2))):
+            before = np.nan_to_num(total[a, nodes])
+            total[a, nodes] = before + share * (added[known] ** 2 - before)
+        self.matches[nodes] += 1
 
 
 def _correlate(

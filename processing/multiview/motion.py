@@ -14,8 +14,12 @@ from processing.correlation import CorrelationSettings, Status
 from processing.multiview.agreement import triangulate_agreeing
 from processing.multiview.matching import Image
 from processing.multiview.shape import ReferenceShape
-from processing.multiview.tracking import Tracking, track
+from processing.multiview.tracking import Track, Tracking, track
+from processing.multiview.weights import smooth_sigma
 from processing.outliers import Lost, surface_outliers
+from processing.uncertainty.matches import match_parts
+from processing.uncertainty.noise import camera_noise
+from processing.uncertainty.texture import Texture
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -23,6 +27,7 @@ Mask = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 
+_CELL = 8  # steps of the correlation, side of the squares over which weights are levelled
 _LEAST_SIGMA = 1e-3  # px, what no match is better than
 
 
@@ -30,14 +35,19 @@ _LEAST_SIGMA = 1e-3  # px, what no match is better than
 class CameraTrack:
     """The k points that one camera followed through F steps.
 
-    camera : its index. vertex : (k,) the points. px, sigma : (F, k, 2) px; c_ls, status : (F, k).
-    used : (F, k), whether the position rests on it.
+    camera : its index. vertex : (k,) the points. px, sigma : (F, k, 2) px, sigma with all that is uncertain in it;
+    noise : (F, k, 2) px, of the displacement by the images' noise alone; weight : (F, k, 2) px, sigma level over the
+    image, by which positions are found. grey_noise : variance of the grey levels.
+    c_ls, status : (F, k). used : (F, k), whether the position rests on it.
     """
 
     camera: int
     vertex: Ints
     px: Array
     sigma: Array
+    noise: Array
+    weight: Array
+    grey_noise: float
     c_ls: Array
     status: NDArray[np.int8]
     used: Mask
@@ -97,10 +107,25 @@ def measure_motion(
         with np.errstate(invalid="ignore"):
             uncertain = (found.status == 0) & (found.sigma > sigma_max).any(axis=2)
         status = np.where(uncertain, Lost.UNCERTAIN, found.status).astype(np.int8)
+        texture = shape.textures[k].part(vertex)
+        variance = camera_noise(float(shape.grey_noise[k]), found.c_ls[1:], texture.contrast)
+        noise, sigma = _parted(found, texture, variance)
+        cell = _CELL * correlation.step
+        weight = np.stack([smooth_sigma(x0, np.maximum(one, _LEAST_SIGMA), cell) for one in sigma])
         used = np.zeros(status.shape, bool)
-        tracks.append(CameraTrack(k, vertex, found.px, found.sigma, found.c_ls, status, used))
+        tracks.append(CameraTrack(k, vertex, found.px, sigma, noise, weight, variance, found.c_ls, status, used))
     progress(1.0, "")
     return _triangulated(cameras, shape, tuple(tracks), steps)
+
+
+def _parted(found: Track, texture: Texture, variance: float) -> tuple[Array, Array]:
+    """Standard deviations (F, k, 2) px of the displacements by noise alone, and by all."""
+    noise, total = np.zeros_like(found.sigma), np.zeros_like(found.sigma)
+    for step in range(1, len(found.px)):
+        parts = match_parts(found.sigma[step], found.c_ls[step], (texture, texture), (variance, variance))
+        noise[step] = np.hypot(parts.reference, parts.current)
+        total[step] = np.hypot(noise[step], parts.systematic)
+    return noise, total
 
 
 def _triangulated(
@@ -135,7 +160,7 @@ def _step(cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, step
         good = one.status[step] == 0
         who = one.vertex[good]
         px[one.camera, who] = one.px[step, good]
-        sigma[one.camera, who] = np.maximum(one.sigma[step, good], _LEAST_SIGMA)
+        sigma[one.camera, who] = one.weight[step, good]
         c_ls[one.camera, who] = one.c_ls[step, good]
         status[one.vertex[~good]] = one.status[step, ~good]
     points, used = triangulate_agreeing(cameras, px, sigma)

@@ -25,14 +25,24 @@ from processing.multiview.lattice import Pieces, evaluate, robust_pieces
 from processing.multiview.matching import Image, NodeMatches, Ring, match_nodes
 from processing.multiview.tube import lattice_faces
 from processing.multiview.views import seen
+from processing.multiview.weights import smooth_sigma
 from processing.outliers import Lost
 from processing.sweep import Search, radii_of, sweep
+from processing.uncertainty.texture import Texture, TextureMap
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
+
+_RETRIES = 3
+_PIECE = 6  # places of a sweep that hang together: an obstacle may part the surface in several
+_FEW = 1e-3  # share of the points below which another retry is not worth it
+_REFERENCES = 3  # cameras a node is matched from, one after the other, before it is lost
+
+_CELL = 8  # steps of the correlation, side of the squares over which weights are levelled
+_NOTHING = TextureMap(np.full((1, 1, 5), np.nan, np.float32), 1, (1, 1))  # of a camera without an image
 
 
 @dataclass(frozen=True)
@@ -42,7 +52,8 @@ class ShapeSettings:
     incidence : the steepest view that is used. spacing : of the lattice, 0 for the correlation's step as the cameras
     see it. curvature : "geometry" holds the second derivatives that the measured shape gives each warp; "none" leaves
     flat subsets flat. piece : reach of the smooth pieces. sigma_max : px, the least certain match that is believed.
-    floor : px, what a match between cameras is uncertain by beside the images' noise.
+    floor : px, what a pixel is uncertain by beside noise and what the images' difference shows: the cameras, and a
+    shape that bends otherwise than its pieces do.
     """
 
     incidence: float = 65.0
@@ -50,7 +61,7 @@ class ShapeSettings:
     curvature: str = "geometry"
     piece: float = 6.0
     sigma_max: float = 0.05
-    floor: float = 0.01
+    floor: float = 0.005
 
 
 @dataclass(frozen=True)
@@ -59,7 +70,9 @@ class ReferenceShape:
 
     xyz : (n, 3) mm. node : (n, 2) column and row on the lattice. reference : (n,) index of the camera that the point
     was matched from, where it lies on a whole pixel. px, sigma : (C, n, 2), NaN for a camera that was not used; sigma
-    with the floor in it. covariance : (n, 3, 3) mm². chi2, degrees : (n,). c_ls : (n,), the largest over the cameras.
+    with all that is uncertain in it and level over the image, noise : (C, n, 2) px, of each image's noise alone.
+    textures, grey_noise : of each camera's image at px, and its variance, NaN where it has none. covariance :
+    (n, 3, 3) mm². chi2, degrees : (n,). c_ls : (n,), the largest over the cameras.
     faces : (M, 3), outwards. pieces : the surface as fitted. status : (columns, rows) of all nodes, 0 where measured;
     NOT_REACHED also where there is no surface. made, seconds : matches and the time they took.
     """
@@ -69,6 +82,9 @@ class ReferenceShape:
     reference: Ints
     px: Array
     sigma: Array
+    noise: Array
+    textures: tuple[Texture, ...]
+    grey_noise: Array
     covariance: Array
     chi2: Array
     degrees: Ints
@@ -103,13 +119,10 @@ def reference_shape(
     surface = _Surface(ring, settings, rough_surface(lattice, samples))
     surface.measure(2, 2, lambda share: progress(0.3 + 0.2 * share, "first pass"))
     surface.fit()
-    for _ in range(3):
-        gained = surface.measure(1, 2, lambda _: None, only_lost=True)
-        surface.fit()
-        if gained < 0.002 * surface.known.sum():
-            break
-    progress(0.5, "with the curvature of the shape")
-    surface.measure(correlation.order, len(cameras), lambda share: progress(0.5 + 0.5 * share, "all views"))
+    surface.retry(1, 2, lambda share: progress(0.5 + 0.05 * share, "first pass, lost points"))
+    surface.measure(correlation.order, len(cameras), lambda share: progress(0.55 + 0.4 * share, "all views"))
+    surface.fit()
+    surface.retry(correlation.order, len(cameras), lambda share: progress(0.95 + 0.05 * share, "lost points"))
     return surface.result()
 
 
@@ -125,7 +138,8 @@ def _samples(ring: Ring, pairs: Sequence[tuple[int, int]], search: Search, progr
         progress(k / len(pairs))
         cameras = (ring.cameras[a], ring.cameras[b])
         mask = ring.masks.get(cameras[0].id)
-        seen_at = sweep(cameras, ring.grey(a), ring.current(b), mask, radii_of(cameras, search), search, ring.settings)
+        radii = radii_of(cameras, search)
+        seen_at = sweep(cameras, ring.grey(a), ring.current(b), mask, radii, search, ring.settings, _PIECE)
         found.append(seen_at.xyz[seen_at.good])
         log.debug("cameras %s, %s: %d places of the surface", cameras[0].id, cameras[1].id, len(found[-1]))
     samples = np.concatenate(found)
@@ -146,12 +160,14 @@ class _Surface:
         self.xyz = np.full((columns, rows, 3), np.nan)
         self.px = np.full((count, columns, rows, 2), np.nan)
         self.sigma = np.full((count, columns, rows, 2), np.nan)
+        self.noise = np.full((count, columns, rows, 2), np.nan)
         self.covariance = np.full((columns, rows, 3, 3), np.nan)
         self.chi2 = np.full((columns, rows), np.nan)
         self.degrees = np.zeros((columns, rows), np.int64)
         self.c_ls = np.full((columns, rows), np.nan)
         self.reference = np.full((columns, rows), -1, np.int64)
         self.status = np.full((columns, rows), Status.NOT_REACHED, np.int8)
+        self.tries, self.tried = np.zeros((columns, rows), np.int64), np.zeros((columns, rows), bool)
         self.made, self.seconds = 0, 0.0
 
     @property
@@ -160,7 +176,11 @@ class _Surface:
         return self.status == Status.GOOD
 
     def measure(self, order: int, views: int, progress: Callable[[float], None], only_lost: bool = False) -> int:
-        """Match the nodes that have a piece in up to so many cameras beside the reference; how many are new."""
+        """Match the nodes that have a piece in up to so many cameras beside the reference; how many are new.
+
+        A node is matched from the camera that faces it, or, where that failed, from the next: an obstacle or a
+        reflection in one camera leaves the others.
+        """
         ring, settings = self.ring, self.settings
         sight, cosine = seen(self.pieces, ring.cameras, ring.masks, settings.incidence, 2.0)
         for k, camera in enumerate(ring.cameras):
@@ -169,12 +189,16 @@ class _Surface:
         wanted = (sight.sum(axis=0) >= 2) & np.isfinite(self.pieces.radius)
         if only_lost:
             wanted &= ~self.known
+            self.tries[wanted & self.tried] += 1
+        self.tried |= wanted
         nodes = _indices(wanted)
         if not len(nodes[0]):
             return 0
         rank = np.where(sight, cosine, -1.0)[:, wanted]
-        reference = np.argmax(rank, axis=0)
-        order_of = np.argsort(np.argsort(-rank, axis=0), axis=0)
+        best_first = np.argsort(-rank, axis=0)
+        turn = self.tries[wanted] % np.minimum((rank > 0).sum(axis=0), _REFERENCES)
+        reference = best_first[turn, np.arange(len(turn))]
+        order_of = np.argsort(best_first, axis=0)
         partners = (rank > 0) & (order_of <= views) & (np.arange(len(rank))[:, None] != reference)
         curved = settings.curvature == "geometry" or order == 2
         found = match_nodes(
@@ -185,6 +209,15 @@ class _Surface:
         self.made, self.seconds = self.made + found.made, self.seconds + found.seconds
         log.debug("order %d: %d of %d nodes measured", order, int(self.known[nodes].sum()), len(nodes[0]))
         return int(self.known.sum()) - before
+
+    def retry(self, order: int, views: int, progress: Callable[[float], None]) -> None:
+        """Match the lost nodes again, and those a little beyond the rim, until few are gained."""
+        for k in range(_RETRIES):
+            progress(k / _RETRIES)
+            gained = self.measure(order, views, lambda _: None, only_lost=True)
+            self.fit()
+            if gained < _FEW * self.known.sum():
+                return
 
     def fit(self) -> None:
         """Smooth pieces through the measured nodes; a node off its piece is lost."""
@@ -205,10 +238,13 @@ class _Surface:
 
     def _keep(self, nodes: tuple[Ints, Ints], reference: Ints, found: NodeMatches) -> None:
         settings, cameras = self.settings, self.ring.cameras
+        sigma = np.sqrt(found.noise**2 + found.systematic**2 + settings.floor**2)
         with np.errstate(invalid="ignore"):
-            uncertain: Mask = np.asarray((found.sigma > settings.sigma_max).any(axis=2))
+            uncertain: Mask = np.asarray((sigma > settings.sigma_max).any(axis=2))
+        uncertain[reference, np.arange(len(reference))] = False  # its pixel names the point
         px = np.where(uncertain[..., None], np.nan, found.px)
-        sigma = np.sqrt(found.sigma**2 + settings.floor**2)
+        cell = _CELL * self.ring.settings.step
+        sigma = np.stack([smooth_sigma(at, own, cell) for at, own in zip(px, sigma, strict=True)])
         points, used = triangulate_agreeing(cameras, px, sigma, reference)
         status = np.where(found.status != 0, found.status, 0)
         status = np.where((status == 0) & ~np.isfinite(points.xyz).all(axis=1), Lost.RESIDUAL, status)
@@ -221,23 +257,28 @@ class _Surface:
         self.xyz[nodes] = np.where(good[:, None], points.xyz, np.nan)
         self.px[:, nodes[0], nodes[1]] = np.where(used[..., None], px, np.nan)
         self.sigma[:, nodes[0], nodes[1]] = np.where(used[..., None], sigma, np.nan)
+        self.noise[:, nodes[0], nodes[1]] = np.where(used[..., None], found.noise, np.nan)
         self.covariance[nodes] = points.covariance
         self.chi2[nodes], self.degrees[nodes] = points.chi2, points.degrees
         self.c_ls[nodes] = np.nanmax(np.where(used, found.c_ls, -np.inf), axis=0)
 
     def result(self) -> ReferenceShape:
         """What was measured, without points off the surface and without points in no triangle."""
-        self.fit()
         if not self.known.any():
             raise ComputationError("no point of the surface could be measured in two cameras; check focus and speckle")
         faces, used = lattice_faces(self.xyz)
         node = np.stack(used, axis=1)
+        px, ring = self.px[:, used[0], used[1]], self.ring
+        sees = np.isfinite(px).any(axis=(1, 2))
         return ReferenceShape(
             xyz=self.xyz[used],
             node=node,
             reference=self.reference[used],
-            px=self.px[:, used[0], used[1]],
+            px=px,
             sigma=self.sigma[:, used[0], used[1]],
+            noise=self.noise[:, used[0], used[1]],
+            textures=tuple(ring.texture(k, one) if sees[k] else _NOTHING.at(one) for k, one in enumerate(px)),
+            grey_noise=np.array([ring.noise(k) if sees[k] else np.nan for k in range(len(px))]),
             covariance=self.covariance[used],
             chi2=self.chi2[used],
             degrees=self.degrees[used],

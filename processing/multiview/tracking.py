@@ -28,7 +28,7 @@ from processing.correlation import (
 from processing.correlation.quadratic import Neighbourhoods
 from processing.correlation.seeds import spread
 from processing.errors import InputError
-from processing.multiview.following import Followed, follow, neighbourhoods
+from processing.multiview.following import Followed, contradicts, follow, most_unlike, neighbourhoods
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8] | NDArray[np.uint16]
@@ -252,20 +252,25 @@ class _Points:
             start = np.full((len(chosen), 12), np.nan)
             start[len(lost) :] = _between(self.warp[held], found.warp[held])
         reference = prepare_reference(image, painted(at[chosen], image.shape, self.settings.step), self.settings)
-        since = self._follow(reference, current, at[chosen], start)
-        k = len(lost)
-        recovered = lost[since.good[:k]]
-        log.debug("%d of %d lost points found from the image of step %d", len(recovered), k, step)
-        if not len(recovered):
+        since = self._follow(reference, current, at[chosen], start).part(np.arange(len(lost)))
+        limit = most_unlike(found.rest, self.around)[lost]
+        there = since.good & ~(since.rest > limit)
+        log.debug("%d of %d lost points found from the image of step %d", there.sum(), len(lost), step)
+        if not there.any():
             return found
-        composed = self._composed(recovered, since.part(np.flatnonzero(since.good[:k])))
-        by_way[recovered] = step
-        found = _placed(found, recovered, composed)
+        composed = self._composed(lost[there], since.part(there))
         # Perhaps only the start value was wanting: then the reference itself says more, and nothing adds up.
-        direct = self._follow(self.reference, current, self.x0[recovered], composed.warp, search=False)
-        agree = direct.good & (np.hypot(*(direct.warp - composed.warp)[:, :2].T) < _AGREE)
-        by_way[recovered[agree]] = 0
-        return _placed(found, recovered[agree], direct.part(agree))
+        direct = self._follow(self.reference, current, self.x0[lost[there]], composed.warp, search=False)
+        agree = direct.good & ~(direct.rest > limit[there])
+        agree &= np.hypot(*(direct.warp - composed.warp)[:, :2].T) < _AGREE
+        by_way[lost[there]] = np.where(agree, 0, step)
+        return self._accepted(found, lost[there], _placed(composed, np.flatnonzero(agree), direct.part(agree)))
+
+    def _accepted(self, found: Followed, index: NDArray[np.int64], other: Followed) -> Followed:
+        """The points found, and the points ``index`` (k,) as others found them where they agree with the rest."""
+        both = _placed(found, index, other)
+        odd = contradicts(self.around.fit(both.warp[:, :2], np.hypot(*both.sigma.T)))[index]
+        return _placed(found, index[~odd], other.part(~odd))
 
     def _composed(self, index: NDArray[np.int64], since: Followed) -> Followed:
         """Points ``index`` (k,): their motion until they were last seen, and since."""
@@ -275,7 +280,7 @@ class _Points:
         warp[:, 2:6] = (G @ (np.eye(2) + self.warp[index, 2:6].reshape(-1, 2, 2)) - np.eye(2)).reshape(-1, 4)
         # An error of the position then is carried along by the gradient since.
         variance = np.einsum("nij,nj->ni", G**2, self.sigma[index] ** 2) + since.sigma**2
-        return Followed(warp, np.sqrt(variance), np.fmax(self.c_ls[index], since.c_ls), since.status)
+        return Followed(warp, np.sqrt(variance), np.fmax(self.c_ls[index], since.c_ls), since.rest, since.status)
 
     def _remember(self, step: int, found: Followed, by_way: NDArray[np.int64]) -> None:
         good = found.good
@@ -301,7 +306,7 @@ def _between(first: Array, second: Array) -> Array:
 def _placed(found: Followed, index: NDArray[np.int64], other: Followed) -> Followed:
     """``found`` with the points ``index`` (k,) as in ``other``."""
     arrays = []
-    for name in ("warp", "sigma", "c_ls", "status"):
+    for name in ("warp", "sigma", "c_ls", "rest", "status"):
         values = getattr(found, name).copy()
         values[index] = getattr(other, name)
         arrays.append(values)

@@ -44,9 +44,13 @@ def flat_noise(image: Image) -> float:
             continue
         flat = half & (slope <= np.quantile(slope[half], _FLAT))
         variance = _clipped_variance(wave[flat])
+        if variance <= 0:  # black or white throughout: no noise is left to see
+            continue
         found.append((float(slope[flat].mean()) / (_white_slope() * variance), variance))
     trusted = [variance for unevenness, variance in found if unevenness < _TRULY_FLAT]
-    return max(float(np.mean(trusted)) if trusted else min(variance for _, variance in found), _QUANTISED)
+    return max(
+        float(np.mean(trusted)) if trusted else min((variance for _, variance in found), default=0.0), _QUANTISED
+    )
 
 
 def rest_noise(images: Sequence[Image]) -> float:

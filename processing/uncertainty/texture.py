@@ -35,6 +35,10 @@ class Texture:
         if self.slopes.shape != (n, 3) or self.peaked.shape != (n,):
             raise ValueError("texture has a contrast, three mean products of slopes and their peak a point")
 
+    def part(self, index: NDArray[np.int64]) -> Texture:
+        """The texture of some of the points."""
+        return Texture(self.contrast[index], self.slopes[index], self.peaked[index])
+
     def clean(self, noise: float) -> Array:
         """Mean squares of fx and fy, (n, 2), without those that noise of this variance adds."""
         return np.asarray(self.slopes[:, [0, 2]] - noise * SLOPE_GAIN)
@@ -51,34 +55,50 @@ class Texture:
         return np.column_stack([yy, xx]) / np.where(known, determinant, np.nan)[:, None]
 
 
-def texture_at(image: Image, px: Array, radius: int, square: bool = False) -> Texture:
-    """The texture about px (n, 2) of an image (h, w), over a square of the area of a subset of this radius, px."""
-    px = np.asarray(px, dtype=float)
-    n = len(px)
-    contrast, slopes, peaked = np.full(n, np.nan), np.full((n, 3), np.nan), np.full(n, np.nan)
-    height, width = image.shape
-    with np.errstate(invalid="ignore"):
-        inside = ((px > -0.5) & (px < (width - 0.5, height - 0.5))).all(axis=1)
-    if not inside.any():
-        return Texture(contrast, slopes, peaked)
-    at = np.rint(px[inside]).astype(np.int64)
-    half = radius if square else round(0.5 * np.sqrt(np.pi) * radius)
-    margin = half + len(_SLOPE)
-    left, top = np.maximum(at.min(axis=0) - margin, 0)
-    right, bottom = at.max(axis=0) + margin + 1
-    grey = np.asarray(image[top:bottom, left:right], dtype=np.float32)
-    rows, columns = at[:, 1] - top, at[:, 0] - left
+@dataclass(frozen=True)
+class TextureMap:
+    """The textures of all places of an image, every ``stride`` px, for subsets of one radius.
 
-    def mean(values: NDArray[np.float32]) -> Array:
-        size = (2 * half + 1, 2 * half + 1)
-        filtered = cv2.blur(values, size, borderType=cv2.BORDER_REFLECT_101)
-        return np.asarray(filtered[rows, columns], dtype=float)
+    values : (h, w, 5) contrast, three mean products of slopes, peak. shape : (height, width) of the image, px.
+    """
+
+    values: NDArray[np.float32]
+    stride: int
+    shape: tuple[int, int]
+
+    def at(self, px: Array) -> Texture:
+        """The texture about px (n, 2), to the nearest place of the map; NaN outside the image."""
+        px = np.asarray(px, dtype=float)
+        with np.errstate(invalid="ignore"):
+            inside: NDArray[np.bool_] = np.asarray(
+                ((px > -0.5) & (px < (self.shape[1] - 0.5, self.shape[0] - 0.5))).all(axis=1)
+            )
+        last = np.array(self.values.shape[1::-1]) - 1
+        at = np.minimum(np.rint(np.where(inside[:, None], px, 0.0) / self.stride).astype(np.int64), last)
+        found = np.where(inside[:, None], self.values[at[:, 1], at[:, 0]].astype(float), np.nan)
+        return Texture(found[:, 0], found[:, 1:4], found[:, 4])
+
+
+def texture_map(image: Image, radius: int, *, stride: int | None = None) -> TextureMap:
+    """The textures of an image (h, w), over squares of the area of a round subset of this radius, px.
+
+    stride : px, by default a fifth of the radius, over which a mean over the subset changes little.
+    """
+    stride = stride or max(1, radius // 5)
+    size = (2 * round(0.5 * np.sqrt(np.pi) * radius) + 1,) * 2
+    grey = np.asarray(image, dtype=np.float32)
+    one = np.ones(1, dtype=np.float32)
+
+    def mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.asarray(cv2.blur(values, size, borderType=cv2.BORDER_REFLECT_101)[::stride, ::stride])
 
     centred = grey - np.float32(grey.mean())
-    contrast[inside] = np.sqrt(np.maximum(mean(centred**2) - mean(centred) ** 2, 0.0))
-    one = np.ones(1, dtype=np.float32)
+    out = np.empty((*grey[::stride, ::stride].shape, 5), dtype=np.float32)
+    out[..., 0] = np.sqrt(np.maximum(mean(centred * centred) - mean(centred) ** 2, 0.0))
     fx, fy = cv2.sepFilter2D(grey, cv2.CV_32F, _SLOPE, one), cv2.sepFilter2D(grey, cv2.CV_32F, one, _SLOPE)
-    slopes[inside] = np.column_stack([mean(fx * fx), mean(fx * fy), mean(fy * fy)])
-    total = fx * fx + fy * fy
-    peaked[inside] = mean(total * total) / np.maximum(mean(total), 1e-9) ** 2
-    return Texture(contrast, slopes, peaked)
+    out[..., 2] = mean(fx * fy)
+    xx, yy = fx * fx, fy * fy
+    out[..., 1], out[..., 3] = mean(xx), mean(yy)
+    total = xx + yy
+    out[..., 4] = mean(total * total) / np.maximum(out[..., 1] + out[..., 3], 1e-6) ** 2
+    return TextureMap(out, stride, (grey.shape[0], grey.shape[1]))

@@ -89,6 +89,10 @@ def test_a_lonely_depth_is_not_coherent_and_the_smaller_piece_is_dropped() -> No
     assert not good[4, 4]
     assert good[:, :8].sum() == 12 * 8 - 1
     assert not good[:, 10:].any()
+    both = coherent(radius, convincing, 2.0, least=20)
+    assert both[:, 10:].all()
+    assert not both[4, 4]
+    assert (coherent(radius, convincing, 2.0, least=30) == good).all()
 
 
 def test_normals_of_a_cylinder_point_along_its_radii() -> None:

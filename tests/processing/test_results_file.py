@@ -153,8 +153,9 @@ def test_every_field_of_the_table_can_be_read_at_every_step(written: Path) -> No
 def everything_known() -> Results:
     """The same with a strain window and with every deviation that can be known."""
     result, rng = a_result(), np.random.default_rng(6)
+    settings = "[correlation]\nradius_px = 20\n[strain]\nwindow_mm = 12.0\n"
     return replace(
-        result, settings="[strain]\nwindow_mm = 12.0\n", sigma_displacement=rng.uniform(0, 0.01, (3, 36, 3)),
+        result, settings=settings, sigma_displacement=rng.uniform(0, 0.01, (3, 36, 3)),
         sigma_lambda=rng.uniform(0, 1e-3, (3, 50, 2)), chi2=rng.uniform(0, 3, (3, 36)),
     )  # fmt: skip
 

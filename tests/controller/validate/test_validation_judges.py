@@ -7,6 +7,7 @@ from controller.validate.calibration import ExactRays, true_camera
 from controller.validate.cylinder import Run, apart, diameter, figure_7a, figure_7b
 from controller.validate.figures import BETTER, PAPER, Figure
 from controller.validate.limb import LimbRun, figure_9, spoilt
+from controller.validate.report import blindness
 from controller.validate.scenery import Scenery
 from controller.validate.shapes import fitted_cylinder
 from controller.validate.tracks import Tracks, mismatch
@@ -196,6 +197,20 @@ def test_a_figure_says_whether_it_is_reached() -> None:
     assert Figure("e", "q", "%", {BETTER: 98.5}, limit=98.0, least=True).reached
     assert Figure("e", "q", "mm", {PAPER: 1.0}, limit=0.003).reached is None
     assert Figure("e", "q", "mm", {BETTER: float("nan")}, limit=0.003).reached is False
+
+
+def test_a_figure_alike_both_ways_does_not_see_the_errors() -> None:
+    table = blindness(
+        [
+            Figure("Table 2", "control points, RMS", "mm", {PAPER: 0.0020, BETTER: 0.0015}, "0.047"),
+            Figure("diameter", "bias, all views", "mm", {PAPER: -0.054, BETTER: 0.0003}, "−0.07"),
+            Figure("Fig. 9", "displacement", "mm", {PAPER: 1.0, BETTER: 0.0}),
+        ]
+    )
+    assert [(row["figure"], row["sees the errors"]) for row in table] == [
+        ("Table 2: control points, RMS", "no"),
+        ("diameter: bias, all views", "yes"),
+    ]
 
 
 def _with_matches(results: Results, matches: tuple[Matches, ...]) -> Results:

@@ -249,7 +249,8 @@ def test_a_session_is_calibrated_as_its_settings_say_and_once(session, rig, ways
     assert first.bundle.cameras == ("cam_12", "cam_01", "cam_02")
     kept = {path: path.stat().st_mtime_ns for path in (session.path / "calibration").iterdir()}
     assert sum(path.name.startswith("bundle-") for path in kept) == 1
-    assert len(kept) == 4  # the start is shared by both methods
+    assert sum(path.name.startswith("survey-") for path in kept) == 1
+    assert len(kept) == 5  # the start is shared by both methods
     again = calibrate_ring(session, CalibrationGroup(method="bundle"))
     assert {path: path.stat().st_mtime_ns for path in (session.path / "calibration").iterdir()} == kept
     assert again.bundle is not None
@@ -262,6 +263,27 @@ def test_a_session_is_calibrated_as_its_settings_say_and_once(session, rig, ways
     assert loose.bundle is not None
     assert loose.bundle.print_sigma == 0.0
     assert loose.bundle.sheet.radius == pytest.approx(57.0, abs=0.005)
+
+
+def test_a_session_s_lenses_have_the_terms_that_its_settings_allow(session) -> None:
+    ring = calibrate_ring(session, CalibrationGroup(radial_terms=2, skew=False, terms="criterion"))
+    assert {row.lens_terms for row in ring.quality} <= {"2 radial terms, tangential", "2 radial terms"}
+    assert all("information criterion" in row.lens_reason for row in ring.quality)
+    assert all(each.camera.intrinsics.K[0, 1] == 0 for each in ring.cameras.values())
+    assert all(each.views == tuple(f"{k:04d}-board" for k in range(1, 6)) for each in ring.cameras.values())
+    assert [row.pair for row in ring.pairs] == [("cam_12", "cam_01"), ("cam_01", "cam_02")]
+    assert all(row.rms < 0.03 for row in ring.pairs)
+    assert any("the lens rests on 5 board views" in sentence for sentence in ring.advice)
+
+
+def test_a_session_whose_cameras_are_exchanged_is_refused(session, folder) -> None:
+    target = session.of_kind("target")[0]
+    images = dict(target.images)
+    images["cam_12"], images["cam_02"] = images["cam_02"], images["cam_12"]
+    others = tuple(each for each in session.captures if each.kind != "target")
+    wrong = replace(session, captures=(*others, replace(target, images=images)))
+    with pytest.raises(InputError, match=r"cam_12 stands at azimuth 30°, where rig.toml has camera cam_02"):
+        calibrate_ring(wrong, CalibrationGroup())
 
 
 def test_a_session_whose_lenses_were_touched_is_told_so(session, folder) -> None:

@@ -203,3 +203,22 @@ def test_observations_survive_json(ring):
     target, _, images, _ = ring
     found = identify(find_dots(images["cam_01"], target), target, 0.0, camera="cam_01")
     assert DotObservations.from_dict(found.to_dict()).to_dict() == found.to_dict()
+
+
+def test_glare_on_dots_costs_those_dots_and_no_others(ring):
+    target, _, images, truth = ring
+    image = images["cam_05"].astype(float)
+    clean = identify(find_dots(images["cam_05"], target), target, 120.0)
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    hit = clean.px[5 : len(clean) : 11]  # a lamp's image over the edge of every eleventh dot
+    for u, v in hit + np.array([8.0, -5.0]):
+        near = np.hypot(x - u, y - v)
+        image = np.maximum(image, 255 * np.clip(2.0 - near / 8.0, 0, 1))
+    found = identify(find_dots(image.astype(np.uint8), target), target, 120.0)
+    assert len(found) > len(clean) - len(hit) - 3
+    _, kept = dlt.solve_dlt_robust(found.xyz, found.px, sigmas=5.0, floor=0.3)
+    off = distances(found, truth["cam_05"])
+    hidden = np.linalg.norm(found.px[:, None] - hit, axis=2).min(axis=1) < 10
+    assert off[~hidden].max() < 0.5
+    assert kept[~hidden].mean() > 0.95
+    assert (off[kept & hidden] < 1.0).all()

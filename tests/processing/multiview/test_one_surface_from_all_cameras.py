@@ -22,6 +22,9 @@ from processing.multiview.tube import lattice_faces
 from processing.multiview.views import seen
 from processing.multiview.warps import surface_stencil, warps_to
 from processing.proxy import on_cylinder
+from processing.results import read_results, write_results
+from processing.ring_surface import ring_surface
+from processing.settings import BEST, CorrelationGroup
 from processing.sweep import Search
 from processing.topology import holes, inconsistent_edges, is_closed_tube, non_manifold_vertices
 
@@ -249,6 +252,32 @@ def test_the_motion_of_the_limb_from_three_cameras(limb: Images, shape, figures)
     both = np.isfinite(fewer.xyz[1, :, 0]) & speckled
     assert 0.3 < both.mean() < 0.9
     assert np.abs(np.median((fewer.xyz - motion.xyz)[1, both], axis=0)).max() < 1e-3
+
+
+def test_two_cameras_are_enough_and_a_third_that_sees_nothing_is_named(limb: Images, tmp_path) -> None:
+    ids = [camera.id for camera in limb.cameras]
+    grey = {(id_, 0): limb.grey[id_, 0] for id_ in ids[:2]}
+    grey[ids[2], 0] = np.full_like(grey[ids[0], 0], 128)
+    settings = BEST.model_copy(update={"correlation": CorrelationGroup(radius_px=8, step_px=5)})
+    pairs = [(ids[0], ids[1]), (ids[1], ids[2])]
+    found = ring_surface("ring", limb.cameras, pairs, Images(limb.cameras, grey), {}, ["reference"], SEARCH, settings)
+    results = found.results
+    assert [sentence for sentence in found.warnings if ids[2] in sentence]
+    assert len(found.warnings) == 1
+    assert set(found.drift) == set(ids[:2])
+    assert set(results.pair) == {0}
+    assert len(results.vertices_ref) > 1000
+    assert found.agreement["views"] == 2.0
+    _, z, distance = Limb().material_coordinates(results.vertices_ref)
+    speckled = (z > 5) & (z < 245)
+    assert np.abs(distance[speckled]).max() < 0.5
+    assert np.sqrt(np.mean(distance[speckled] ** 2)) < 0.04  # a tenth of a pixel
+    assert {matches.cameras for matches in results.matches} == {(ids[0],), (ids[1],)}
+    write_results(tmp_path / "results.h5", results)
+    again = read_results(tmp_path / "results.h5")
+    for one, other in zip(results.matches, again.matches, strict=True):
+        assert one.cameras == other.cameras
+        np.testing.assert_array_equal(one.px, other.px)
 
 
 def test_cameras_that_see_nothing_in_common_are_refused(limb: Images) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from processing.uncertainty.noise import camera_noise, flat_noise, rest_noise
-from processing.uncertainty.texture import Texture, texture_at
+from processing.uncertainty.texture import Texture, texture_map
 
 
 def blots(noise: float, seed: int = 0, size: int = 400) -> np.ndarray:
@@ -61,7 +61,7 @@ def test_the_texture_of_a_wave_is_that_of_its_formula() -> None:
     y, x = np.mgrid[:200, :200].astype(float)
     a, b = 2 * np.pi / 12.0, 2 * np.pi / 18.0
     image = 128.0 + 30.0 * np.sin(a * x) + 20.0 * np.sin(b * y)
-    found = texture_at(image, np.array([[100.0, 90.0], [100.3, 89.8], [-3.0, 50.0], [np.nan, 1.0]]), radius=20)
+    found = texture_map(image, radius=20).at(np.array([[100.0, 90.0], [100.3, 89.8], [-3.0, 50.0], [np.nan, 1.0]]))
     # Over 37 px the squares of the waves are not quite averaged: sin(37 a)/(37 a) and the like.
     np.testing.assert_allclose(found.contrast[:2], np.sqrt((30.0**2 + 20.0**2) / 2), rtol=0.05)
     np.testing.assert_allclose(found.slopes[:2, [0, 2]], [[(30 * a) ** 2 / 2, (20 * b) ** 2 / 2]] * 2, rtol=0.1)
@@ -72,22 +72,22 @@ def test_the_texture_of_a_wave_is_that_of_its_formula() -> None:
     np.testing.assert_allclose(found.peaked[:2], expected, rtol=0.1)
     assert np.isnan(found.contrast[2:]).all()
     assert np.isnan(found.spread(0.0)[2:]).all()
-    np.testing.assert_array_equal(found.slopes[0], found.slopes[1])  # the nearest pixel
+    np.testing.assert_array_equal(found.slopes[0], found.slopes[1])  # the nearest place of the map
 
 
 def test_the_slopes_of_the_noise_are_taken_off() -> None:
     y, x = np.mgrid[:300, :300].astype(float)
     image = 128.0 + 10.0 * np.sin(x / 3.0) + 10.0 * np.sin(y / 4.0)
     at = np.array([[150.0, 150.0]])
-    noisy = texture_at(image + np.random.default_rng(0).normal(0.0, 3.0, image.shape), at, radius=130)
-    clean = texture_at(image, at, radius=130)
+    noisy = texture_map(image + np.random.default_rng(0).normal(0.0, 3.0, image.shape), radius=130).at(at)
+    clean = texture_map(image, radius=130).at(at)
     np.testing.assert_allclose(noisy.clean(9.0), clean.clean(0.0), rtol=0.03)  # 53,000 pixels
     assert (noisy.clean(0.0) > 1.5 * clean.clean(0.0)).all()
 
 
 def test_a_pattern_of_one_direction_does_not_tell_where_it_is() -> None:
     _, x = np.mgrid[:100, :100].astype(float)
-    found = texture_at(100.0 + 30.0 * np.sin(x), np.array([[50.0, 50.0]]), radius=10)
+    found = texture_map(100.0 + 30.0 * np.sin(x), radius=10).at(np.array([[50.0, 50.0]]))
     assert np.isnan(found.spread(0.0)).all()
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from processing.correlation import CorrelationSettings, correlate, prepare_current, prepare_reference
 from processing.uncertainty.matches import MatchParts, match_parts
-from processing.uncertainty.texture import Texture, texture_at
+from processing.uncertainty.texture import Texture, texture_map
 
 SIZE = 170
 SPECKLES = np.random.default_rng(11).uniform(-20.0, SIZE + 20.0, (2, 420))
@@ -35,7 +35,7 @@ def test_over_repeated_noise_matches_scatter_as_their_two_parts_say(squeeze: flo
         a, b = (image + rng.normal(0.0, s, image.shape) for image, s in zip((first, second), noise, strict=True))
         found = correlate(prepare_reference(a, settings=settings), prepare_current(b, settings=settings), XY, settings,
                           start=start, threads=1)  # fmt: skip
-        textures = texture_at(a, XY, 20), texture_at(b, XY + found.uv, 20)
+        textures = texture_map(a, 20).at(XY), texture_map(b, 20).at(XY + found.uv)
         parts = match_parts(found.sigma, found.c_ls, textures, (noise[0] ** 2, noise[1] ** 2), found.gradient)
         G = np.eye(2) + found.gradient
         uv.append(found.uv)

@@ -1,0 +1,45 @@
+"""Cameras that moved: the mean vertical residual of matches, step by step, as sentences for the operator.
+
+Steady cameras leave nothing in the mean across the epipolar line. What they leave at the reference came between the
+calibration and the reference image, what is added later came between two steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Mean vertical residual beyond which a camera has moved, px.
+LIMIT = 0.1
+
+
+def drift_sentences(drift: Mapping[str, Array], steps: Sequence[str], limit: float = LIMIT) -> tuple[str, ...]:
+    """One sentence for what moved since the calibration, and one for what moved between steps; none where all is still.
+
+    drift : (F,) px by camera or pair; NaN where not measured. steps : F names. limit : px.
+    """
+    measured = {who: values for who, values in drift.items() if len(values)}
+    before = {who: float(values[0]) for who, values in measured.items() if abs(values[0]) > limit}
+    since = {who: values - np.nan_to_num(values[0]) for who, values in measured.items()}
+    later = {who: values for who, values in since.items() if np.any(np.abs(values) > limit)}
+    sentences = []
+    if before:
+        worst = max(before, key=lambda who: abs(before[who]))
+        sentences.append(
+            f"cameras {', '.join(before)}: at the reference matches lie off the epipolar line by up to "
+            f"{before[worst]:+.2f} px in the mean ({worst}); a camera moved after the calibration, or the board views "
+            "do not fit the target: fix the cameras and calibrate again"
+        )
+    if later:
+        worst = max(later, key=lambda who: float(np.nanmax(np.abs(later[who]))))
+        step = int(np.nanargmax(np.abs(later[worst])))
+        sentences.append(
+            f"cameras {', '.join(later)}: matches drift off the epipolar line, by {later[worst][step]:+.2f} px in the "
+            f"mean in {steps[step]} ({worst}); a camera moves between the steps: fix it, and take the displacements of "
+            "such steps as good to that"
+        )
+    return tuple(sentences)
