@@ -7,6 +7,7 @@ result is compared as a ratio.
 from __future__ import annotations
 
 import json
+import math
 import platform
 import sys
 import time
@@ -21,9 +22,11 @@ from numpy.typing import NDArray
 
 from processing.correlation.correlate import Correlation, correlate, load_kernels, on_threads
 from processing.correlation.grid import grid
+from processing.correlation.machine import Machine, demand, measure_machine
 from processing.correlation.prepared import prepare_current, prepare_reference
 from processing.correlation.propagation import refine
 from processing.correlation.settings import CorrelationSettings
+from processing.correlation.status import Status
 from processing.errors import InputError
 from processing.images import read_gray, read_mask
 
@@ -32,6 +35,11 @@ Say = Callable[[str], None]
 
 _TOLERANCE = 1e-3  # px, at which the published figures of other programs are taken
 _OFF = 0.3  # px the start values of the kernel alone are off
+# The fastest open program on two cores of an x86-64 processor with AVX-512, points/s by (radius, order): OpenCorr of
+# August 2026 on the pair 201_1 → 201_2 of the MultiDIC rig, circle, 10 px apart.
+PEER = {(16, 1): 27_500.0, (20, 1): 18_700.0, (20, 2): 9_980.0}
+_PEER_WHOLE = {(20, 1): 0.80}  # s, on a crop about the region
+_FINE, _DOUBLE = 1e-6, 9e-7  # px, tolerances of the finest run in single precision, and of one in double
 
 
 def bench_correlation(
@@ -47,25 +55,43 @@ def bench_correlation(
     data : the folder that holds ``speckle/201_1.jpg``, ``speckle/201_2.jpg`` and ``roi_mask.png``. Returns machine,
     pair, points and ``runs``: for each radius, order and number of threads the points/s of the kernel alone from
     start values 0.3 px off, those of the refine stage, the seconds prepare, start, refine and whole (in memory), the
-    mean iterations, and the share matched; and peak_memory_mb of the process. InputError if the images are missing.
+    mean iterations, the share matched, cycles per pixel and iteration of the kernel, its share of what the core's
+    arithmetic allows, and for the rig's pair the peer's points/s; ``stereo``, the pair 201_1 → 202_1 (None without);
+    ``double``, the largest difference from double precision, px; and peak_memory_mb of the process. InputError if the
+    images are missing.
     """
     reference, current, mask = _rig_pair(data) if data is not None else synthetic_pair()
     xy, _ = grid(mask, step)
     load_kernels()
+    machine = measure_machine()
     runs = []
     for threads in sorted({1, int(numba.config.NUMBA_NUM_THREADS)}):  # type: ignore[attr-defined]
         for radius, order in ((16, 1), (20, 1), (16, 2), (20, 2)):
             settings = CorrelationSettings(radius, step, order, interpolation=interpolation, tolerance=_TOLERANCE)
             run = _measure(reference, current, mask, xy, settings, threads, repeats)
-            say(
-                f"radius {radius}, order {order}, {threads} threads: {run['kernel_points_per_second']:,.0f} points/s, "
-                f"whole pair {run['seconds']['whole']:.3f} s"
-            )
+            run |= _roofline(settings, run, machine)
+            if data is not None:
+                run["peer_points_per_second"] = PEER.get((radius, order))
+                run["peer_seconds"] = _PEER_WHOLE.get((radius, order))
+            say(_told(run))
             runs.append(run)
+    peak = _peak_memory()
+    stereo = _stereo(data, reference, mask, xy, step, interpolation) if data is not None else None
+    if stereo is not None:
+        say(
+            f"201_1 to 202_1, radius 20, order 2: {stereo['matched']} of {len(xy)} points in "
+            f"{stereo['cpu_seconds']:.2f} CPU-s (peer: 8,875 in 10), kernel "
+            f"{stereo['kernel_points_per_second']:,.0f} points/s"
+        )
+    double = _difference(reference, current, mask, xy, step, interpolation)
+    say(f"largest difference from double precision: {double:.1e} px; peak memory {peak or math.nan:.0f} MB")
     return {
         "machine": {
             "processor": platform.processor() or platform.machine(),
             "llvm": _target(),
+            "clock_ghz": machine.clock,
+            "vector_operations_per_second": machine.operations,
+            "memory_bytes_per_second": machine.bandwidth,
             "numba": numba.__version__,
         },
         "pair": "multidic_rig 201_1-201_2" if data is not None else "synthetic",
@@ -73,7 +99,9 @@ def bench_correlation(
         "image": list(reference.shape),
         "interpolation": interpolation,
         "runs": runs,
-        "peak_memory_mb": _peak_memory(),
+        "stereo": stereo,
+        "double": double,
+        "peak_memory_mb": peak,
     }
 
 
@@ -161,11 +189,83 @@ def _measure(
     }
 
 
+def _roofline(settings: CorrelationSettings, run: dict[str, Any], machine: Machine) -> dict[str, float]:
+    """What the kernel asks of a core for a point, and how near it comes to what the core can do."""
+    asked = demand(settings, run["iterations"])
+    seconds = 1.0 / run["kernel_points_per_cpu_second"]
+    return {
+        "pixels": asked.pixels,
+        "operations_per_point": asked.operations,
+        "bytes_per_point": asked.bytes,
+        "bound_points_per_second": asked.bound(machine) * run["threads"],
+        "share_of_bound": 1.0 / (seconds * asked.bound(machine)),
+        "cycles_per_pixel_and_iteration": seconds * machine.clock * 1e9 / (asked.pixels * run["iterations"]),
+    }
+
+
+def _told(run: dict[str, Any]) -> str:
+    """One line about a run."""
+    peer, peer_seconds = run.get("peer_points_per_second"), run.get("peer_seconds")
+    return (
+        f"radius {run['radius']}, order {run['order']}, {run['threads']} threads: kernel "
+        f"{run['kernel_points_per_second']:,.0f} points/s ({run['kernel_points_per_cpu_second']:,.0f} a CPU-s, "
+        f"{run['cycles_per_pixel_and_iteration']:.1f} cycles per pixel and iteration, "
+        f"{100 * run['share_of_bound']:.0f} % of the arithmetic's bound), refine stage "
+        f"{run['refine_points_per_second']:,.0f}"
+        + (f" (peer {peer:,.0f} on 2 threads)" if peer else "")
+        + f", whole pair {run['seconds']['whole']:.3f} s"
+        + (f" (peer {peer_seconds:.2f})" if peer_seconds else "")
+    )
+
+
+def _stereo(
+    data: Path, reference: Image, mask: NDArray[np.bool_], xy: NDArray[np.float64], step: int, interpolation: str
+) -> dict[str, Any] | None:
+    """The neighbouring camera, second order: gradients up to 0.65. None where its image is missing."""
+    path = data / "speckle" / "202_1.jpg"
+    if not path.is_file():
+        return None
+    settings = CorrelationSettings(20, step, 2, interpolation=interpolation, tolerance=_TOLERANCE)
+    prepared = prepare_reference(reference, mask, settings), prepare_current(read_gray(path), None, settings)
+    began, worked = time.perf_counter(), time.process_time()
+    result = correlate(*prepared, xy, settings)
+    seconds, cpu = time.perf_counter() - began, time.process_time() - worked
+    start, kernel = _start_off(result), []
+    for _ in range(3):
+        began = time.perf_counter()
+        refine(*prepared, xy, start, settings)
+        kernel.append(time.perf_counter() - began)
+    return {
+        "matched": int(result.good.sum()),
+        "seconds": seconds,
+        "cpu_seconds": cpu,
+        "kernel_points_per_second": len(xy) / min(kernel),
+        "largest_gradient": float(np.nanpercentile(np.abs(result.gradient), 99.9)),
+    }
+
+
+def _difference(
+    reference: Image, current: Image, mask: NDArray[np.bool_], xy: NDArray[np.float64], step: int, interpolation: str
+) -> float:
+    """Largest difference between the matches in single and in double precision, of every seventh point, px."""
+    xy, found = xy[::7], []
+    start = None
+    for tolerance in (_FINE, _DOUBLE):
+        settings = CorrelationSettings(20, step, 1, interpolation=interpolation, tolerance=tolerance)
+        prepared = prepare_reference(reference, mask, settings), prepare_current(current, None, settings)
+        if start is None:
+            start = _start_off(correlate(*prepared, xy, settings))
+        status, _, _, _, parameters = refine(*prepared, xy, start, settings)
+        found.append(np.where((status == Status.GOOD)[:, None], parameters[:, [0, 6]], np.nan))
+    return float(np.nanmax(np.abs(found[1] - found[0])))
+
+
 def _start_off(result: Correlation) -> NDArray[np.float64]:
     """Start values (n, 12): the displacement found, 0.3 px off in a direction of its own, and its gradient."""
     start = np.zeros((len(result.xy), 12))
     angle = np.random.default_rng(1).uniform(0.0, 2.0 * np.pi, len(start))
-    start[:, [0, 6]] = result.uv + _OFF * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    uv = np.where(result.good[:, None], result.uv, np.nan)
+    start[:, [0, 6]] = uv + _OFF * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     start[:, [1, 2, 7, 8]] = result.gradient.reshape(-1, 4)
     return start
 

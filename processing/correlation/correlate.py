@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from processing.correlation import kernels
 from processing.correlation.features import feature_starts
+from processing.correlation.hypotheses import search_hypotheses
 from processing.correlation.prepared import Current, Reference, prepare_current, prepare_reference
 from processing.correlation.propagation import Field, Progress, refine
 from processing.correlation.seeds import flow_starts, search_starts, spread
@@ -26,13 +27,16 @@ StartValues = Callable[[Reference, Current, Array, int], Array]
 
 log = logging.getLogger(__name__)
 
-_METHODS: tuple[tuple[str, StartValues], ...] = (
-    ("optical flow", flow_starts),
-    ("template search", search_starts),
-    ("features", feature_starts),
+# Name, method, and whether it tells of all points at once as cheaply as of a few.
+_METHODS: tuple[tuple[str, StartValues, bool], ...] = (
+    ("optical flow", flow_starts, True),
+    ("template search", search_starts, False),
+    ("features", feature_starts, False),
 )
 _ENOUGH = 0.99  # share of the points that have a match before the next method is asked
+_ALIKE = 0.4  # ZNCC before the refinement below which none is worth while
 _SEED_ZNCC = 0.75
+_DENSE_ZNCC = 0.9  # what a point started by itself must reach; others wait for what their neighbours say
 _TRUSTED = 0.6  # share of a method's seeds that must hold
 # Columns of the 12 parameters of a kernel, in the order u v ux uy vx vy, then uxx uxy uyy vxx vxy vyy.
 _COLUMNS = [0, 6, 1, 2, 7, 8, 3, 4, 5, 9, 10, 11]
@@ -125,13 +129,16 @@ def _match_automatically(points: Field, seconds: dict[str, float]) -> None:
     through may be false: they wait until the others have had their turn, and only serve points nobody reached.
     """
     doubtful = []
-    for name, method in _METHODS:
+    for name, method, dense in _METHODS:
         open_points = _open(points)
         if len(open_points) <= (1.0 - _ENOUGH) * _worth(points):
             break
         began = time.perf_counter()
-        seeds = open_points[spread(points.xy[open_points])]
-        trial = _try_seeds(points, seeds, method)
+        chosen = spread(points.xy[open_points])
+        asked = open_points if dense else open_points[chosen]
+        start = method(points.reference, points.current, points.xy[asked], points.settings.radius)
+        seeds = open_points[chosen]
+        trial = _try_seeds(points, seeds, start[chosen] if dense else start)
         share = float(trial.good.sum() / max((trial.status != Status.NO_TEXTURE).sum(), 1))
         log.debug("%s: %d of %d seeds hold", name, int(trial.good.sum()), len(seeds))
         seconds["start"] += time.perf_counter() - began - trial.filtering
@@ -141,7 +148,7 @@ def _match_automatically(points: Field, seconds: dict[str, float]) -> None:
             continue
         points.adopt(seeds, trial)
         points.region = points.region or trial.region
-        _carry_on(points, seconds)
+        _carry_on(points, seconds, asked[~points.good[asked]], start[~points.good[asked]])
     for _, seeds, trial in sorted(doubtful, key=lambda entry: -entry[0]):
         if len(_open(points)) > (1.0 - _ENOUGH) * _worth(points):
             points.adopt(seeds, trial)
@@ -157,11 +164,16 @@ def _worth(points: Field) -> int:
     return int((points.status != Status.NO_TEXTURE).sum())
 
 
-def _try_seeds(points: Field, seeds: NDArray[np.int64], method: StartValues) -> Field:
-    """The seeds (k,) refined from a method's start values, apart from the other points."""
-    trial = Field(points.reference, points.current, points.xy[seeds], points.settings)
-    start = method(points.reference, points.current, trial.xy, points.settings.radius)
-    found = np.flatnonzero(np.isfinite(start).all(axis=1))
+def _try_seeds(points: Field, seeds: NDArray[np.int64], start: Array) -> Field:
+    """The seeds (k,) refined from start values (k, 12), apart from the other points, where they look alike at all."""
+    bare = points.status[seeds] == Status.NO_TEXTURE
+    trial = Field(points.reference, points.current, points.xy[seeds], points.settings, bare=np.asarray(bare))
+    known = np.asarray(np.isfinite(start).all(axis=1))
+    warps = np.where(known[:, None], start, np.nan)[:, None, _COLUMNS[:6]]
+    _, alike, _ = search_hypotheses(points.reference, points.current, trial.xy, warps, points.settings.radius)
+    found = np.flatnonzero(known & (alike > _ALIKE))
+    if not len(found):
+        return trial
     trial.attempt(found, start[found], max(_SEED_ZNCC, points.settings.zncc_min))
     return trial
 
@@ -176,13 +188,20 @@ def _match_from(points: Field, start: Array, seconds: dict[str, float]) -> None:
     _carry_on(points, seconds)
 
 
-def _carry_on(points: Field, seconds: dict[str, float]) -> None:
+def _carry_on(
+    points: Field, seconds: dict[str, float], index: NDArray[np.int64] | None = None, start: Array | None = None
+) -> None:
+    """All points from their own start values where given, then from neighbour to neighbour, and the judgement."""
     began = time.perf_counter()
+    if index is not None and start is not None:
+        known = np.isfinite(start).all(axis=1) & (points.status[index] != Status.NO_TEXTURE)
+        points.attempt(index[known], start[known], max(_DENSE_ZNCC, points.settings.zncc_min), follow=True)
     points.propagate()
     points.retry_from_fit()
-    points.reject_outliers()
-    points.retry_from_fit()
-    points.reject_outliers()
+    if points.reject_outliers():
+        points.propagate()
+        points.retry_from_fit()
+        points.reject_outliers()
     seconds["refine"] += time.perf_counter() - began
 
 

@@ -15,8 +15,8 @@ from processing.correlation.prepared import Current, Reference, as_8_bit
 
 Array = NDArray[np.float64]
 
-_PIXELS = 2.5e6  # reduce larger images to this
-_FEATURES = 6000
+_PIXELS = 1.2e6  # reduce larger images to this
+_FEATURES = 3000
 _RATIO = 0.85
 _NEAREST = 14
 _TRIALS = 120

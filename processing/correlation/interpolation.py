@@ -1,9 +1,11 @@
-"""B-spline interpolation of vectors of 16 pixels, in single precision.
+"""B-spline interpolation of sixteen pixels of a row at once.
 
-While the fractional position t = t0 + s l + q l² of the lanes l = 0 … 15 of a vector stays inside one pixel interval,
-lane l needs the coefficients at base + l + tap: every tap is one contiguous load for all lanes, no gather. Where t
-crosses one whole number there is one tap more, and the weights move along by a select. The two axes are independent:
-four cases, and a general one in which each pixel finds its own taps.
+While the fractional position t = t0 + s l + q l² of the lanes l = 0 … 15 stays inside one pixel interval, lane l needs
+the coefficients at base + l + tap: every tap is one contiguous load for all lanes, no gather. Where t crosses one
+whole number there is one tap more, and the weights move along by a select. The two axes are independent: four cases.
+
+With larger gradients the sixteen pixels lie within 32 coefficients of a row: every tap is picked from two loads by a
+permutation, in as many rows as the lanes reach. Beyond that (a stretch of 1.7) each pixel finds its own taps.
 
 Weights are those of the B-spline times 6 (cubic) or 120 (quintic), so g is 36 or 14400 times the grey level: the
 criterion does not mind a contrast.
@@ -17,27 +19,21 @@ from typing import Any
 import numba as nb
 import numpy as np
 
+from processing.correlation.lanes import LANES, floor, load, magnitude, number, picked, put, ramp, select, store
+
 FAST = {"contract", "reassoc", "arcp", "nsz"}
-LANES = 16
-STILL, ACROSS_X, ACROSS_Y, ACROSS, SCATTERED = range(5)  # what a vector crosses
+# What sixteen pixels cross: nothing, one whole number along an axis or both; WIDE + n: n whole numbers in y, any in x.
+ACROSS_X, ACROSS_Y, WIDE, SCATTERED = 1, 2, 4, -1
+REACH_OF_WINDOW = 31 - 5  # px that a window of 32 coefficients leaves the pixels for six taps
 _F, _U = np.float32, np.uint64
-_L = _U(LANES)
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _cubic(t):  # type: ignore[no-untyped-def]
-    """Cubic B-spline at the taps -1 … 2 for a fraction t, times 6; the last but one by the partition of unity."""
+    """Cubic B-spline at the taps -1 … 2 for a fraction t, times 6."""
     s, t2 = _F(1) - t, t * t
-    a, b, d = s * s * s, _F(4) + t2 * (_F(3) * t - _F(6)), t2 * t
-    return a, b, _F(6) - a - b - d, d
-
-
-@nb.njit(forceinline=True, fastmath=FAST)
-def _cubic_across(t):  # type: ignore[no-untyped-def]
-    """The five taps where t in [0, 2) may cross 1."""
-    k = t >= _F(1)
-    a, b, c, d = _cubic(t - _F(1) if k else t)
-    return _F(0) if k else a, a if k else b, b if k else c, c if k else d, d if k else _F(0)
+    s2 = s * s
+    return s2 * s, t2 * (_F(3) * t - _F(6)) + _F(4), s2 * (_F(3) * s - _F(6)) + _F(4), t2 * t
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
@@ -46,19 +42,55 @@ def _quintic(t):  # type: ignore[no-untyped-def]
     s, t2 = _F(1) - t, t * t
     s2 = s * s
     a, f = s2 * s2 * s, t2 * t2 * t
-    c = _F(66) + t2 * (t2 * (_F(30) - _F(10) * t) - _F(60))
-    d = _F(66) + s2 * (s2 * (_F(30) - _F(10) * s) - _F(60))
-    b = _F(26) + t * (t * (t * (t * (_F(5) * t - _F(20)) + _F(20)) + _F(20)) - _F(50))
+    c = t2 * (t2 * (_F(30) - _F(10) * t) - _F(60)) + _F(66)
+    d = s2 * (s2 * (_F(30) - _F(10) * s) - _F(60)) + _F(66)
+    b = t * (t * (t * (t * (_F(5) * t - _F(20)) + _F(20)) + _F(20)) - _F(50)) + _F(26)
     return a, b, c, d, _F(120) - a - b - c - d - f, f
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _cubic_across(t):  # type: ignore[no-untyped-def]
+    """The five taps where t in [0, 2) may cross 1."""
+    k, zero = t >= _F(1), _F(0)
+    a, b, c, d = _cubic(select(k, t - _F(1), t))
+    return select(k, zero, a), select(k, a, b), select(k, b, c), select(k, c, d), select(k, d, zero)
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _quintic_across(t):  # type: ignore[no-untyped-def]
     """The seven taps where t in [0, 2) may cross 1."""
-    k = t >= _F(1)
-    a, b, c, d, e, f = _quintic(t - _F(1) if k else t)
-    zero = _F(0)
-    return zero if k else a, a if k else b, b if k else c, c if k else d, d if k else e, e if k else f, f if k else zero
+    k, zero = t >= _F(1), _F(0)
+    a, b, c, d, e, f = _quintic(select(k, t - _F(1), t))
+    first, second, third = select(k, zero, a), select(k, a, b), select(k, b, c)
+    return first, second, third, select(k, c, d), select(k, d, e), select(k, e, f), select(k, f, zero)
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def largest(one, other):  # type: ignore[no-untyped-def]
+    """The larger, lane by lane."""
+    return select(one >= other, one, other)
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _positive(t):  # type: ignore[no-untyped-def]
+    return select(t >= _F(0), t, _F(0))
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _cubic_at(t):  # type: ignore[no-untyped-def]
+    """Cubic B-spline at any distance t, times 6."""
+    a = magnitude(t)
+    one, two = _positive(_F(1) - a), _positive(_F(2) - a)
+    return two * two * two - _F(4) * (one * one * one)
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _quintic_at(t):  # type: ignore[no-untyped-def]
+    """Quintic B-spline at any distance t, times 120."""
+    a = magnitude(t)
+    one, two, three = _positive(_F(1) - a), _positive(_F(2) - a), _positive(_F(3) - a)
+    one2, two2, three2 = one * one, two * two, three * three
+    return three2 * three2 * three - _F(6) * (two2 * two2 * two) + _F(15) * (one2 * one2 * one)
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
@@ -83,131 +115,145 @@ def _quintic_slope(t):  # type: ignore[no-untyped-def]
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _row4(c, p, w):  # type: ignore[no-untyped-def]
-    return w[0] * c[p] + w[1] * c[p + _U(1)] + w[2] * c[p + _U(2)] + w[3] * c[p + _U(3)]
+    return w[0] * load(c, p) + w[1] * load(c, p + _U(1)) + w[2] * load(c, p + _U(2)) + w[3] * load(c, p + _U(3))
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _row5(c, p, w):  # type: ignore[no-untyped-def]
-    return _row4(c, p, w) + w[4] * c[p + _U(4)]
+    return _row4(c, p, w) + w[4] * load(c, p + _U(4))
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _row6(c, p, w):  # type: ignore[no-untyped-def]
-    return _row5(c, p, w) + w[5] * c[p + _U(5)]
+    return _row5(c, p, w) + w[5] * load(c, p + _U(5))
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _row7(c, p, w):  # type: ignore[no-untyped-def]
-    return _row6(c, p, w) + w[6] * c[p + _U(6)]
+    return _row6(c, p, w) + w[6] * load(c, p + _U(6))
 
 
-def _make_spans(row: Any, across: Any, weights: Any, long_row: Any, taps: int) -> tuple[Any, ...]:
-    """The vector kernels of one degree: neither axis crosses, x does, y does, both do; and one pixel on its own."""
-
-    def make(weights_x: Any, row_x: Any, weights_y: Any, taps_y: int) -> Any:
-        @nb.njit(forceinline=True, fastmath=FAST)
-        def span(c, base, stride, tx, sx, qx, ty, sy, qy, g, at):  # type: ignore[no-untyped-def]
-            """g[at … at + 15] of the lanes whose taps begin at base + lane."""
-            for lane in range(_L):
-                e = _F(lane)
-                wx, wy = weights_x(tx + e * (sx + e * qx)), weights_y(ty + e * (sy + e * qy))
-                p = base + lane
-                total = wy[0] * row_x(c, p, wx) + wy[1] * row_x(c, p + stride, wx)
-                total += wy[2] * row_x(c, p + _U(2) * stride, wx) + wy[3] * row_x(c, p + _U(3) * stride, wx)
-                if taps_y == 5:
-                    total += wy[4] * row_x(c, p + _U(4) * stride, wx)
-                g[at + lane] = total
-            if taps_y > 5:  # in two loops: one with as many rows is not vectorised
-                for lane in range(_L):
-                    e = _F(lane)
-                    wx, wy = weights_x(tx + e * (sx + e * qx)), weights_y(ty + e * (sy + e * qy))
-                    p = base + lane + _U(4) * stride
-                    total = g[at + lane] + wy[4] * row_x(c, p, wx) + wy[5] * row_x(c, p + stride, wx)
-                    if taps_y > 6:
-                        total += wy[6] * row_x(c, p + _U(2) * stride, wx)
-                    g[at + lane] = total
-
-        return span
+def _make_sum(row: Any, taps: int) -> Any:
+    """Σ of so many rows, each with the taps of ``row``."""
 
     @nb.njit(forceinline=True, fastmath=FAST)
-    def scattered(c, base, stride, tx, sx, qx, ty, sy, qy, g, at):  # type: ignore[no-untyped-def]
-        """The same for any gradient: every lane finds its own taps."""
-        for lane in range(_L):
-            e = _F(lane)
-            x, y = tx + e * (sx + e * qx), ty + e * (sy + e * qy)
-            i, j = math.floor(y), math.floor(x)
-            wx, wy = weights(x - _F(j)), weights(y - _F(i))
-            p = _U(np.int64(base) + np.int64(lane) + np.int64(i) * np.int64(stride) + np.int64(j))
-            total = wy[0] * row(c, p, wx) + wy[1] * row(c, p + stride, wx)
-            total += wy[2] * row(c, p + _U(2) * stride, wx) + wy[3] * row(c, p + _U(3) * stride, wx)
-            if taps > 4:
-                total += wy[4] * row(c, p + _U(4) * stride, wx) + wy[5] * row(c, p + _U(5) * stride, wx)
-            g[at + lane] = total
+    def spline(c, p, stride, wx, wy):  # type: ignore[no-untyped-def]
+        out = wy[0] * row(c, p, wx) + wy[1] * row(c, p + stride, wx)
+        out += wy[2] * row(c, p + _U(2) * stride, wx) + wy[3] * row(c, p + _U(3) * stride, wx)
+        if taps > 4:
+            out += wy[4] * row(c, p + _U(4) * stride, wx)
+        if taps > 5:
+            out += wy[5] * row(c, p + _U(5) * stride, wx)
+        if taps > 6:
+            out += wy[6] * row(c, p + _U(6) * stride, wx)
+        return out
 
-    return (
-        make(weights, row, weights, taps),
-        make(across, long_row, weights, taps),
-        make(weights, row, across, taps + 1),
-        make(across, long_row, across, taps + 1),
-        scattered,
-    )
+    return spline
 
 
-_c0, _cx, _cy, _cxy, _c_any = _make_spans(_row4, _cubic_across, _cubic, _row5, 4)
-_q0, _qx, _qy, _qxy, _q_any = _make_spans(_row6, _quintic_across, _quintic, _row7, 6)
+_c44, _c54, _c45, _c55 = _make_sum(_row4, 4), _make_sum(_row5, 4), _make_sum(_row4, 5), _make_sum(_row5, 5)
+_q66, _q76, _q67, _q77 = _make_sum(_row6, 6), _make_sum(_row7, 6), _make_sum(_row6, 7), _make_sum(_row7, 7)
 
 
 @nb.njit(fastmath=FAST, nogil=True, cache=True)
-def interpolate(c, stride, base, case, place, qx, qy, quintic, n, g):  # type: ignore[no-untyped-def]
-    """Grey levels g of n vectors in the current image. place : (4, n) tx, sx, ty, sy."""
-    for v in range(n):
-        at, b, k = _U(v) * _L, base[v], case[v]
-        tx, sx, ty, sy = place[0, v], place[1, v], place[2, v], place[3, v]
-        if quintic:
-            if k == STILL:
-                _q0(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
-            elif k == ACROSS_X:
-                _qx(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
-            elif k == ACROSS_Y:
-                _qy(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
-            elif k == ACROSS:
-                _qxy(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
-            else:
-                _q_any(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
-        elif k == STILL:
-            _c0(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
-        elif k == ACROSS_X:
-            _cx(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
-        elif k == ACROSS_Y:
-            _cy(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
-        elif k == ACROSS:
-            _cxy(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
-        else:
-            _c_any(c, b, stride, tx, sx, qx, ty, sy, qy, g, at)
+def _wide(c, p, stride, tx, sx, qx, ty, sy, qy, rows, quintic, g):  # type: ignore[no-untyped-def]
+    """Any gradients that 32 coefficients of a row cover: taps picked by permutation, ``rows`` more rows of them.
 
-
-@nb.njit(fastmath=FAST, nogil=True, cache=True)
-def between_pixels(c, b, stride, tx, ty, quintic, weight, out_f, out_x, out_y, at, count):  # type: ignore[no-untyped-def]
-    """f and its gradient between the pixels: a row with the same fraction."""
+    g : where to put the sixteen grey levels.
+    """
+    e = ramp(c)
+    x, y = e * (e * qx + sx) + tx + e, e * (e * qy + sy) + ty
+    whole = floor(x)
+    out, t = ramp(c) * _F(0), x - whole
     if quintic:
-        b -= _U(2) * stride + _U(2)
-        wx, wy, sx, sy = _quintic(tx), _quintic(ty), _quintic_slope(tx), _quintic_slope(ty)
-        for lane in range(count):
-            f = fx = fy = _F(0)
-            for k in range(_U(6)):
-                p = b + lane + k * stride
-                level = _row6(c, p, wx)
-                f, fx, fy = f + wy[k] * level, fx + wy[k] * _row6(c, p, sx), fy + sy[k] * level
-            m = weight[at + lane] / _F(14400)
-            out_f[at + lane], out_x[at + lane], out_y[at + lane] = m * f, m * fx, m * fy
+        w, row = _quintic(t), y + _F(2)
+        for _ in range(rows + _U(6)):
+            taps = w[0] * picked(c, p, whole) + w[1] * picked(c, p, whole + _F(1)) + w[2] * picked(c, p, whole + _F(2))
+            taps += w[3] * picked(c, p, whole + _F(3)) + w[4] * picked(c, p, whole + _F(4))
+            out += _quintic_at(row) * (taps + w[5] * picked(c, p, whole + _F(5)))
+            row -= _F(1)
+            p += stride
     else:
-        b -= stride + _U(1)
+        v, row = _cubic(t), y + _F(1)
+        for _ in range(rows + _U(4)):
+            taps = v[0] * picked(c, p, whole) + v[1] * picked(c, p, whole + _F(1))
+            taps += v[2] * picked(c, p, whole + _F(2)) + v[3] * picked(c, p, whole + _F(3))
+            out += _cubic_at(row) * taps
+            row -= _F(1)
+            p += stride
+    store(g, _U(0), out)
+
+
+@nb.njit(fastmath=FAST, nogil=True, cache=True)
+def _scattered(c, p, stride, tx, sx, qx, ty, sy, qy, quintic, g):  # type: ignore[no-untyped-def]
+    """The same for any gradient: every lane finds its own taps. g : where to put them."""
+    for lane in range(LANES):
+        e = _F(lane)
+        x, y = tx + e * (sx + e * qx), ty + e * (sy + e * qy)
+        i, j = math.floor(y), math.floor(x)
+        first = _U(np.int64(p) + np.int64(lane) + np.int64(i) * np.int64(stride) + np.int64(j))
+        out = x * _F(0)
+        if quintic:
+            wx, wy = _quintic(x - _F(j)), _quintic(y - _F(i))
+            for k in range(6):
+                for m in range(6):
+                    out += wy[k] * wx[m] * number(c, first + _U(k) * stride + _U(m))
+        else:
+            vx, vy = _cubic(x - _F(j)), _cubic(y - _F(i))
+            for k in range(4):
+                for m in range(4):
+                    out += vy[k] * vx[m] * number(c, first + _U(k) * stride + _U(m))
+        put(g, lane, out)
+
+
+@nb.njit(nogil=True, cache=True)
+def _general(c, p, stride, case, tx, sx, qx, ty, sy, qy, quintic, g):  # type: ignore[no-untyped-def]
+    if case == SCATTERED:
+        _scattered(c, p, stride, tx, sx, qx, ty, sy, qy, quintic, g)
+    else:
+        _wide(c, p, stride, tx, sx, qx, ty, sy, qy, _U(case - WIDE), quintic, g)
+
+
+def make_interpolation(quintic: bool) -> Any:
+    """The interpolation of one degree."""
+    weights, across = (_quintic, _quintic_across) if quintic else (_cubic, _cubic_across)
+    still, over_x, over_y, over = (_q66, _q76, _q67, _q77) if quintic else (_c44, _c54, _c45, _c55)
+
+    @nb.njit(forceinline=True, fastmath=FAST)
+    def interpolate(c, p, stride, case, tx, sx, qx, ty, sy, qy, spare):  # type: ignore[no-untyped-def]
+        """Sixteen grey levels of the current image, those whose taps begin at p + lane where t < 1.
+
+        c : pointer to the coefficients; case : what the lanes cross; spare : pointer to 16 numbers of scratch.
+        """
+        e = ramp(c)
+        x, y = e * (e * qx + sx) + tx, e * (e * qy + sy) + ty
+        if case == 0:
+            g = still(c, p, stride, weights(x), weights(y))
+        elif case == ACROSS_X:
+            g = over_x(c, p, stride, across(x), weights(y))
+        elif case == ACROSS_Y:
+            g = over_y(c, p, stride, weights(x), across(y))
+        elif case == ACROSS_X + ACROSS_Y:
+            g = over(c, p, stride, across(x), across(y))
+        else:
+            _general(c, p, stride, case, tx, sx, qx, ty, sy, qy, quintic, spare)
+            g = load(spare, _U(0))
+        return g
+
+    return interpolate
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def between_pixels(c, p, stride, tx, ty, quintic):  # type: ignore[no-untyped-def]
+    """f, ∂f/∂x and ∂f/∂y of sixteen pixels with the same fractions tx, ty; p : the pixel to the upper left."""
+    if quintic:
+        p -= _U(2) * stride + _U(2)
+        wx, wy, sx, sy = _quintic(tx), _quintic(ty), _quintic_slope(tx), _quintic_slope(ty)
+        f = _q66(c, p, stride, wx, wy) * _F(1 / 14400)
+        fx, fy = _q66(c, p, stride, sx, wy) * _F(1 / 14400), _q66(c, p, stride, wx, sy) * _F(1 / 14400)
+    else:
+        p -= stride + _U(1)
         vx, vy, rx, ry = _cubic(tx), _cubic(ty), _cubic_slope(tx), _cubic_slope(ty)
-        for lane in range(count):
-            f = fx = fy = _F(0)
-            for k in range(_U(4)):
-                p = b + lane + k * stride
-                level = _row4(c, p, vx)
-                f, fx, fy = f + vy[k] * level, fx + vy[k] * _row4(c, p, rx), fy + ry[k] * level
-            m = weight[at + lane] / _F(36)
-            out_f[at + lane], out_x[at + lane], out_y[at + lane] = m * f, m * fx, m * fy
+        f = _c44(c, p, stride, vx, vy) * _F(1 / 36)
+        fx, fy = _c44(c, p, stride, rx, vy) * _F(1 / 36), _c44(c, p, stride, vx, ry) * _F(1 / 36)
+    return f, fx, fy

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
@@ -42,53 +43,84 @@ def predicted(xy: Array, parameters: Array, source: NDArray[np.int64], target: N
     return out
 
 
-def _expected(xy: Array, parameters: Array, use: NDArray[np.bool_], near: NDArray[np.int64]) -> Array:
-    """What each neighbour in use expects of the displacement of each point; NaN of the others. (n, k, 2)."""
-    source = np.maximum(near, 0)
-    d = xy[:, None] - xy[source]
-    dx, dy = np.where(use, d[..., 0], np.nan), d[..., 1]
-    half_xx, xy_, half_yy = 0.5 * dx * dx, dx * dy, 0.5 * dy * dy
-    curved = bool(np.any(parameters[:, [3, 4, 5, 9, 10, 11]]))
-    out = np.empty((*near.shape, 2))
-    for axis, at in enumerate((0, 6)):
-        p = np.ascontiguousarray(parameters[:, at : at + 6].T)
-        out[..., axis] = p[0][source] + p[1][source] * dx + p[2][source] * dy
-        if curved:
-            out[..., axis] += p[3][source] * half_xx + p[4][source] * xy_ + p[5][source] * half_yy
-    return out
-
-
 def inconsistent(xy: Array, parameters: Array, good: NDArray[np.bool_], near: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Good points that contradict the median of what their good neighbours predict, and small islands. (n,) bool.
 
     The median of affine predictions is the robust local fit: half the neighbours may be wrong.
     """
-    use = (near >= 0) & good[near] & good[:, None]
-    prediction = _expected(xy, parameters, use, near)
-    # NaN sorts last, so the median of the m others lies at their middle; a point without any has none.
-    ranked, m = np.sort(prediction, axis=1), use.sum(axis=1)
-    rows = np.arange(len(xy))
-    median = 0.5 * (ranked[rows, np.maximum(m - 1, 0) // 2] + ranked[rows, np.minimum(m // 2, near.shape[1] - 1)])
-    jump = np.hypot(*(parameters[:, [0, 6]] - median).T)
-    known = good & np.isfinite(jump)
+    jump = _jumps(xy, parameters, good, near)
+    known = np.isfinite(jump)
     scatter = 1.4826 * np.median(jump[known]) if known.any() else 0.0
     limit = max(_LEAST_JUMP, _SCATTERS * scatter)
     bad = known & (jump > limit)
-    each = np.hypot(*np.moveaxis(parameters[:, None, [0, 6]] - prediction, -1, 0))
-    agree = use & (each <= 2 * limit) & ~bad[:, None] & ~bad[np.maximum(near, 0)]
-    return bad | _islands(agree, near, good & ~bad)
+    size = _island_sizes(xy, parameters, good & ~bad, near, 2.0 * limit)
+    if size.max(initial=0) < 4 * _LEAST_ISLAND:
+        return bad
+    return bad | (good & ~bad & (size < _LEAST_ISLAND))
 
 
-def _islands(agree: NDArray[np.bool_], near: NDArray[np.int64], good: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Good points in groups of mutually agreeing neighbours too small to trust, where larger ones exist."""
-    target, slot = np.nonzero(agree)
-    n = len(near)
-    links = coo_matrix((np.ones(len(target)), (target, near[target, slot])), shape=(n, n))
-    _, label = connected_components(links, directed=False)
-    size = np.bincount(label[good], minlength=label.max(initial=0) + 1)[label]
-    if size[good].max(initial=0) < 4 * _LEAST_ISLAND:
-        return np.zeros(n, bool)
-    return good & (size < _LEAST_ISLAND)
+@nb.njit(cache=True, nogil=True)
+def _expected(xy, parameters, source, target, at):  # type: ignore[no-untyped-def]
+    """The displacement along x (at 0) or y (at 6) that a point expects of another."""
+    dx, dy, p = xy[target, 0] - xy[source, 0], xy[target, 1] - xy[source, 1], parameters[source]
+    curved = 0.5 * p[at + 3] * dx * dx + p[at + 4] * dx * dy + 0.5 * p[at + 5] * dy * dy
+    return p[at] + p[at + 1] * dx + p[at + 2] * dy + curved
+
+
+@nb.njit(cache=True, nogil=True)
+def _jumps(xy, parameters, good, near):  # type: ignore[no-untyped-def]
+    """Distance (n,) px of each good point from the median of what its good neighbours expect; NaN without any."""
+    n = len(xy)
+    out = np.full(n, np.nan)
+    expected = np.empty((2, near.shape[1]))
+    for k in range(n):
+        if not good[k]:
+            continue
+        m = 0
+        for slot in range(near.shape[1]):
+            source = near[k, slot]
+            if source >= 0 and good[source]:
+                expected[0, m] = _expected(xy, parameters, source, k, 0)
+                expected[1, m] = _expected(xy, parameters, source, k, 6)
+                m += 1
+        if m:
+            u, v = np.median(expected[0, :m]), np.median(expected[1, :m])
+            out[k] = math.hypot(parameters[k, 0] - u, parameters[k, 6] - v)
+    return out
+
+
+@nb.njit(cache=True, nogil=True)
+def _root(parent, k):  # type: ignore[no-untyped-def]
+    while parent[k] != k:
+        parent[k] = parent[parent[k]]
+        k = parent[k]
+    return k
+
+
+@nb.njit(cache=True, nogil=True)
+def _island_sizes(xy, parameters, good, near, limit):  # type: ignore[no-untyped-def]
+    """The number of good points (n,) that each good point hangs together with by mutual agreement; 0 of the others."""
+    n = len(xy)
+    parent = np.arange(n)
+    for k in range(n):
+        if not good[k]:
+            continue
+        for slot in range(near.shape[1]):
+            source = near[k, slot]
+            if source >= 0 and good[source]:
+                u = _expected(xy, parameters, source, k, 0) - parameters[k, 0]
+                v = _expected(xy, parameters, source, k, 6) - parameters[k, 6]
+                if u * u + v * v <= limit * limit:
+                    parent[_root(parent, k)] = _root(parent, source)
+    count = np.zeros(n, np.int64)
+    for k in range(n):
+        if good[k]:
+            count[_root(parent, k)] += 1
+    out = np.zeros(n, np.int64)
+    for k in range(n):
+        if good[k]:
+            out[k] = count[_root(parent, k)]
+    return out
 
 
 def local_fit(

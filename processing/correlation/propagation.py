@@ -36,7 +36,7 @@ class Field:
 
     parameters (n, 12) as in ``kernels``; tried : (n, 8) bool, neighbours a start value was taken from.
     region : the part of the current image in use, chosen by the first start values, grown when a point lies beyond.
-    filtering : seconds spent on filtering it.
+    filtering : seconds spent on filtering it. bare : (n,) bool, points without texture; None to look for them.
     """
 
     reference: Reference
@@ -46,6 +46,7 @@ class Field:
     progress: Progress | None = None
     region: Current | None = None
     filtering: float = 0.0
+    bare: NDArray[np.bool_] | None = None
     near: NDArray[np.int64] = field(init=False)
     parameters: Array = field(init=False)
     status: NDArray[np.int64] = field(init=False)
@@ -63,22 +64,28 @@ class Field:
         self.iterations = np.zeros(n, np.int64)
         self.sigma = np.full((n, 2), np.nan)
         self.tried = np.zeros((n, COUNT), bool)
-        bare = bare_points(self.reference, self.xy, self.settings)
-        self.status[bare] = Status.NO_TEXTURE
+        if self.bare is None:
+            self.bare = bare_points(self.reference, self.xy, self.settings)
+        self.status[self.bare] = Status.NO_TEXTURE
 
     @property
     def good(self) -> NDArray[np.bool_]:
         """Points matched so far. (n,) bool."""
         return self.status == Status.GOOD
 
-    def attempt(self, index: NDArray[np.int64], start: Array, zncc_min: float | None = None) -> NDArray[np.bool_]:
+    def attempt(
+        self, index: NDArray[np.int64], start: Array, zncc_min: float | None = None, follow: bool = False
+    ) -> NDArray[np.bool_]:
         """Refine points (k,) from start values (k, 12) and keep what is good; true where it was. (k,) bool.
 
+        follow : a point beside one just matched starts from it, if it agrees with the start value.
         A result must look alike (ZNCC) and lie within a step of its start value.
         """
         part = self.region if self.region is not None else self.current.around(*self._reached(start, index))
         self._filter(part)
-        status, zncc, iterations, sigma, found = refine(self.reference, part, self.xy[index], start, self.settings)
+        status, zncc, iterations, sigma, found = refine(
+            self.reference, part, self.xy[index], start, self.settings, follow
+        )
         beyond = np.flatnonzero(status == Status.OUTSIDE)
         if part is not self.current and len(beyond):  # of the region, but perhaps not of the image
             part = self.current
@@ -168,14 +175,16 @@ class Field:
                 return
             self.propagate()
 
-    def reject_outliers(self) -> None:
-        """Points that contradict their neighbours become lost, until none does."""
-        for _ in range(5):
+    def reject_outliers(self) -> bool:
+        """Points that contradict their neighbours become lost, until none does. True if any did."""
+        for k in range(5):
             bad = inconsistent(self.xy, self.parameters, self.good, self.near)
             if not bad.any():
-                return
+                return k > 0
             self.status[bad] = Status.INCONSISTENT
             self.parameters[bad], self.zncc[bad], self.sigma[bad] = np.nan, np.nan, np.nan
+            self.tried[bad] = False  # another neighbour may lead elsewhere
+        return True
 
     def _has_good_neighbour(self) -> NDArray[np.bool_]:
         return np.asarray(((self.near >= 0) & self.good[self.near]).any(axis=1))
@@ -217,15 +226,20 @@ def _degenerate(parameters: Array) -> NDArray[np.bool_]:
 
 
 def refine(
-    reference: Reference, current: Current, xy: Array, start: Array, settings: CorrelationSettings
+    reference: Reference,
+    current: Current,
+    xy: Array,
+    start: Array,
+    settings: CorrelationSettings,
+    follow: bool = False,
 ) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array, Array]:
     """IC-GN of points xy (n, 2) from start values (n, 12), NaN rows left out.
 
     Returns status (n,), ZNCC (n,), iterations (n,), sigma (n, 2) px and parameters (n, 12), all as the kernel left
-    them: nothing is judged here.
+    them: nothing is judged here. follow : a point beside one just matched starts from it, if it agrees.
     """
-    n = len(xy)
-    parameters = np.array(start, dtype=np.float64)
+    n, order = len(xy), _tiles(xy, settings)
+    xy, parameters = np.ascontiguousarray(xy[order], dtype=np.float64), np.array(start[order], dtype=np.float64)
     known = np.isfinite(parameters).all(axis=1)
     status = np.full(n, Status.NOT_REACHED, np.int64)
     zncc, sigma = np.full(n, np.nan), np.full((n, 2), np.nan)
@@ -239,7 +253,7 @@ def refine(
         reference.origin,
         current.coef,
         current.origin,
-        np.ascontiguousarray(xy, dtype=np.float64),
+        xy,
         parameters,
         known,
         settings.radius,
@@ -250,9 +264,18 @@ def refine(
         settings.max_iterations,
         settings.texture_min * reference.grey_range / 255.0,
         settings.noise or 0.0,
+        1.6 * settings.step if follow else 0.0,
         status,
         zncc,
         iterations,
         sigma,
     )
-    return status, zncc, iterations, sigma, parameters
+    back = np.argsort(order)
+    return status[back], zncc[back], iterations[back], sigma[back], parameters[back]
+
+
+def _tiles(xy: Array, settings: CorrelationSettings) -> NDArray[np.int64]:
+    """An order of points xy (n, 2) in which points that share pixels follow one another. (n,)."""
+    side = max(8.0 * settings.step, 2.0 * settings.radius)
+    column, row = np.floor(xy / side).T
+    return np.lexsort((xy[:, 1], xy[:, 0], row, column))

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 _SEEDS = 150
 _FLOW_SIDE = 700  # px of the longer side of the reduced region
 _FLOW_MARGIN = 96  # px around the region
+_LEVELLED = 35  # px of the reduced image over which mean and contrast are levelled
 _SEARCH = 160  # px, largest displacement of the template search
 
 
@@ -49,7 +50,7 @@ def flow_starts(reference: Reference, current: Current, xy: Array, radius: int) 
     height, width = min(ref.shape[0], cur.shape[0]), min(ref.shape[1], cur.shape[1])
     if min(height, width) < 16:
         return np.full((len(xy), 12), np.nan)
-    flow_search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow_search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     flow = flow_search.calc(ref[:height, :width], cur[:height, :width], np.zeros((height, width, 2), np.float32))
     flow = cv2.GaussianBlur(flow, (0, 0), max(0.25 * radius * scale, 0.5)) / scale
     at = _reduced_position(xy - (x0, y0), scale)
@@ -89,9 +90,9 @@ def _reduced(image: NDArray, scale: float) -> NDArray[np.uint8]:
     if scale < 1.0:
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     level = grey.astype(np.float32)
-    mean = cv2.GaussianBlur(level, (0, 0), 10)
-    spread_of = np.sqrt(np.maximum(cv2.GaussianBlur((level - mean) ** 2, (0, 0), 10), 4.0))
-    return np.clip(128.0 + 40.0 * (level - mean) / spread_of, 0, 255).astype(np.uint8)
+    level -= cv2.blur(level, (_LEVELLED, _LEVELLED))
+    spread_of = np.sqrt(np.maximum(cv2.blur(level * level, (_LEVELLED, _LEVELLED)), 4.0))
+    return np.clip(128.0 + 40.0 * level / spread_of, 0, 255).astype(np.uint8)
 
 
 def _reduced_position(xy: Array, scale: float) -> Array:

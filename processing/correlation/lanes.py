@@ -1,0 +1,287 @@
+"""Sixteen numbers at once, as a value of numba's: a LLVM vector with arithmetic, loads, selects and sums.
+
+A loop over sixteen pixels that numba is to vectorise keeps no sums in registers from one row to the next, and which of
+its loads become gathers is the optimiser's choice. With the vector as a value nothing is left to it, and the code of
+an equation stays the code of the equation: + - * with vectors and scalars, ``>=``, ``select``, ``load``, ``total``.
+A processor without such wide registers computes the same in parts.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import llvmlite.ir as ir
+from llvmlite.binding import get_host_cpu_features
+from numba import extending
+from numba.core import cgutils, types
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import lower_builtin, models, register_model
+
+LANES = 16
+intrinsic: Any = extending.intrinsic  # its own type hides the arguments of what it makes
+_FLAGS = ("contract", "reassoc", "arcp", "nsz")  # no order of sums is promised, NaN is
+_INDEX = ir.VectorType(ir.IntType(32), LANES)
+
+
+class Lanes(types.Type):
+    """Sixteen numbers of one float type."""
+
+    def __init__(self, dtype: types.Float) -> None:
+        super().__init__(f"Lanes({dtype})")
+        self.dtype = dtype
+
+
+class Choice(types.Type):
+    """Sixteen truth values."""
+
+    def __init__(self) -> None:
+        super().__init__("Choice")
+
+
+_CHOICE = Choice()
+
+
+def _vector(dtype: types.Float) -> ir.VectorType:
+    return ir.VectorType(ir.FloatType() if dtype == types.float32 else ir.DoubleType(), LANES)
+
+
+@register_model(Lanes)
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, dmm: Any, fe_type: Lanes) -> None:
+        super().__init__(dmm, fe_type, _vector(fe_type.dtype))
+
+
+@register_model(Choice)
+class _ChoiceModel(models.PrimitiveModel):
+    def __init__(self, dmm: Any, fe_type: Choice) -> None:
+        super().__init__(dmm, fe_type, ir.VectorType(ir.IntType(1), LANES))
+
+
+def _repeat(builder: Any, scalar: Any) -> Any:
+    """The vector whose lanes are all the scalar."""
+    vector = ir.VectorType(scalar.type, LANES)
+    first = builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), ir.Constant(_INDEX, [0] * LANES))
+
+
+def _as_lanes(context: Any, builder: Any, value: Any, kind: Any, lanes: Lanes) -> Any:
+    return value if isinstance(kind, Lanes) else _repeat(builder, context.cast(builder, value, kind, lanes.dtype))
+
+
+def _define(symbol: Callable[..., Any], result: Callable[[Lanes], Any], emit: Callable[[Any, Any, Any], Any]) -> None:
+    """One operator between vectors, or a vector and a scalar on either side."""
+
+    @infer_global(symbol)
+    class _Typing(AbstractTemplate):
+        def generic(self, args: Any, kws: Any) -> Any:
+            lanes = [a for a in args if isinstance(a, Lanes)]
+            if len(args) == 2 and lanes and all(isinstance(a, (Lanes, types.Number)) for a in args):
+                return signature(result(lanes[0]), *args) if len(set(lanes)) == 1 else None
+            return None
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        lanes = next(a for a in sig.args if isinstance(a, Lanes))
+        one, other = (_as_lanes(context, builder, v, k, lanes) for v, k in zip(args, sig.args, strict=True))
+        return emit(builder, one, other)
+
+    for kinds in ((Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes)):
+        lower_builtin(symbol, *kinds)(lower)
+
+
+def _arithmetic(method: str) -> Callable[[Any, Any, Any], Any]:
+    return lambda builder, x, y: getattr(builder, method)(x, y, flags=_FLAGS)
+
+
+for _symbols, _method in (
+    ((operator.add, operator.iadd), "fadd"),
+    ((operator.sub, operator.isub), "fsub"),
+    ((operator.mul, operator.imul), "fmul"),
+):
+    for _symbol in _symbols:
+        _define(_symbol, lambda kind: kind, _arithmetic(_method))
+_define(operator.ge, lambda k: _CHOICE, lambda b, x, y: b.fcmp_ordered(">=", x, y))
+
+
+@intrinsic
+def pointer(typingctx, array):  # type: ignore[no-untyped-def]
+    """Where an array's numbers begin. It does not keep the array: one that an argument holds, or the caller."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return cgutils.create_struct_proxy(sig.args[0])(context, builder, args[0]).data
+
+    return types.CPointer(array.dtype)(array), codegen
+
+
+def _address(builder: Any, start: Any, index: Any, kind: ir.Type) -> Any:
+    return builder.bitcast(builder.gep(start, [index]), kind.as_pointer())
+
+
+@intrinsic
+def load(typingctx, start, index):  # type: ignore[no-untyped-def]
+    """The sixteen numbers from start[index] on."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.load(_address(builder, args[0], args[1], _vector(sig.return_type.dtype)), align=_width(sig) // 8)
+
+    return Lanes(start.dtype)(start, index), codegen
+
+
+def _width(sig: Any) -> int:
+    dtype = sig.args[0].dtype
+    return int(dtype.bitwidth)
+
+
+@intrinsic
+def store(typingctx, start, index, value):  # type: ignore[no-untyped-def]
+    """start[index] and the fifteen after it become the value's."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        builder.store(args[2], _address(builder, args[0], args[1], args[2].type), align=_width(sig) // 8)
+        return context.get_dummy_value()
+
+    return types.void(start, index, value), codegen
+
+
+@intrinsic
+def number(typingctx, start, index):  # type: ignore[no-untyped-def]
+    """start[index]."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.load(builder.gep(args[0], [args[1]]))
+
+    return start.dtype(start, index), codegen
+
+
+@intrinsic
+def put(typingctx, start, index, value):  # type: ignore[no-untyped-def]
+    """start[index] becomes the value."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        builder.store(context.cast(builder, args[2], value, start.dtype), builder.gep(args[0], [args[1]]))
+        return context.get_dummy_value()
+
+    return types.void(start, index, value), codegen
+
+
+@intrinsic
+def store_whole(typingctx, start, index, value):  # type: ignore[no-untyped-def]
+    """start[index] and the fifteen after it, int32, become the value's whole numbers."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        builder.store(builder.fptosi(args[2], _INDEX), _address(builder, args[0], args[1], _INDEX), align=4)
+        return context.get_dummy_value()
+
+    return types.void(start, index, value), codegen
+
+
+@intrinsic
+def chosen(typingctx, bits):  # type: ignore[no-untyped-def]
+    """The choice whose lane k is bit k of a uint16."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.bitcast(args[0], ir.VectorType(ir.IntType(1), LANES))
+
+    return _CHOICE(types.uint16), codegen
+
+
+@intrinsic
+def marked(typingctx, start, index):  # type: ignore[no-untyped-def]
+    """Which of the sixteen bytes from start[index] on are not zero, as bits of a uint16."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        kind = ir.VectorType(ir.IntType(8), LANES)
+        bytes_ = builder.load(_address(builder, args[0], args[1], kind), align=1)
+        return builder.bitcast(builder.icmp_unsigned("!=", bytes_, ir.Constant(kind, [0] * LANES)), ir.IntType(16))
+
+    return types.uint16(start, index), codegen
+
+
+@intrinsic
+def ramp(typingctx, start):  # type: ignore[no-untyped-def]
+    """0, 1 … 15, of the pointer's type."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return ir.Constant(_vector(sig.return_type.dtype), [float(k) for k in range(LANES)])
+
+    return Lanes(start.dtype)(start), codegen
+
+
+@intrinsic
+def select(typingctx, choice, one, other):  # type: ignore[no-untyped-def]
+    """Lane by lane ``one`` where the choice is true, else ``other``; either may be a scalar."""
+    lanes = one if isinstance(one, Lanes) else other
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        one, other = (_as_lanes(context, builder, v, k, lanes) for v, k in zip(args[1:], sig.args[1:], strict=True))
+        return builder.select(args[0], one, other)
+
+    return lanes(choice, one, other), codegen
+
+
+def _call(builder: Any, name: str, kind: Any, *args: Any, fast: bool = False) -> Any:
+    function = cgutils.get_or_insert_function(
+        builder.module, ir.FunctionType(kind, [a.type for a in args]), f"llvm.{name}"
+    )
+    return builder.call(function, args, fastmath=_FLAGS if fast else ())
+
+
+def _suffix(lanes: Lanes) -> str:
+    return f"v{LANES}f{lanes.dtype.bitwidth}"
+
+
+@intrinsic
+def floor(typingctx, value):  # type: ignore[no-untyped-def]
+    """The whole number at or below, lane by lane."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return _call(builder, f"floor.{_suffix(value)}", args[0].type, args[0])
+
+    return value(value), codegen
+
+
+@intrinsic
+def magnitude(typingctx, value):  # type: ignore[no-untyped-def]
+    """The absolute value, lane by lane."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return _call(builder, f"fabs.{_suffix(value)}", args[0].type, args[0])
+
+    return value(value), codegen
+
+
+@intrinsic
+def total(typingctx, value):  # type: ignore[no-untyped-def]
+    """The sum of the lanes, in double precision from there on."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        kind = args[0].type.element
+        summed = _call(
+            builder, f"vector.reduce.fadd.{_suffix(value)}", kind, ir.Constant(kind, 0.0), args[0], fast=True
+        )
+        return context.cast(builder, summed, value.dtype, types.float64)
+
+    return types.float64(value), codegen
+
+
+@intrinsic
+def picked(typingctx, start, index, which):  # type: ignore[no-untyped-def]
+    """start[index + which], ``which`` a whole number of 0 … 31 for each lane."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        lane = builder.fptosi(args[2], _INDEX)
+        kind = _vector(sig.return_type.dtype)
+        near = builder.load(_address(builder, args[0], args[1], kind), align=4)
+        if sig.return_type.dtype == types.float32 and get_host_cpu_features().get("avx512f"):
+            beyond = builder.add(args[1], ir.Constant(args[1].type, LANES))
+            far = builder.load(_address(builder, args[0], beyond, kind), align=4)
+            return _call(builder, "x86.avx512.vpermi2var.ps.512", kind, near, lane, far)
+        out = near
+        for k in range(LANES):
+            at = ir.Constant(ir.IntType(32), k)
+            index = builder.add(args[1], builder.zext(builder.extract_element(lane, at), args[1].type))
+            out = builder.insert_element(out, builder.load(builder.gep(args[0], [index])), at)
+        return out
+
+    return Lanes(start.dtype)(start, index, which), codegen
