@@ -25,7 +25,7 @@ _SLOPES = 1.894
 # What is no noise goes with the slopes: it counts as much more than an even spread over the subset as they are peaked,
 # less what signs that change along an edge cancel. The share is a measured one: views 30° apart and 10 % of stretch,
 # speckles of 7 and 14 px.
-_LEFT = 0.7
+_LEFT = 0.9
 
 
 @dataclass(frozen=True)

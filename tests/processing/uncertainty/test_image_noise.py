@@ -45,8 +45,8 @@ def test_a_camera_is_no_noisier_than_its_matches_in_time_show_and_not_much_quiet
     shown = 1.85 * 4.0 / contrast**2  # of a variance of 4, the interpolation letting 0.85 of the second image's through
     c_ls = np.stack([np.full(50, 9.0 * shown), np.full(50, shown), np.full(50, np.nan)])
     assert camera_noise(100.0, c_ls, contrast) == pytest.approx(4.0)
-    assert camera_noise(3.0, c_ls, contrast) == 3.0
-    assert camera_noise(0.1, c_ls, contrast) == pytest.approx(0.55 * 4.0)
+    assert 3.0 < camera_noise(3.0, c_ls, contrast) < 4.0
+    assert 0.55 * 4.0 < camera_noise(0.1, c_ls, contrast) < 4.0
     assert camera_noise(3.0, c_ls[2:], contrast) == 3.0  # nothing to judge by
 
 
