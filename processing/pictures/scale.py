@@ -55,8 +55,8 @@ class Scale:
 
     def bar(self, height: int) -> Picture:
         """The colour bar with its title as a picture of its own, (height, ·, 3), black on white."""
-        dpi = max(60.0, height / 5.0)
-        picture = Figure(figsize=(1.25, height / dpi), dpi=dpi, layout="constrained")
+        dpi = max(70.0, height / 7.0)
+        picture = Figure(figsize=(1.15, height / dpi), dpi=dpi, layout="constrained")
         axes = picture.subplots()
         bar = picture.colorbar(self.mappable(), cax=axes)
         bar.ax.tick_params(labelsize=8)
@@ -82,6 +82,13 @@ def on_faces(seen: Evaluated, entry: Field, values: Array, step: int) -> Array:
         values = values[faces].mean(axis=1)
     lost = ~np.isfinite(seen.results.vertices[step]).all(axis=1)
     return np.asarray(np.where(lost[faces].any(axis=1), np.nan, values))
+
+
+def palette(scale: Scale) -> Picture:
+    """256 colours (256, 3) that a drawing in this scale is made of: the scale's own and greys for lines and letters."""
+    steps = scale.colours(np.linspace(scale.low, scale.high, 224))
+    greys = np.repeat(np.linspace(0.0, 1.0, 32)[:, None], 3, axis=1)
+    return np.rint(255.0 * np.concatenate([steps, greys])).astype(np.uint8)
 
 
 def looked_up(faces: NDArray[np.int32], values: Array, scale: Scale) -> Array:

@@ -12,7 +12,10 @@ from typing import Any
 from matplotlib.figure import Figure
 from PIL import Image
 
+from processing.pictures.scale import Picture
+
 UNKNOWN = "not recorded"
+_DPI = 105
 
 _STYLE = """
 :root { color-scheme: light; --line: #d5d9de; --soft: #f4f6f8; --text: #1b2530; --muted: #5b6773; --mark: #2f6fb3; }
@@ -29,7 +32,7 @@ table { border-collapse: collapse; margin: .5rem 0; font-size: .88rem; font-vari
 caption { text-align: left; color: var(--muted); padding: .2rem 0; }
 th, td { border-bottom: 1px solid var(--line); padding: .25rem .7rem .25rem 0; text-align: left; vertical-align: top; }
 thead th { border-bottom: 2px solid var(--line); background: #fff; }
-td.number, th.number { text-align: right; white-space: nowrap; }
+td.number, th.number { text-align: right; } td.number { white-space: nowrap; } thead th { vertical-align: bottom; }
 table.facts th { font-weight: 500; width: 17rem; } table.facts td { max-width: 50rem; }
 ul.sentences { margin: .4rem 0; padding-left: 1.2rem; } ul.warnings li::marker { color: #b3261e; }
 figure { margin: .8rem 0 1.4rem; } figure img { max-width: 100%; height: auto; display: block; }
@@ -98,11 +101,17 @@ class Document:
         """Text as it stands, such as a file's."""
         self._body.append(f'<pre id="{escape(key)}" tabindex="0">{escape(text)}</pre>')
 
-    def picture(self, key: str, drawn: Figure, description: str, dpi: float = 110.0) -> None:
-        """A drawing, embedded as a PNG of at most 256 colours."""
+    def picture(
+        self, key: str, drawn: Figure, description: str, colours: Picture | None = None, dpi: float = 110.0
+    ) -> None:
+        """A drawing, embedded as a PNG of 256 colours: those given (256, 3), else the most frequent ones."""
         made = io.BytesIO()
-        drawn.savefig(made, format="png", dpi=dpi)
-        few = Image.open(made).convert("RGB").quantize(256, dither=Image.Dither.NONE)
+        drawn.savefig(made, format="png", dpi=_DPI)
+        palette = None
+        if colours is not None:
+            palette = Image.new("P", (1, 1))
+            palette.putpalette(colours.ravel().tolist())
+        few = Image.open(made).convert("RGB").quantize(256, palette=palette, dither=Image.Dither.NONE)
         small = io.BytesIO()
         few.save(small, format="png", optimize=True)
         source = base64.b64encode(small.getvalue()).decode("ascii")

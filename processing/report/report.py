@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from uuid import uuid4
 
 import numpy as np
 
 from processing.errors import InputError
 from processing.evaluation import Evaluated, evaluated
 from processing.mesh import Mesh
-from processing.pictures.scale import Scale
-from processing.pictures.views import from_side, mean_azimuth, unrolled
+from processing.pictures.scale import Scale, palette
+from processing.pictures.views import View, from_side, mean_azimuth, unrolled
 from processing.report import plots, tables
 from processing.report.document import Document, figure
 from processing.report.gathered import Gathered, gather
@@ -67,15 +68,20 @@ def write_report(
     _pictures(document, seen, gathered, lambda share: progress(0.5 + 0.45 * share))
     document.section("settings", "Settings of the run")
     document.verbatim("settings-toml", results.settings)
-    out.write_text(document.to_html(), encoding="utf-8")
+    aside = out.with_name(f".{out.name}.{uuid4().hex}.partial")
+    try:
+        aside.write_text(document.to_html(), encoding="utf-8")
+        aside.replace(out)
+    finally:
+        aside.unlink(missing_ok=True)
     progress(1.0)
     return out
 
 
 def _summary(document: Document, results: Results) -> None:
     document.section("summary", "At a glance")
-    rows = results.summary.get("table", [])
-    document.facts("figures", {row["figure"]: row["value"] for row in rows if row["figure"] != "warning"})
+    rows = [list(row.values()) for row in results.summary.get("table", []) if row.get("figure") != "warning"]
+    document.facts("figures", {str(row[0]): row[1] for row in rows if len(row) > 1})
     warnings = results.summary.get("warnings", [])
     document.heading("Warnings")
     if warnings:
@@ -120,7 +126,9 @@ def _pictures(document: Document, seen: Evaluated, gathered: Gathered, progress:
         for name in chosen:
             if name in gathered.scales:
                 scale = gathered.scales[name]
-                document.picture(f"map-{name}", plots.maps(gathered, scale, views), _caption(scale), dpi=100)
+                document.picture(
+                    f"map-{name}", plots.maps(gathered, scale, views), _caption(scale), palette(scale), dpi=100
+                )
                 done += 1
                 progress(0.2 + 0.8 * done / len(gathered.scales))
 
@@ -160,7 +168,7 @@ def _views(seen: Evaluated, steps: Sequence[int]) -> list[plots.StepViews]:
     made = []
     for step in steps:
         mesh = Mesh(seen.positions(step), seen.results.faces)
-        sides = []
+        sides: list[tuple[str, View]] = []
         for azimuth in (front, front + np.pi) if mesh.whole_faces().any() else ():
             view = from_side(mesh, azimuth)
             if not sides or view.outside_share > _WORTHWHILE:
