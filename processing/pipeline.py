@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from processing import summary
+from processing import noise_floor, summary
 from processing.calibration.quality import ReconstructionError
 from processing.camera import Camera
 from processing.correlation import CorrelationSettings
@@ -50,7 +50,7 @@ def process_session(path: Path, settings: Settings, report: Report = silent) -> 
     began = time.monotonic()
     stages = Stages(_WEIGHTS, report)
     session = read_session(path)
-    steps = _specimen_steps(session)
+    steps = _with_captures_at_rest(session)
     stages.at("prepare", 0.0, "loading the correlation kernels (compiled at the first use)")
     load_kernels()
     stages.at("calibrate", 0.0)
@@ -63,7 +63,9 @@ def process_session(path: Path, settings: Settings, report: Report = silent) -> 
         surfaces, more_warnings = _surfaces(session, ring, tuple(errors), steps, settings, stages)
         results, agreement = pairs_surface(session, ring, surfaces, steps, settings)
         drift = {"-".join(surface.matches.cameras): surface.drift for surface in surfaces}
+    results, drift, floor = _noise_floor(results, drift, steps)
     found = summary.summarise(results, ring, errors, drift, agreement, (*ring.warnings, *warnings, *more_warnings))
+    found["noise_floor"] = floor
     for warning in found["warnings"]:
         log.warning("%s", warning)
     return _keep(session, results, found, ring, errors, settings, stages, began)
@@ -74,6 +76,24 @@ def _specimen_steps(session: Session) -> tuple[Capture, ...]:
     if not steps:
         raise InputError(f"{session.path}: no capture of the specimen; capture or import the reference and the steps")
     return steps
+
+
+def _with_captures_at_rest(session: Session) -> tuple[Capture, ...]:
+    """The steps, and right after the reference, where nothing has moved yet, the captures at rest."""
+    steps = _specimen_steps(session)
+    return (steps[0], *session.of_kind("static"), *steps[1:])
+
+
+def _noise_floor(
+    results: Results, drift: dict[str, NDArray[np.float64]], steps: tuple[Capture, ...]
+) -> tuple[Results, dict[str, NDArray[np.float64]], dict[str, Any] | None]:
+    """The results and the drift without the captures at rest, and the noise floor that these show."""
+    at_rest = [k for k, step in enumerate(steps) if step.kind == "static"]
+    if not at_rest:
+        return results, drift, None
+    kept = [k for k in range(len(steps)) if k not in at_rest]
+    floor = noise_floor.noise_floor(noise_floor.part(results, [0, *at_rest]))
+    return noise_floor.part(results, kept), {who: values[kept] for who, values in drift.items()}, floor
 
 
 def _usable_pairs(

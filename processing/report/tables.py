@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from processing.correlation.status import Status
 from processing.measure.window_study import gauge
+from processing.outliers import Lost
 from processing.report.document import UNKNOWN, Document, figure
 from processing.report.hardware import CameraFacts
 from processing.results import Results
@@ -19,14 +20,17 @@ from processing.settings import Settings
 
 Array = NDArray[np.float64]
 
-_REASONS = {
+_REASONS: dict[int, str] = {
     Status.GOOD: "measured",
     Status.NOT_REACHED: "no start value led to it",
     Status.NO_CONVERGENCE: "the iteration did not settle",
     Status.LOW_ZNCC: "the images do not look alike there",
-    Status.INCONSISTENT: "it contradicts its neighbours, its cameras or its own uncertainty",
+    Status.INCONSISTENT: "it contradicts its neighbours",
     Status.OUTSIDE: "it left the image",
     Status.NO_TEXTURE: "too little pattern, or too few pixels inside the mask",
+    Lost.RESIDUAL: "its cameras contradict one another, or too few see it",
+    Lost.UNCERTAIN: "its match is too uncertain",
+    Lost.SURFACE: "it stands out of the surface",
 }
 
 
@@ -196,10 +200,10 @@ def steps(document: Document, session: Session, results: Results) -> None:
         "Displacement, stretches and strain: medians over the surface.",
     )  # fmt: skip
     document.heading("Points lost, by reason")
-    present = [status for status in Status if (results.status == status).any()]
+    present = [int(status) for status in np.unique(results.status)]
     document.table(
         "lost",
-        ("step", *(_REASONS[status] for status in present)),
+        ("step", *(_REASONS.get(status, f"status {status}") for status in present)),
         ((name, *(int((results.status[k] == status).sum()) for status in present))
          for k, name in enumerate(results.steps)),
         "Numbers of points of the surface found at the reference; what has no point there is not counted.",
