@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import FileResponse
+from fastapi.responses import FileResponse, HTMLResponse
 from numpy.typing import NDArray
 
 from controller.desk import Desk, NotFoundError
@@ -39,6 +39,18 @@ def header(session: str, run: str, desk: TheDesk) -> dict[str, Any]:
 def file(session: str, run: str, desk: TheDesk) -> FileResponse:
     """VTKHDF form: opens in ParaView."""
     return FileResponse(_file(desk, session, run), filename=f"{session}-{run}.h5")
+
+
+@router.get("/{run}/report", response_class=HTMLResponse, summary="The run's report: one page of HTML")
+def report(session: str, run: str, desk: TheDesk) -> Response:
+    """Made when it is first asked for, which takes a while, and kept beside the results."""
+    results = _file(desk, session, run)
+    path = results.with_name("report.html")
+    if not path.is_file() or path.stat().st_mtime_ns < results.stat().st_mtime_ns:
+        from processing.report import write_report  # draws; the page is served without it
+
+        write_report(desk.catalogue.path(session), path, int(run))
+    return FileResponse(path, media_type="text/html", headers={"Cache-Control": "no-cache"})
 
 
 @router.get("/{run}/faces", response_class=Response, responses=_BINARY, summary="Triangles: uint32 (faces, 3)")

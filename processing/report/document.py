@@ -29,7 +29,6 @@ nav ul { display: flex; flex-wrap: wrap; gap: .2rem 1.1rem; list-style: none; ma
 a { color: var(--mark); }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; margin: .5rem 0; font-size: .88rem; font-variant-numeric: tabular-nums; }
-caption { text-align: left; color: var(--muted); padding: .2rem 0; }
 th, td { border-bottom: 1px solid var(--line); padding: .25rem .7rem .25rem 0; text-align: left; vertical-align: top; }
 thead th { border-bottom: 2px solid var(--line); background: #fff; }
 td.number, th.number { text-align: right; } td.number { white-space: nowrap; } thead th { vertical-align: bottom; }
@@ -91,9 +90,10 @@ class Document:
         body = "".join(
             "<tr>" + "".join(_cell(value, n) for value, n in zip(row, numeric, strict=True)) + "</tr>" for row in rows
         )
-        caption = f"<caption>{escape(caption)}</caption>" if caption else ""
+        told = f'<p class="muted" id="{escape(key)}-caption">{escape(caption)}</p>' if caption else ""
+        named = f' aria-describedby="{escape(key)}-caption"' if caption else ""
         self._body.append(
-            f'<div class="wide"><table id="{escape(key)}">{caption}<thead><tr>{head}</tr></thead>'
+            f'{told}<div class="wide"><table id="{escape(key)}"{named}><thead><tr>{head}</tr></thead>'
             f"<tbody>{body}</tbody></table></div>"
         )
 

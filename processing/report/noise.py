@@ -47,8 +47,8 @@ def noise(document: Document, results: Results, gathered: Gathered) -> None:
         document.text(
             f"{floor['captures']} captures of kind 'static' were followed as if they were steps. The surface did not "
             "move: what is measured is noise, and with the rigid motion removed, noise without a common drift. The "
-            f"median displacement of a capture is at most {figure(floor['moved_mm'], 3)} mm; one far above the rest after "
-            "the rigid motion tells of cameras or of a specimen that did move."
+            f"median displacement of a capture is at most {figure(floor['moved_mm'], 3)} mm; one far above what stays "
+            "after the rigid motion tells of cameras or of a specimen that did move."
         )
         document.table(
             "noise-floor",

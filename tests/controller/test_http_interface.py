@@ -242,3 +242,15 @@ def test_nothing_is_fetched_from_another_host(client) -> None:
     assert client.get("/openapi.json").json()["info"]["title"] == "RingDIC controller"
     for viewer in ("/docs", "/redoc"):  # their pages would load scripts from elsewhere
         assert client.get(viewer).status_code == 404
+
+
+def test_a_run_has_a_report_that_is_made_once_and_kept_beside_the_results(processed) -> None:
+    run = processed.get(f"{API}/sessions/limb/results").json()[-1]["run"]
+    address = f"{API}/sessions/limb/results/{run}/report"
+    first, second = processed.get(address), processed.get(address)
+    assert first.status_code == 200, first.text
+    assert first.headers["content-type"].startswith("text/html")
+    assert f"report of run {run}" in first.text
+    assert "Larger stretch λ2" in first.text
+    assert second.headers["last-modified"] == first.headers["last-modified"]
+    assert processed.get(f"{API}/sessions/limb/results/0099/report").status_code == 404

@@ -83,6 +83,7 @@ async function openRun() {
   setOptions(byId("field"), options, options.some(({ value }) => value === before) ? before : FIRST_FIELD);
   byId("step").max = String(header.steps.length - 1);
   byId("step").value = String(header.steps.length - 1);
+  byId("report").href = url("sessions", header.session, "results", header.run, "report");
   byId("download").href = url("sessions", header.session, "results", header.run, "file");
   const faces = await bytes("faces");
   if (header !== opened) return; // another run was chosen meanwhile
