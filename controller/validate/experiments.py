@@ -40,7 +40,8 @@ _SCENES = {
 class Validation:
     """The rig, the folder of everything written, and the ways of processing by name.
 
-    Sessions and results that are there already are used again where they were made with the same settings.
+    Sessions and results that are there already are used again where they were made with the same settings; a run is
+    not repeated when the program changes: remove ``sessions/*/results`` for that.
     """
 
     folder: Path

@@ -137,7 +137,7 @@ def spoilt(
         Figure(what, "blind area, fewer than two clean views", "cm²", blind_area, digits=1),
         Figure(what, "lost area", "cm²", lost_area, digits=1),
         Figure(what, "lost / spoilt area", "", to_spoilt, "", 1.2, digits=2),
-        Figure(what, "lost / blind area", "", to_blind, digits=2),
+        Figure(what, "lost / blind area", "", to_blind, "", 1.2, digits=2),
         Figure(what, "lost points without a reason", "", named, "", 0.0, digits=0, note="; ".join(reasons)),
     )
     return Findings(figures, {"hit": hit, "blind": blind, "grid": grids[0], "lost": gone})
