@@ -22,15 +22,15 @@ from node_agent.virtual_rig.scenes import Board, Scene, Specimen, Target
 from node_agent.virtual_rig.scenes import scene as make_scene
 from node_agent.virtual_rig.scenes.board import MARGIN, SQUARE, SQUARES
 from node_agent.virtual_rig.scenes.damage import BAR, GLARE_PEAK, GLARE_WIDTH, Damage
-from node_agent.virtual_rig.sensor import expose
+from node_agent.virtual_rig.sensor import POINT_SPREAD, blurred, expose
 from node_agent.virtual_rig.texture import RADIUS, checker, covered, dots, speckle
 
 Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
 
 SAMPLES = 2
-# mm of the surface: with a footprint no larger one sample will do. Against 5 x 5 samples, subsets of 41 px then lie
-# off by less than 0.0001 px on the mean and 0.0013 px each, a fifth of what the sensor's noise makes.
+# mm of the surface: with a footprint no larger one sample will do. Subsets of 41 px then lie off by less than 0.0001 px
+# on the mean and 0.0007 px each, a fifth of what the sensor's noise makes.
 FINE = 0.2
 # A compiled kernel is kept on disk under this stamp too, so it is rebuilt when any file of the renderer changes
 # (the compiler itself looks at this file alone).
@@ -55,12 +55,12 @@ def warm_up(specimen: str = "limb") -> None:
 
 
 def radiance(camera: VirtualCamera, scene: Scene) -> Radiance:
-    """The noise-free, unblurred image (height, width) of a scene, in linear light."""
+    """The noise-free image (height, width) of a scene behind the lens, in linear light."""
     out = np.zeros((camera.height, camera.width), np.float32)
     if isinstance(scene, Board):
         R, t = scene.pose(camera)
         _board_kernel(camera.lens, camera.R, camera.centre, R, t, out)
-        return out
+        return blurred(out)
     if isinstance(scene, Target):
         look = np.array([_PRINT_DOTS, 0.0, 0.0, 0.0, _TARGET_TOP, _widest(scene)])
         prints, damage, seed = scene.prints(), Damage(), 0
@@ -69,7 +69,7 @@ def radiance(camera: VirtualCamera, scene: Scene) -> Radiance:
         prints, damage, seed = np.zeros((1, 1, 2)), scene.damage, scene.seed
     marks = (prints, *damage.arrays())
     _body_kernel(camera.lens, camera.R, camera.centre, scene.body(), look, seed, marks, out)
-    return out
+    return blurred(out) if isinstance(scene, Target) else out
 
 
 def _extent(scene: Specimen) -> tuple[float, float]:
@@ -217,8 +217,9 @@ def _footprint(d, t, frame, per_x, per_y):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True)
-def _shade(o, d, p, look, seed, marks, theta, z, t, frame, per_x, per_y):  # type: ignore[no-untyped-def]
-    """Brightness of the body where a ray meets it. per_x, per_y : width of a sample at distance 1.
+def _shade(o, d, p, look, seed, marks, theta, z, t, frame, per_x, per_y, samples):  # type: ignore[no-untyped-def]
+    """Brightness of the body where a ray meets it. per_x, per_y : width of a sample at distance 1; samples : how many
+    of these a pixel is wide.
 
     marks : print errors of the target; worn patches, lamps and bars of a specimen.
     """
@@ -239,7 +240,8 @@ def _shade(o, d, p, look, seed, marks, theta, z, t, frame, per_x, per_y):  # typ
         low, high = look[1] - 3.0 + 0.5 * ragged, look[2] + 3.0 + 0.5 * ragged
         if z < low or z > high:
             return glare + light * _SKIN * (1.0 + 0.03 * math.sin(0.8 * z + 3.0 * math.sin(4.0 * theta)))
-    dark = speckle(s, z, ws, wz, seed) if look[1] < z < look[2] else 0.0
+    blur = math.sqrt((POINT_SPREAD * samples) ** 2 + 1.0 / 12.0)  # of lens and sample, in widths of a sample
+    dark = speckle(s, z, blur * ws, blur * wz, seed) if look[1] < z < look[2] else 0.0
     if dark > 0.0 and len(marks[1]):
         dark *= 1.0 - _worn(s, z, ws + wz, marks[1])
     return glare + light * (_WHITE + dark * (_BLACK - _WHITE))
@@ -338,7 +340,7 @@ def _render_body(lens, R, o, p, look, seed, marks, out):  # type: ignore[no-unty
                 ws, wz = _footprint(straight, t, middle, SAMPLES * per_x, SAMPLES * per_y)
                 if max(ws, wz) < FINE and look[3] + wz < z < look[4] - wz:
                     value = _shade(
-                        o, straight, p, look, seed, marks, theta, z, t, middle, SAMPLES * per_x, SAMPLES * per_y
+                        o, straight, p, look, seed, marks, theta, z, t, middle, SAMPLES * per_x, SAMPLES * per_y, 1
                     )
                     out[v, u] = _before_bars(o, straight, t, SAMPLES * per_x, marks[3], value)
                     continue
@@ -352,7 +354,7 @@ def _render_body(lens, R, o, p, look, seed, marks, out):  # type: ignore[no-unty
                 else:
                     theta_k, z_k, t_k, met = _on_limb_beside(o, d, p, near, theta, z, t, middle, frame)
                 if met and look[3] <= z_k <= look[4]:
-                    total += _shade(o, d, p, look, seed, marks, theta_k, z_k, t_k, frame, per_x, per_y)
+                    total += _shade(o, d, p, look, seed, marks, theta_k, z_k, t_k, frame, per_x, per_y, SAMPLES)
                 else:
                     total += _behind(o, d, p, per_x)
             out[v, u] = _before_bars(o, straight, depth, SAMPLES * per_x, marks[3], total * share * share)

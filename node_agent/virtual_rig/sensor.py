@@ -1,4 +1,4 @@
-"""From radiance to grey levels: point spread, vignetting, shot and read noise, gamma, 8 bits."""
+"""From the light behind the lens to grey levels: point spread, vignetting, shot and read noise, gamma, 8 bits."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ _VIGNETTING = 0.18  # loss in the corners
 
 
 def expose(radiance: NDArray[np.float32], seed: int) -> NDArray[np.uint8]:
-    """Grey levels (height, width), sRGB-coded, of a linear image (height, width); the same for the same seed."""
-    light = _vignetted(_blurred(radiance))
+    """Grey levels (height, width), sRGB-coded, of a linear image (height, width) behind the lens; the same for the
+    same seed."""
+    light = _vignetted(radiance)
     noise = np.random.default_rng([seed, 4500]).standard_normal(light.shape, dtype=np.float32)
     electrons = np.minimum(light, 1.0) * np.float32(FULL_WELL)
     electrons += noise * np.sqrt(np.maximum(electrons, 0.0) + np.float32(READ_NOISE**2))
@@ -25,7 +26,7 @@ def encode(linear: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 
-def _blurred(image: NDArray[np.float32]) -> NDArray[np.float32]:
+def blurred(image: NDArray[np.float32]) -> NDArray[np.float32]:
     """The point spread as two passes of a sampled Gaussian, mirrored at the rim."""
     reach = 3
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / POINT_SPREAD) ** 2)

@@ -1,8 +1,9 @@
-"""Printed patterns as signed distances in surface coordinates, averaged over the footprint of a sample.
+"""Printed patterns as signed distances in surface coordinates, averaged over what a sample sees of them.
 
 ``s`` is the arc along the circumference of the 57 mm cylinder (57 theta), ``z`` the height; both mm. ``ws`` and
 ``wz`` are the widths that one sample covers on the surface. A pattern answers with the share of the sample that is
-dark, so no pixel image is ever resampled.
+dark, so no pixel image is ever resampled. Speckles are seen through the lens's point spread at once: blurred only
+after sampling, their sharp rims would alias, as they do in no camera.
 """
 
 from __future__ import annotations
@@ -67,11 +68,32 @@ def _random(i, j, k, seed):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def speckle(s, z, ws, wz, seed):  # type: ignore[no-untyped-def]
-    """Dark share of a random pattern of disks of 1.0 … 1.6 mm on a jittered grid, seamless round the body."""
+def _spot(x, y, radius, ds, dz):  # type: ignore[no-untyped-def]
+    """Dark share at (x, y) from the centre of a disk seen through a Gaussian of deviations ds along s and dz along z.
+
+    Exact for a straight rim; the rim's curvature enters to first order, as half of it times the variance along it.
+    """
+    length = math.sqrt(x * x + y * y)
+    if length > 0.3 * radius:
+        a, b = x / length, y / length
+    else:  # the direction means nothing at the centre
+        a = b = math.sqrt(0.5)
+    across, along = a * a * ds * ds + b * b * dz * dz, b * b * ds * ds + a * a * dz * dz
+    scaled = (length - radius + along / (2.0 * radius)) / math.sqrt(2.0 * across)
+    if scaled > 4.0:
+        return 0.0
+    return 1.0 if scaled < -4.0 else 0.5 * math.erfc(scaled)
+
+
+@nb.njit(cache=True, nogil=True)
+def speckle(s, z, ds, dz, seed):  # type: ignore[no-untyped-def]
+    """Dark share of a random pattern of disks of 1.0 … 1.6 mm on a jittered grid, seamless round the body.
+
+    ds, dz : mm, standard deviations along s and z of the Gaussian that it is seen through.
+    """
     ci, cj = math.floor(s / _CELL), math.floor(z / _CELL)
-    reach = 0.8 + 0.35 * _CELL + max(ws, wz)  # largest radius, largest displacement, rim of the sample
-    dark = 0.0
+    reach = 0.8 + 0.35 * _CELL + 5.0 * max(ds, dz)  # largest radius, largest displacement, rim of the Gaussian
+    white = 1.0
     for j in range(cj - 1, cj + 2):
         if abs(z - (j + 0.5) * _CELL) > reach:
             continue
@@ -83,8 +105,8 @@ def speckle(s, z, ws, wz, seed):  # type: ignore[no-untyped-def]
             x = (i + 0.5 + 0.7 * (_random(key, row, 0, seed) - 0.5)) * _CELL
             y = (j + 0.5 + 0.7 * (_random(key, row, 1, seed) - 0.5)) * _CELL
             r = 0.5 + 0.3 * _random(key, row, 2, seed)
-            dark = min(1.0, dark + _disk(s - x, z - y, r, ws, wz))
-    return dark
+            white *= 1.0 - _spot(s - x, z - y, r, ds, dz)
+    return 1.0 - white
 
 
 @nb.njit(cache=True, nogil=True)
