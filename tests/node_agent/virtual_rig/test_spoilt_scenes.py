@@ -111,5 +111,5 @@ def test_a_finely_sampled_body_looks_as_the_mean_of_its_parts() -> None:
     middle = slice(height // 3, 2 * height // 3), slice(2 * width // 5, 3 * width // 5)
     error = (mean - four)[middle]
     assert np.std(four[middle]) > 0.2
-    assert np.std(error) < 0.02
-    assert abs(np.mean(error)) < 0.001
+    assert np.std(error) < 0.015
+    assert abs(np.mean(error)) < 0.002  # where disks overlap, the dark that they share depends on the blur
