@@ -82,9 +82,7 @@ def animate(
     out: Annotated[Path, typer.Option(help="The .gif or .mp4 file.")],
     field: FieldName = "lambda2",
     camera: Camera = None,
-    azimuth: Annotated[
-        float | None, typer.Option(help="Degrees from which the body is seen.")
-    ] = None,
+    azimuth: Annotated[float | None, typer.Option(help="Degrees from which the body is seen.")] = None,
     limits: Limits = None,
     seconds: Annotated[float, typer.Option(min=0.02, max=60.0, help="Each step is shown for.")] = 0.8,
     size: Annotated[int, typer.Option(min=64, max=4096, help="Longer side of the picture, px.")] = 720,
