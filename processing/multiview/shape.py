@@ -61,7 +61,7 @@ class ShapeSettings:
     curvature: str = "geometry"
     piece: float = 6.0
     sigma_max: float = 0.05
-    floor: float = 0.003
+    floor: float = 0.005
 
 
 @dataclass(frozen=True)
