@@ -115,8 +115,12 @@ def material(results: Results, truth: Truth) -> tuple[np.ndarray, np.ndarray, np
 def test_all_cameras_and_pairs_take_part(results: Results, shared_data: Path, way: Way, figures) -> None:
     centres = np.load(shared_data / "rendered_ring" / "limb" / "target_truth.npz")["projected_px"]
     assert len(results.cameras) == 12
-    assert len(results.pairs) == 12
-    assert set(results.vertex_pair) == set(range(12))
+    ids = [camera.id for camera in results.cameras]
+    neighbours = {frozenset(pair) for pair in zip(ids, ids[1:] + ids[:1], strict=True)}
+    pairs = {frozenset(pair) for pair in results.pairs}
+    # A triangle that one of its neighbouring cameras lost is named by the next two that have it.
+    assert pairs == neighbours if way.name == "pairs" else pairs >= neighbours
+    assert set(results.vertex_pair) == set(range(len(results.pairs)))
     worst = 0.0
     for k, camera in enumerate(results.calibration["cameras"]):
         dots = camera["dots"]
