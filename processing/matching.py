@@ -7,8 +7,9 @@ reference and again at every step, so a large motion does not matter.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,8 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 Mask = NDArray[np.bool_]
 
+_STAGES = ("prepare", "start", "refine")
+
 
 @dataclass(frozen=True)
 class PairMatches:
@@ -46,58 +49,103 @@ class PairMatches:
 
 
 @dataclass(frozen=True)
-class _Stereo:
-    """What a pair keeps from its reference step."""
+class Stereo:
+    """Two calibrated cameras, the first that of the reference image, and how they are matched."""
 
     cameras: tuple[Camera, Camera]
     search: Search
     settings: CorrelationSettings
-    radii: Array
+
+    @cached_property
+    def radii(self) -> Array:
+        """Radii (K,) mm of the sweep."""
+        return radii_of(self.cameras, self.search)
+
+    @property
+    def ids(self) -> tuple[str, str]:
+        """The cameras' ids."""
+        return self.cameras[0].id, self.cameras[1].id
 
 
-def match_pair(
-    cameras: tuple[Camera, Camera],
-    image: Callable[[str, int], Image | None],
-    steps: int,
-    mask: Mask | None,
-    search: Search,
-    settings: CorrelationSettings,
-    progress: Callable[[float], None] = lambda _: None,
-) -> PairMatches:
-    """Match all points of a pair in ``steps`` images (reference included) of both cameras.
+@dataclass(frozen=True)
+class Grid:
+    """What is matched of a pair: region (height, width) of the first camera's reference image, its points xy (n, 2) px
+    and the triangles between them (m, 3)."""
 
-    image : gives the grey image of a camera id and a step; None where a later step has none: its points are lost.
+    region: Mask
+    xy: Array
+    faces: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class StepMatches:
+    """The n points of a pair in both cameras' images of one step; NaN where a camera has no match.
+
+    px : (2, n, 2). sigma : (2, n, 2) px. c_ls : (n,), the larger. status : (n,), 0 good in both. seconds : by stage.
+    """
+
+    px: Array
+    sigma: NDArray[np.float32]
+    c_ls: NDArray[np.float32]
+    status: NDArray[np.int8]
+    seconds: dict[str, float]
+
+
+def match_reference(
+    stereo: Stereo, first: Image, second: Image, mask: Mask | None, progress: Callable[[float], None] = lambda _: None
+) -> tuple[Grid, StepMatches]:
+    """Find the region in the reference images of both cameras, lay the points and match them between the two.
+
     mask : a region drawn by the user, or None to find it.
     Raises ComputationError where the cameras share no textured surface.
     """
-    first, second = cameras
-    stereo = _Stereo(cameras, search, settings, radii_of(cameras, search))
-    reference_image, second_image = image(first.id, 0), image(second.id, 0)
-    if reference_image is None or second_image is None:
-        raise ComputationError(f"cameras {first.id} and {second.id}: the reference capture lacks an image")
-    current = prepare_current(second_image, settings=settings)
-    region, seeds, warps = _find_region(stereo, reference_image, current, mask)
+    settings = stereo.settings
+    current = prepare_current(second, settings=settings)
+    region, seeds, warps = _find_region(stereo, first, current, mask)
+    progress(0.5)
     xy, faces = grid(region, settings.step)
-    reference = prepare_reference(reference_image, region, settings)
-    images = 2 * steps - 1
-    found = {(0, 1): correlate(reference, current, xy, settings, start=_start_at(xy, seeds, warps))}
-    progress(1 / images)
-    for step in range(1, steps):
-        in_time = None
-        if (seen := image(first.id, step)) is not None:
-            in_time = correlate(reference, prepare_current(seen, settings=settings), xy, settings)
-            found[step, 0] = in_time
-        progress((2 * step) / images)
-        if in_time is not None and (seen := image(second.id, step)) is not None:
-            current = prepare_current(seen, settings=settings)
-            start = _start_after_motion(stereo, reference, current, xy, in_time)
-            if np.isfinite(start).any():
-                found[step, 1] = correlate(reference, current, xy, settings, start=start)
-        progress((2 * step + 1) / images)
-    return PairMatches(_collect((first.id, second.id), xy, found, steps), faces)
+    reference = prepare_reference(first, region, settings)
+    found = correlate(reference, current, xy, settings, start=_start_at(xy, seeds, warps))
+    return Grid(region, xy, faces), _of_step(xy, None, found, reference=True)
 
 
-def _find_region(stereo: _Stereo, image: Image, current: Current, mask: Mask | None) -> tuple[Mask, Array, Array]:
+def match_step(
+    stereo: Stereo, reference: Reference, xy: Array, first: Image | None, second: Image | None
+) -> StepMatches:
+    """Match the points xy (n, 2) px of a pair in both cameras' images of a step; None where one is missing.
+
+    The first camera's image is matched in time; the second's from there, by the calibration and a sweep, so a large
+    motion does not matter.
+    """
+    settings = stereo.settings
+    in_time = between = None
+    if first is not None:
+        in_time = correlate(reference, prepare_current(first, settings=settings), xy, settings)
+    if in_time is not None and second is not None:
+        current = prepare_current(second, settings=settings)
+        start = _start_after_motion(stereo, reference, current, xy, in_time)
+        if np.isfinite(start).any():
+            between = correlate(reference, current, xy, settings, start=start)
+    return _of_step(xy, in_time, between)
+
+
+def collect(pair: tuple[str, str], grid_: Grid, steps: Sequence[StepMatches]) -> PairMatches:
+    """The matches of all steps, the reference first."""
+    seconds = {name: float(sum(step.seconds.get(name, 0.0) for step in steps)) for name in _STAGES}
+    matches = Matches(
+        pair,
+        grid_.xy,
+        np.stack([step.px for step in steps]),
+        np.stack([step.c_ls for step in steps]).astype(float),
+        np.stack([step.sigma for step in steps]).astype(float),
+        np.stack([step.status for step in steps]),
+        np.full(len(grid_.xy), -1),
+        seconds,
+    )
+    return PairMatches(matches, grid_.faces)
+
+
+def _find_region(stereo: Stereo, image: Image, current: Current, mask: Mask | None) -> tuple[Mask, Array, Array]:
     """The region of interest (height, width), lattice positions (k, 2) px in it and their warps (k, 6)."""
     first, second = stereo.cameras
     found = sweep(stereo.cameras, image, current, mask, stereo.radii, stereo.search, stereo.settings)
@@ -128,7 +176,7 @@ def _start_at(xy: Array, seeds: Array, warps: Array) -> Array:
 
 
 def _start_after_motion(
-    stereo: _Stereo, reference: Reference, current: Current, xy: Array, in_time: Correlation
+    stereo: Stereo, reference: Reference, current: Current, xy: Array, in_time: Correlation
 ) -> Array:
     """Start values (n, 6) in the second camera's image of a later step, from the first camera's motion and a sweep."""
     settings = stereo.settings
@@ -145,24 +193,23 @@ def _start_after_motion(
     return start
 
 
-def _collect(pair: tuple[str, str], xy: Array, found: dict[tuple[int, int], Correlation], steps: int) -> Matches:
+def _of_step(
+    xy: Array, in_time: Correlation | None, between: Correlation | None, reference: bool = False
+) -> StepMatches:
+    """Both cameras' matches of a step together; at the reference the first camera's are the grid itself, exact."""
     n = len(xy)
-    px = np.full((steps, 2, n, 2), np.nan)
-    sigma = np.full((steps, 2, n, 2), np.nan)
-    c_ls = np.full((steps, n), np.nan)
-    status = np.zeros((steps, n), np.int8)
-    px[0, 0], sigma[0, 0] = xy, 0.0  # the grid itself is exact
-    for step in range(steps):
-        for camera in (1,) if step == 0 else (0, 1):
-            match = found.get((step, camera))
-            if match is None:
-                status[step] = np.where(status[step] == Status.GOOD, Status.NOT_REACHED, status[step])
-                continue
-            px[step, camera] = xy + match.uv
-            sigma[step, camera] = match.sigma
-            c_ls[step] = np.fmax(c_ls[step], match.c_ls)
-            status[step] = np.where(status[step] == Status.GOOD, match.status, status[step])
-    seconds = {
-        name: float(sum(match.seconds[name] for match in found.values())) for name in ("prepare", "start", "refine")
-    }
-    return Matches(pair, xy, px, c_ls, sigma, status, np.full(n, -1), seconds)
+    px, sigma = np.full((2, n, 2), np.nan), np.full((2, n, 2), np.nan, np.float32)
+    c_ls, status = np.full(n, np.nan, np.float32), np.full(n, Status.GOOD, np.int8)
+    seconds = dict.fromkeys(_STAGES, 0.0)
+    if reference:
+        px[0], sigma[0] = xy, 0.0
+    for camera, match in ((1, between),) if reference else ((0, in_time), (1, between)):
+        if match is None:
+            status = np.where(status == Status.GOOD, Status.NOT_REACHED, status).astype(np.int8)
+            continue
+        px[camera], sigma[camera] = xy + match.uv, match.sigma
+        c_ls = np.fmax(c_ls, match.c_ls.astype(np.float32))
+        status = np.where(status == Status.GOOD, match.status, status).astype(np.int8)
+        for name in _STAGES:
+            seconds[name] += match.seconds[name]
+    return StepMatches(px, sigma, c_ls, status, seconds)

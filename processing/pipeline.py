@@ -8,9 +8,8 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Callable
-from dataclasses import replace
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +22,8 @@ from processing.camera import Camera
 from processing.correlation import CorrelationSettings
 from processing.correlation.correlate import load_kernels
 from processing.errors import ComputationError, InputError
-from processing.images import read_gray, read_mask
-from processing.matching import PairMatches, match_pair
+from processing.images import read_mask
+from processing.pair_tasks import in_order, pair_jobs
 from processing.pairs_surface import pairs_surface
 from processing.progress import Report, Stages, silent
 from processing.results import Results, write_results
@@ -32,25 +31,65 @@ from processing.ring import Ring, calibrate_ring, control_points
 from processing.ring_surface import RingSurface, ring_surface
 from processing.session import Capture, Session, new_run, read_session
 from processing.settings import Settings
+from processing.step_images import step_image
 from processing.surface import PairSurface, pair_surface
 from processing.sweep import Search
+from processing.tasks import Executor, LocalExecutor, Ran, Task, tidy, work_folder
 
 log = logging.getLogger(__name__)
 
 _WEIGHTS = {"prepare": 0.03, "calibrate": 0.25, "correlate": 0.62, "triangulate": 0.04, "deform": 0.06}
-_IMAGES_KEPT = 4  # decoded images held at a time: a pair uses its own two reference images again
 
 
-def process_session(path: Path, settings: Settings, report: Report = silent) -> Path:
+@dataclass(frozen=True)
+class Measured:
+    """What a run found before anything is written. errors : of the pairs' reconstruction of the control points."""
+
+    results: Results
+    ring: Ring
+    errors: dict[tuple[str, str], ReconstructionError]
+    found: dict[str, Any]
+
+    @property
+    def calibration(self) -> dict[str, Any]:
+        """The cameras and how well they agree, as JSON values."""
+        return {
+            "cameras": [camera.to_dict() for camera in self.ring.cameras.values()],
+            "pairs": [
+                {"pair": list(pair), "mean_mm": error.mean, "rms_mm": error.rms, "points": error.points}
+                for pair, error in self.errors.items()
+            ],
+            "bundle": None if self.ring.bundle is None else self.ring.bundle.to_dict(),
+        }
+
+
+def process_session(path: Path, settings: Settings, report: Report = silent, executor: Executor | None = None) -> Path:
     """Process a session and return the folder of the new run; earlier runs stay as they are.
 
-    path : the session folder. report : is told the stage, the share done, the rate and the time left.
+    path : the session folder. report : is told the stage, the share done, the rate and the time left. executor : of
+    the tasks; None runs them in this process. What an interrupted run has matched is not matched again.
     Raises InputError or ComputationError with a sentence for the operator.
     """
     began = time.monotonic()
     stages = Stages(_WEIGHTS, report)
     session = read_session(path)
-    steps = _with_captures_at_rest(session)
+    return _keep(session, measure(session, settings, stages, executor), settings, stages, began)
+
+
+def measure(
+    session: Session,
+    settings: Settings,
+    stages: Stages | None = None,
+    executor: Executor | None = None,
+    steps: Sequence[Capture] | None = None,
+) -> Measured:
+    """Everything of a run but the writing of its files.
+
+    steps : captures to measure, the reference first; None takes all of the specimen, and those at rest. executor : of
+    the tasks; None runs them in this process.
+    """
+    stages = stages or Stages(_WEIGHTS, silent)
+    steps = tuple(steps) if steps is not None else _with_captures_at_rest(session)
     stages.at("prepare", 0.0, "loading the correlation kernels (compiled at the first use)")
     load_kernels()
     stages.at("calibrate", 0.0)
@@ -60,7 +99,7 @@ def process_session(path: Path, settings: Settings, report: Report = silent) -> 
         whole = _whole_ring(session, ring, tuple(errors), steps, settings, stages)
         results, drift, agreement, more_warnings = whole.results, whole.drift, whole.agreement, whole.warnings
     else:
-        surfaces, more_warnings = _surfaces(session, ring, tuple(errors), steps, settings, stages)
+        surfaces, more_warnings = _surfaces(session, ring, tuple(errors), steps, settings, stages, executor)
         results, agreement = pairs_surface(session, ring, surfaces, steps, settings)
         drift = {"-".join(surface.matches.cameras): surface.drift for surface in surfaces}
     results, drift, floor = _noise_floor(results, drift, steps)
@@ -68,7 +107,7 @@ def process_session(path: Path, settings: Settings, report: Report = silent) -> 
     found["noise_floor"] = floor
     for warning in found["warnings"]:
         log.warning("%s", warning)
-    return _keep(session, results, found, ring, errors, settings, stages, began)
+    return Measured(results, ring, errors, found)
 
 
 def _specimen_steps(session: Session) -> tuple[Capture, ...]:
@@ -128,34 +167,42 @@ def _surfaces(
     steps: tuple[Capture, ...],
     settings: Settings,
     stages: Stages,
+    executor: Executor | None,
 ) -> tuple[list[PairSurface], list[str]]:
-    """Every pair matched and triangulated, one after the other: the correlation itself uses all cores."""
-    search = _search(session, settings)
+    """Every pair matched at every step, as tasks, and triangulated."""
+    cameras = {id_: each.camera for id_, each in ring.cameras.items()}
     correlation = CorrelationSettings(**settings.correlation.keywords)
-    image = _image_source(session, ring, steps)
+    jobs = pair_jobs(session, cameras, pairs, steps, _search(session, settings), correlation)
+    _run(in_order(jobs), executor, stages, session)
     surfaces: list[PairSurface] = []
     warnings: list[str] = []
-    refined, seconds = 0, 0.0
-    for k, pair in enumerate(pairs):
-        cameras = (ring.cameras[pair[0]].camera, ring.cameras[pair[1]].camera)
-        rate = f"{refined / seconds:,.0f} points/s" if seconds else ""
-
-        def progress(share: float, k: int = k, pair: tuple[str, str] = pair, rate: str = rate) -> None:
-            stages.at("correlate", (k + share) / len(pairs), f"pair {pair[0]}-{pair[1]}", rate)
-
-        progress(0.0)
+    for k, job in enumerate(jobs):
+        stages.at("triangulate", k / len(jobs), f"pair {job.name}")
         try:
-            found = match_pair(cameras, image, len(steps), _mask(session, cameras[0]), search, correlation, progress)
-            surfaces.append(pair_surface(cameras, found, correlation.step, settings.surface.sigma_max_px))
+            surfaces.append(pair_surface(job.cameras, job.matches(), correlation.step, settings.surface.sigma_max_px))
         except ComputationError as error:
             warnings.append(str(error))
-            continue
-        refined += _matches_made(found)
-        seconds += found.matches.seconds["refine"]
     if not surfaces:
         raise ComputationError(f"{session.path}: no camera pair gave a surface: {'; '.join(warnings)}")
     stages.at("triangulate", 1.0)
     return surfaces, warnings
+
+
+def _run(tasks: Sequence[Task], executor: Executor | None, stages: Stages, session: Session) -> None:
+    """Run the tasks and tell how far they are; outputs of long ago make room for theirs."""
+    whole = sum(task.cost for task in tasks)
+    began, done, points = time.monotonic(), 0.0, 0
+
+    def told(task: Task, ran: Ran, count: int, total: int) -> None:
+        nonlocal done, points
+        done += task.cost
+        points += ran.points
+        rate = f"{points / max(time.monotonic() - began, 1e-3):,.0f} points/s" if points else ""
+        stages.at("correlate", done / whole, f"{task.name} ({count} of {total})", rate)
+
+    stages.at("correlate", 0.0)
+    (executor or LocalExecutor()).run(tasks, told)
+    tidy(work_folder(session.path), tasks)
 
 
 def _whole_ring(
@@ -173,7 +220,7 @@ def _whole_ring(
         session.rig.name,
         cameras,
         pairs,
-        _image_source(session, ring, steps),
+        _image_source(ring, steps),
         masks,
         tuple(step.id for step in steps),
         _search(session, settings),
@@ -190,25 +237,10 @@ def _search(session: Session, settings: Settings) -> Search:
     )
 
 
-def _matches_made(found: PairMatches) -> int:
-    steps, n = found.matches.status.shape
-    return n * (2 * steps - 1)
-
-
-def _image_source(session: Session, ring: Ring, steps: tuple[Capture, ...]) -> Callable[[str, int], NDArray | None]:
-    @lru_cache(maxsize=_IMAGES_KEPT)
+def _image_source(ring: Ring, steps: tuple[Capture, ...]) -> Callable[[str, int], NDArray | None]:
     def image(camera_id: str, step: int) -> NDArray | None:
         path = steps[step].images.get(camera_id)
-        if path is None:
-            return None
-        grey = read_gray(path)
-        width, height = ring.cameras[camera_id].camera.size
-        if grey.shape != (height, width):
-            raise InputError(
-                f"{path}: {grey.shape[1]} x {grey.shape[0]} px, but camera {camera_id} was calibrated at "
-                f"{width} x {height} px; capture board, target and specimen at one size"
-            )
-        return grey
+        return None if path is None else step_image(path, ring.cameras[camera_id].camera)
 
     return image
 
@@ -218,29 +250,13 @@ def _mask(session: Session, camera: Camera) -> NDArray[np.bool_] | None:
     return None if path is None else read_mask(path, (camera.size[1], camera.size[0]))
 
 
-def _keep(
-    session: Session,
-    results: Results,
-    found: dict[str, Any],
-    ring: Ring,
-    errors: dict[tuple[str, str], ReconstructionError],
-    settings: Settings,
-    stages: Stages,
-    began: float,
-) -> Path:
+def _keep(session: Session, measured: Measured, settings: Settings, stages: Stages, began: float) -> Path:
     """Write the run aside and give it its number."""
-    calibration = {
-        "cameras": [camera.to_dict() for camera in ring.cameras.values()],
-        "pairs": [
-            {"pair": list(pair), "mean_mm": error.mean, "rms_mm": error.rms, "points": error.points}
-            for pair, error in errors.items()
-        ],
-        "bundle": None if ring.bundle is None else ring.bundle.to_dict(),
-    }
     stages.at("deform", 0.0)
+    found, calibration = measured.found, measured.calibration
     with new_run(session.path) as run:
         found["seconds"] = round(time.monotonic() - began, 2)
-        results = replace(results, calibration=calibration, summary=found)
+        results = replace(measured.results, calibration=calibration, summary=found)
         write_results(run.folder / "results.h5", results, lambda done: stages.at("deform", done))
         (run.folder / "settings.toml").write_text(settings.to_toml(), encoding="utf-8")
         (run.folder / "calibration.json").write_text(json.dumps(calibration), encoding="utf-8")

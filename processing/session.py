@@ -13,6 +13,7 @@
         0003-specimen/ …          the first specimen capture is the reference, the others are the steps
       mask/<camera>.png           optional region of interest on the reference image
       calibration/                cameras as calibrated, kept under a key of what they rest on
+      work/                       outputs of the tasks of processing, under keys of what they rest on; may be removed
       results/
         0001/ …                   one folder a processing run, written aside and renamed: results.h5, settings.toml,
                                   calibration.json, summary.json

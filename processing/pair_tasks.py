@@ -1,0 +1,179 @@
+"""The matching of all camera pairs as tasks: one for each pair's reference images, one for each pair and step.
+
+The steps of a pair are independent of one another: each is matched from the reference. So one more capture, or the
+newest step alone, makes no other step anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.camera import Camera
+from processing.correlation import CorrelationSettings, Reference, prepare_reference
+from processing.images import read_mask
+from processing.matching import Grid, PairMatches, StepMatches, Stereo, collect, match_reference, match_step
+from processing.session import Capture, Session
+from processing.step_images import step_image
+from processing.sweep import Search
+from processing.tasks import Arrays, Task, code_stamp, digest, file_digest, kept, read_output, work_folder
+
+Array = NDArray[np.float64]
+_MATCH_COST = 0.6  # of a step's second correlation, in correlations of the reference
+
+
+@dataclass(frozen=True)
+class PairJob:
+    """The tasks of one pair: the reference's, then a step's each."""
+
+    cameras: tuple[Camera, Camera]
+    reference: Task
+    steps: tuple[Task, ...]
+
+    @property
+    def name(self) -> str:
+        """The pair's name."""
+        return f"{self.cameras[0].id}-{self.cameras[1].id}"
+
+    def matches(self) -> PairMatches:
+        """The pair's matches at all steps. Raises the ComputationError that the reference ended with."""
+        of_reference = read_output(self.reference.output)
+        grid = _grid(of_reference)
+        found = [_step_matches(of_reference), *(_step_matches(read_output(task.output)) for task in self.steps)]
+        return collect((self.cameras[0].id, self.cameras[1].id), grid, found)
+
+
+def pair_jobs(
+    session: Session,
+    cameras: Mapping[str, Camera],
+    pairs: Sequence[tuple[str, str]],
+    steps: Sequence[Capture],
+    search: Search,
+    correlation: CorrelationSettings,
+) -> list[PairJob]:
+    """The tasks of all pairs over these steps, the reference first."""
+    plan = _Plan(session, work_folder(session.path), {}, {})
+    return [plan.job(Stereo((cameras[first], cameras[second]), search, correlation), steps) for first, second in pairs]
+
+
+def in_order(jobs: Sequence[PairJob]) -> list[Task]:
+    """All tasks, step by step and round the ring: what two of them read is read while it is still in memory."""
+    steps = range(len(jobs[0].steps) if jobs else 0)
+    return [*(job.reference for job in jobs), *(job.steps[step] for step in steps for job in jobs)]
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What the keys of a session's tasks are made of. images, masks : digests of the files so far."""
+
+    session: Session
+    folder: Path
+    images: dict[Path, str]
+    masks: dict[Path, str]
+
+    def job(self, stereo: Stereo, steps: Sequence[Capture]) -> PairJob:
+        first, second = stereo.ids
+        mask = self.session.mask(first)
+        reference = Task(
+            digest(
+                code_stamp(), "pair reference", stereo.cameras, stereo.search, stereo.settings,
+                [self._image(steps[0], id_) for id_ in stereo.ids], None if mask is None else self._mask(mask),
+            ),
+            f"pair {first}-{second}",
+            reference_task,
+            (stereo, tuple(steps[0].images[id_] for id_ in stereo.ids), mask),
+            self.folder,
+            cost=1.0 + _MATCH_COST,
+        )  # fmt: skip
+        return PairJob(stereo.cameras, reference, tuple(self._step(stereo, reference, steps, k) for k in _later(steps)))
+
+    def _step(self, stereo: Stereo, reference: Task, steps: Sequence[Capture], k: int) -> Task:
+        first, second = stereo.ids
+        seen = tuple(steps[k].images.get(id_) for id_ in stereo.ids)
+        return Task(
+            digest("pair step", reference.key, [self._image(steps[k], id_) for id_ in stereo.ids]),
+            f"pair {first}-{second}, {steps[k].id}",
+            step_task,
+            (stereo, steps[0].images[first], seen),
+            self.folder,
+            (reference.key,),
+            cost=1.0 + _MATCH_COST,
+        )
+
+    def _image(self, capture: Capture, id_: str) -> str | None:
+        path = capture.images.get(id_)
+        if path is None:
+            return None
+        if path not in self.images:
+            self.images[path] = file_digest(path, capture.record.get("cameras", {}).get(id_))
+        return self.images[path]
+
+    def _mask(self, path: Path) -> str:
+        if path not in self.masks:
+            self.masks[path] = file_digest(path)
+        return self.masks[path]
+
+
+def reference_task(stereo: Stereo, images: tuple[Path, Path], mask: Path | None, *, inputs: tuple[Path, ...]) -> Arrays:
+    """Region, points and matches of a pair's reference images."""
+    del inputs
+    first, second = stereo.cameras
+    drawn = None if mask is None else read_mask(mask, (first.size[1], first.size[0]))
+    grid, found = match_reference(stereo, step_image(images[0], first), step_image(images[1], second), drawn)
+    region = {"region": np.packbits(grid.region), "shape": np.array(grid.region.shape)}
+    return {**region, "xy": grid.xy, "faces": grid.faces, **_arrays(found), "points": np.array(len(grid.xy))}
+
+
+def step_task(
+    stereo: Stereo, reference: Path, images: tuple[Path | None, Path | None], *, inputs: tuple[Path, ...]
+) -> Arrays:
+    """Matches of a pair's images of one step. reference : the first camera's reference image."""
+    (kept_grid,) = inputs
+    grid, prepared = _prepared(kept_grid, reference, stereo)
+    seen = [None if path is None else step_image(path, each) for path, each in zip(images, stereo.cameras, strict=True)]
+    found = match_step(stereo, prepared, grid.xy, seen[0], seen[1])
+    made = len(grid.xy) * sum(image is not None for image in seen)
+    return {**_arrays(found), "points": np.array(made)}
+
+
+def _prepared(grid_file: Path, image: Path, stereo: Stereo) -> tuple[Grid, Reference]:
+    """A pair's points and its prepared reference image, kept in memory for all its steps."""
+
+    def make() -> tuple[Grid, Reference]:
+        grid = _grid(read_output(grid_file))
+        reference = prepare_reference(step_image(image, stereo.cameras[0]), grid.region, stereo.settings)
+        assert reference.slopes  # computed when first asked for
+        return grid, reference
+
+    def size(value: tuple[Grid, Reference]) -> int:
+        grid, reference = value
+        filtered = reference.grey.nbytes + sum(slope.nbytes for slope in reference.slopes) + reference.mask.nbytes
+        return int(filtered + grid.region.nbytes + grid.xy.nbytes + grid.faces.nbytes + reference.image.nbytes)
+
+    return kept.get(("reference", str(grid_file)), make, size)
+
+
+def _arrays(found: StepMatches) -> dict[str, NDArray[Any]]:
+    seconds = {f"seconds_{name}": np.array(value) for name, value in found.seconds.items()}
+    return {"px": found.px, "sigma": found.sigma, "c_ls": found.c_ls, "status": found.status, **seconds}
+
+
+def _step_matches(arrays: Arrays) -> StepMatches:
+    start = len("seconds_")
+    seconds = {name[start:]: float(value) for name, value in arrays.items() if name.startswith("seconds_")}
+    return StepMatches(arrays["px"], arrays["sigma"], arrays["c_ls"], arrays["status"], seconds)
+
+
+def _grid(arrays: Arrays) -> Grid:
+    height, width = (int(side) for side in arrays["shape"])
+    region = np.unpackbits(arrays["region"], count=height * width).reshape(height, width).astype(bool)
+    return Grid(region, arrays["xy"], arrays["faces"])
+
+
+def _later(steps: Sequence[Capture]) -> Iterator[int]:
+    return iter(range(1, len(steps)))

@@ -1,0 +1,33 @@
+"""A job as a set of tasks, each with one output file, so that a job started again makes only what is missing.
+
+A task is a pure function of file paths and small values. Its output lies in ``SESSION/work`` under a key of everything
+that it depends on; where the file is there, the task is done. An executor runs those that are not: ``LocalExecutor``
+in threads of this process, others elsewhere, all of them the same tasks.
+
+``task``    a task, its key and its output file
+``local``   the executor of one machine
+``memory``  what a process keeps between tasks: decoded images, prepared references
+``work``    the folder of the outputs, kept within a size
+"""
+
+from processing.tasks.local import LocalExecutor
+from processing.tasks.memory import Memory, kept
+from processing.tasks.task import Arrays, Executor, Ran, Task, Told, code_stamp, digest, file_digest, read_output
+from processing.tasks.work import tidy, work_folder
+
+__all__ = [
+    "Arrays",
+    "Executor",
+    "LocalExecutor",
+    "Memory",
+    "Ran",
+    "Task",
+    "Told",
+    "code_stamp",
+    "digest",
+    "file_digest",
+    "kept",
+    "read_output",
+    "tidy",
+    "work_folder",
+]

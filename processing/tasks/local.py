@@ -1,0 +1,85 @@
+"""The executor of one machine: tasks side by side in threads of this process, as many as there are cores."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+
+import cv2
+import numba
+
+from processing.tasks.task import Ran, Task, Told
+
+_TOGETHER = ("omp", "tbb")  # layers of numba whose kernels may be started from several threads at once
+
+
+class LocalExecutor:
+    """Runs tasks in threads of this process.
+
+    workers : tasks at a time; None for one a core. Each task's kernels get an equal share of the cores.
+    """
+
+    def __init__(self, workers: int | None = None) -> None:
+        self._workers = workers
+
+    def run(self, tasks: Sequence[Task], told: Told) -> None:
+        """See ``Executor.run``. Tasks start in the order given as soon as what they need is there."""
+        waiting = [task for task in tasks if not task.done]
+        count = 0
+        for task in tasks:
+            if task.done:
+                count += 1
+                told(task, task.run(), count, len(tasks))
+        if not waiting:
+            return
+        cores = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+        workers = min(self._workers or (os.cpu_count() or 1), len(waiting)) if _kernels_side_by_side() else 1
+        left = {task.key for task in waiting}
+        running: dict[Future[Ran], Task] = {}
+        share = max(1, cores // workers)
+        with _single_threaded_filters(workers > 1), ThreadPoolExecutor(workers, "task") as pool:
+            try:
+                while waiting or running:
+                    while len(running) < workers and (ready := _next(waiting, left)) is not None:
+                        waiting.remove(ready)
+                        running[pool.submit(_run, ready, share)] = ready
+                    ended, _ = wait(running, return_when=FIRST_COMPLETED)
+                    for future in ended:
+                        task = running.pop(future)
+                        ran = future.result()
+                        left.discard(task.key)
+                        count += 1
+                        told(task, ran, count, len(tasks))
+            finally:
+                waiting.clear()
+
+
+def _next(waiting: Sequence[Task], left: set[str]) -> Task | None:
+    """The first task whose needs are all met."""
+    return next((task for task in waiting if not left.intersection(task.needs)), None)
+
+
+def _run(task: Task, threads: int) -> Ran:
+    numba.set_num_threads(threads)  # of this thread
+    return task.run()
+
+
+def _kernels_side_by_side() -> bool:
+    try:
+        return numba.threading_layer() in _TOGETHER
+    except ValueError:  # no kernel has run yet
+        return False
+
+
+@contextmanager
+def _single_threaded_filters(alone: bool) -> Iterator[None]:
+    """OpenCV without threads of its own while tasks fill the cores."""
+    before = cv2.getNumThreads()
+    if alone:
+        cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
