@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-import threading
 import time
+import uuid
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
@@ -132,7 +132,7 @@ def file_digest(path: Path, told: Mapping[str, Any] | None = None) -> str:
 def _write(path: Path, arrays: Arrays) -> None:
     """Written aside and renamed: a file under its own name is whole."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".{path.stem}-{os.getpid()}-{threading.get_ident()}.partial")
+    aside = path.with_name(f".{path.stem}-{uuid.uuid4().hex}.partial")  # its own on every machine that sees the folder
     try:
         with aside.open("wb") as file:
             np.savez(file, **dict(arrays))  # type: ignore[arg-type]

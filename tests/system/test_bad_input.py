@@ -27,9 +27,10 @@ STEPS = ("0006-specimen", "0007-specimen")
 
 
 def tree(folder: Path) -> dict[str, bytes]:
-    """Every file below a folder, and every folder; calibrations that are whole may be kept."""
+    """Every file below a folder, and every folder; calibrations and outputs of tasks that are whole may be kept."""
+    may_stay = {"calibration", "work"}
     found = {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else b"" for p in folder.rglob("*")}
-    return {name: data for name, data in found.items() if "calibration" not in Path(name).parts or "partial" in name}
+    return {name: data for name, data in found.items() if not may_stay & {*Path(name).parts} or "partial" in name}
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,177 @@
+"""Two cameras of the virtual ring, matched as tasks: what is made again, and that it makes no difference."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from controller.importing import import_folder
+from node_agent.virtual_rig.render import render
+from node_agent.virtual_rig.rig import VirtualRig, paper_rig
+from node_agent.virtual_rig.scenes import scene
+from processing.camera import Camera
+from processing.correlation import CorrelationSettings
+from processing.pair_tasks import PairJob, in_order, pair_jobs
+from processing.pipeline import process_session
+from processing.results import Results, read_results
+from processing.ring import calibrate_ring
+from processing.session import read_session
+from processing.settings import Settings, load_settings
+from processing.sweep import Search
+from processing.tasks import LocalExecutor, Ran, Task, Told, kept
+
+SCALE, STEPS = 0.2, 3
+SETTINGS = load_settings(None, ["correlation.radius_px=12", "correlation.step_px=8"])
+
+
+class Counted:
+    """A local executor that tells which tasks were made, and stops after so many."""
+
+    def __init__(self, stop_after: int | None = None) -> None:
+        self.made: list[str] = []
+        self.stop_after = stop_after
+
+    def run(self, tasks: list[Task], told: Told) -> None:
+        def tell(task: Task, ran: Ran, count: int, total: int) -> None:
+            if ran.made:
+                self.made.append(task.name)
+            if self.stop_after == len(self.made):
+                raise KeyboardInterrupt
+            told(task, ran, count, total)
+
+        LocalExecutor(1).run(tasks, tell)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session of two cameras and three captures of the specimen, calibrated."""
+    folder = tmp_path_factory.mktemp("rig")
+    rig = VirtualRig(paper_rig(12, SCALE).cameras[:2])
+    source = folder / "source"
+    source.mkdir()
+    (source / "rig.toml").write_text(rig.rig_toml(), encoding="utf-8")
+    for camera in rig.cameras:
+        shots = {f"board/{camera.id}/{pose}.png": ("board", pose) for pose in range(4)}
+        shots |= {f"specimen/{camera.id}/{step}.png": ("specimen", step) for step in range(STEPS)}
+        for name, (kind, number) in {**shots, f"target/{camera.id}.png": ("target", 0)}.items():
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            assert cv2.imwrite(str(source / name), render(camera, scene(kind, number), number))
+    import_folder(source, folder / "session")
+    calibrate_ring(read_session(folder / "session"), SETTINGS.calibration)
+    return folder / "session"
+
+
+@pytest.fixture
+def session(made: Path, tmp_path: Path) -> Path:
+    """A copy to process."""
+    kept.clear()
+    shutil.copytree(made, tmp_path / "session", ignore=shutil.ignore_patterns("results", "work"))
+    return tmp_path / "session"
+
+
+def jobs(session: Path, settings: Settings = SETTINGS, steps: slice = slice(None), **changed: Camera) -> list[PairJob]:
+    """The tasks of a session, with other cameras where they are given."""
+    read = read_session(session)
+    ring = calibrate_ring(read, settings.calibration)
+    cameras = {id_: changed.get(id_, each.camera) for id_, each in ring.cameras.items()}
+    search = Search(radius=57.0, reach=settings.surface.reach_mm, incidence=settings.surface.incidence_deg)
+    correlation = CorrelationSettings(**settings.correlation.keywords)
+    return pair_jobs(read, cameras, read.rig.pairs, read.of_kind("specimen")[steps], search, correlation)
+
+
+def keys(session: Path, settings: Settings = SETTINGS, steps: slice = slice(None), **changed: Camera) -> list[str]:
+    return [task.key for task in in_order(jobs(session, settings, steps, **changed))]
+
+
+def same(first: Results, second: Results) -> None:
+    """Bit for bit."""
+    for name in ("vertices", "faces", "correlation", "sigma_xyz", "status"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
+    for one, other in zip(first.matches, second.matches, strict=True):
+        np.testing.assert_array_equal(one.px, other.px)
+        np.testing.assert_array_equal(one.sigma, other.sigma)
+
+
+def test_an_interrupted_job_makes_only_what_is_missing_and_the_same_results(session: Path) -> None:
+    interrupted, resumed, whole = Counted(stop_after=2), Counted(), Counted()
+    with pytest.raises(KeyboardInterrupt):
+        process_session(session, SETTINGS, executor=interrupted)
+    assert not (session / "results").exists()
+    kept.clear()
+    second = read_results(process_session(session, SETTINGS, executor=resumed) / "results.h5")
+    assert len(interrupted.made) == 2
+    assert sorted([*interrupted.made, *resumed.made]) == sorted({*interrupted.made, *resumed.made})
+    assert len(interrupted.made) + len(resumed.made) == STEPS
+    shutil.rmtree(session / "work")
+    fresh = read_results(process_session(session, SETTINGS, executor=whole) / "results.h5")
+    assert len(whole.made) == STEPS
+    same(second, fresh)
+    again = Counted()
+    same(read_results(process_session(session, SETTINGS, executor=again) / "results.h5"), fresh)
+    assert again.made == []
+
+
+def test_threads_side_by_side_make_the_same(session: Path) -> None:
+    alone = read_results(process_session(session, SETTINGS, executor=LocalExecutor(1)) / "results.h5")
+    shutil.rmtree(session / "work")
+    same(read_results(process_session(session, SETTINGS, executor=LocalExecutor(2)) / "results.h5"), alone)
+
+
+def test_one_more_capture_leaves_the_earlier_steps(session: Path) -> None:
+    before, after = keys(session, steps=slice(0, 2)), keys(session)
+    assert before == after[: len(before)]
+    newest = keys(session, steps=slice(0, None, 2))  # the reference and the newest step
+    assert set(newest) < set(after)
+
+
+def _image(session: Path) -> None:
+    path = next(iter(sorted(read_session(session).of_kind("specimen")[1].images.values())))
+    path.write_bytes(path.read_bytes() + b" ")  # the record's size no longer agrees
+
+
+def _mask(session: Path) -> None:
+    (session / "mask").mkdir()
+    first = read_session(session).rig.pairs[0][0]
+    mask = np.full((round(3280 * SCALE), round(2464 * SCALE)), 255, np.uint8)
+    assert cv2.imwrite(str(session / "mask" / f"{first}.png"), mask)
+
+
+@pytest.mark.parametrize(("change", "count"), [(_image, 1), (_mask, STEPS)])
+def test_another_image_or_mask_is_matched_anew(session: Path, change: Callable[[Path], None], count: int) -> None:
+    before = keys(session)
+    change(session)
+    assert sum(one != other for one, other in zip(before, keys(session), strict=True)) == count
+
+
+@pytest.mark.parametrize(
+    ("setting", "anew"),
+    [
+        ("correlation.radius_px=13", True),
+        ("correlation.tolerance=1e-4", True),
+        ("surface.reach_mm=15", True),
+        ("strain.window_mm=5", False),
+        ("surface.merge=none", False),
+        ("surface.sigma_max_px=0.1", False),
+        ("tracking.two_pass=false", False),
+    ],
+)
+def test_settings_that_matches_rest_on_make_them_anew(session: Path, setting: str, anew: bool) -> None:
+    told = ["correlation.radius_px=12", "correlation.step_px=8", setting]
+    assert (set(keys(session)).isdisjoint(keys(session, load_settings(None, told)))) is anew
+
+
+def test_another_calibration_makes_all_anew(session: Path) -> None:
+    camera = jobs(session)[0].cameras[1]
+    P = camera.P.copy()
+    P[0, 3] += 1e-9
+    moved = Camera(camera.id, P, camera.size, camera.intrinsics)
+    assert set(keys(session)).isdisjoint(keys(session, **{camera.id: moved}))
+
+
+def test_no_image_is_decoded_twice(session: Path) -> None:
+    before = kept.made
+    process_session(session, SETTINGS, executor=LocalExecutor(2))
+    assert kept.made - before == 2 * STEPS + 1  # the images, and the prepared reference
