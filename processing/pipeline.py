@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +25,7 @@ from processing.correlation import CorrelationSettings
 from processing.correlation.correlate import load_kernels
 from processing.errors import ComputationError, InputError
 from processing.images import read_mask
-from processing.pair_tasks import in_order, pair_jobs
+from processing.pair_tasks import PairJob, in_order, pair_jobs
 from processing.pairs_surface import pairs_surface
 from processing.progress import Report, Stages, silent
 from processing.results import Results, write_results
@@ -176,15 +178,22 @@ def _surfaces(
     _run(in_order(jobs), executor, stages, session)
     surfaces: list[PairSurface] = []
     warnings: list[str] = []
-    for k, job in enumerate(jobs):
-        stages.at("triangulate", k / len(jobs), f"pair {job.name}")
+
+    def surface(job: PairJob) -> PairSurface | str:
         try:
-            surfaces.append(pair_surface(job.cameras, job.matches(), correlation.step, settings.surface.sigma_max_px))
+            return pair_surface(job.cameras, job.matches(), correlation.step, settings.surface.sigma_max_px)
         except ComputationError as error:
-            warnings.append(str(error))
+            return str(error)
+
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        for k, made in enumerate(pool.map(surface, jobs), start=1):
+            stages.at("triangulate", k / len(jobs), f"pair {jobs[k - 1].name}")
+            if isinstance(made, str):
+                warnings.append(made)
+            else:
+                surfaces.append(made)
     if not surfaces:
         raise ComputationError(f"{session.path}: no camera pair gave a surface: {'; '.join(warnings)}")
-    stages.at("triangulate", 1.0)
     return surfaces, warnings
 
 

@@ -13,8 +13,8 @@ from processing.matching import PairMatches
 from processing.mesh import Mesh
 from processing.outliers import Lost, crossing_outliers, surface_outliers
 from processing.results import Matches
-from processing.triangulation import reprojection_residuals, triangulate
-from processing.uncertainty import position_sigma
+from processing.triangulation import LinearSystem, reprojection_residuals
+from processing.uncertainty.position import linear_sigma
 
 Array = NDArray[np.float64]
 
@@ -53,8 +53,9 @@ def pair_surface(cameras: tuple[Camera, Camera], found: PairMatches, step_px: in
     for step in range(steps):
         good = status[step] == 0
         px = np.where(good[None, :, None], matches.px[step], np.nan)
-        xyz[step] = triangulate(cameras, px)
-        sigma[step] = position_sigma(cameras, px, matches.sigma[step])
+        system = LinearSystem.of(cameras, px)
+        xyz[step] = system.solution
+        sigma[step] = linear_sigma(cameras, system, matches.sigma[step])
         residuals = reprojection_residuals(cameras, xyz[step], px)
         if good.any():
             drift[step] = float(np.nanmean(residuals[0, :, 1]))

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.camera import Camera
-from processing.triangulation import determined, equations
+from processing.triangulation import LinearSystem
 
 Array = NDArray[np.float64]
 
@@ -126,9 +126,6 @@ def step_covariance(
 def position_sigma(cameras: Sequence[Camera], px: Array, sigma: Array) -> Array:
     """Standard deviations of linearly triangulated points from those of their pixels, taken as independent.
 
-    The linear solution minimises ``|A(px) X - b(px)|²``; for consistent pixels its change is ``dX = -(AᵀA)⁻¹ Aᵀ dr``
-    with ``dr = (dA) X - db``, and the residual of a camera moves by ``-(p3 · (X, 1))`` times the change of its pixel.
-
     Parameters
     ----------
     cameras : the C cameras.
@@ -139,23 +136,32 @@ def position_sigma(cameras: Sequence[Camera], px: Array, sigma: Array) -> Array:
     (n, 3) mm, world frame; NaN where fewer than two cameras know the point and its scatter.
     """
     px = np.where(np.isfinite(sigma), np.asarray(px, dtype=float), np.nan)
-    P = np.stack([camera.P for camera in cameras])
-    undistorted = np.stack([camera.undistort(image) for camera, image in zip(cameras, px, strict=True)])
-    A, b, seen = equations(P, undistorted)
-    normal = np.einsum("cnri,cnrj->nij", A, A)
-    solvable = determined(normal, seen)
-    inverse = np.full_like(normal, np.nan)
-    inverse[solvable] = np.linalg.inv(normal[solvable])
-    xyz = np.einsum("nij,cnrj,cnr->ni", inverse, A, b)
-    depth = np.einsum("ci,ni->cn", P[:, 2, :3], xyz) + P[:, None, 2, 3]
-    # Change of the point by each pixel coordinate of each image: (C, n, 3, 2).
-    lens = np.stack([_lens_slope(camera, image) for camera, image in zip(cameras, px, strict=True)])
-    slope = np.einsum("nij,cnrj,cn,cnrs->cnis", inverse, A, depth, np.nan_to_num(lens))
-    variance = np.nan_to_num(np.asarray(sigma, dtype=float)) ** 2 * seen[..., None]
-    return np.sqrt(np.einsum("cnis,cns->ni", slope**2, variance))
+    return linear_sigma(cameras, LinearSystem.of(cameras, px), sigma)
 
 
-def _lens_slope(camera: Camera, px: Array, h: float = 0.5) -> Array:
-    """d(undistorted pixel)/d(image pixel), (n, 2, 2), by central differences over one pixel."""
-    columns = [(camera.undistort(px + d) - camera.undistort(px - d)) / (2 * h) for d in np.eye(2) * h]
-    return np.stack(columns, axis=-1)
+def linear_sigma(cameras: Sequence[Camera], system: LinearSystem, sigma: Array) -> Array:
+    """The same of points whose equations are there already; sigma (C, n, 2) px.
+
+    The linear solution minimises ``|A(px) X - b(px)|²``; for consistent pixels its change is ``dX = -(AᵀA)⁻¹ Aᵀ dr``
+    with ``dr = (dA) X - db``, and the residual of a camera moves by ``-(p3 · (X, 1))`` times the change of its pixel.
+    """
+    A, _, seen = system.equations
+    solvable, xyz = system.solvable, system.solution
+    inverse = np.full_like(system.normal, np.nan)
+    inverse[solvable] = np.linalg.inv(system.normal[solvable])
+    variance = np.zeros_like(xyz)
+    for k, camera in enumerate(cameras):
+        depth = xyz @ camera.P[2, :3] + camera.P[2, 3]
+        # Change of the point by each pixel coordinate of the image: (n, 3, 2).
+        slope = inverse @ A[k].transpose(0, 2, 1) * depth[:, None, None]
+        if camera.intrinsics is not None:
+            slope = slope @ np.linalg.inv(_finite(camera.intrinsics.slope(system.undistorted[k])))
+        pixel = np.where(seen[k, :, None], np.nan_to_num(np.asarray(sigma[k], dtype=float)), 0.0)
+        variance += np.where(seen[k, :, None], ((slope * pixel[:, None, :]) ** 2).sum(axis=2), 0.0)
+    variance[~solvable] = np.nan
+    return np.sqrt(variance)
+
+
+def _finite(slope: Array) -> Array:
+    """Matrices (n, 2, 2), the identity where one is not known: nothing is multiplied by it that counts."""
+    return np.where(np.isfinite(slope).all(axis=(1, 2))[:, None, None], slope, np.eye(2))
