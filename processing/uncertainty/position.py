@@ -164,4 +164,5 @@ def linear_sigma(cameras: Sequence[Camera], system: LinearSystem, sigma: Array) 
 
 def _finite(slope: Array) -> Array:
     """Matrices (n, 2, 2), the identity where one is not known: nothing is multiplied by it that counts."""
-    return np.where(np.isfinite(slope).all(axis=(1, 2))[:, None, None], slope, np.eye(2))
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(slope).all(axis=(1, 2)))
+    return np.where(known[:, None, None], slope, np.eye(2))
