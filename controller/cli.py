@@ -15,6 +15,7 @@ import typer
 
 from controller import measuring, reporting
 from controller.console import narrated, show_table
+from controller.options import AsJson, Reference, Run, Session, SethHill, Window, WithoutRigidMotion
 from processing.errors import InputError, RingdicError
 
 app = typer.Typer(
@@ -25,7 +26,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="GROUP.NAME=VALUE", help="Repeatable.")]
 SettingsFile = Annotated[Path | None, typer.Option("--settings", help="Settings as a TOML file.")]
 app.add_typer(measuring.measure)
@@ -80,7 +80,7 @@ def import_(
 
 @app.command()
 def process(
-    session: Annotated[Path, typer.Argument(help="The session folder.")],
+    session: Session,
     settings: SettingsFile = None,
     set_: Overrides = None,
     cluster: Annotated[str | None, typer.Option(help="Address of a cluster's scheduler.")] = None,
@@ -130,15 +130,15 @@ def correlate(
 
 @app.command()
 def export(
-    session: Annotated[Path, typer.Argument(help="The session folder.")],
+    session: Session,
     format_: Annotated[str, typer.Option("--format", help="npz, vtkhdf, vtp, mat, csv, ply or glb.")] = "npz",
     out: Annotated[Path | None, typer.Option(help="Where to; beside the results unless given.")] = None,
-    reference: measuring.Reference = "first",
-    without_rigid_motion: measuring.WithoutRigidMotion = False,
-    window: measuring.Window = None,
-    seth_hill: measuring.SethHill = None,
+    reference: Reference = "first",
+    without_rigid_motion: WithoutRigidMotion = False,
+    window: Window = None,
+    seth_hill: SethHill = None,
     colour: Annotated[str | None, typer.Option(help="Field that ply and glb are coloured by.")] = None,
-    run: measuring.Run = None,
+    run: Run = None,
     as_json: AsJson = False,
 ) -> None:
     """Results in another program's form, evaluated anew from their positions."""

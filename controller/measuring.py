@@ -13,10 +13,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from controller.console import say
+from controller.options import (
+    AsJson,
+    Reference,
+    Run,
+    Session,
+    SethHill,
+    Window,
+    WithoutRigidMotion,
+    results_of,
+)
 from processing.errors import InputError
 
 if TYPE_CHECKING:
-    from processing.evaluation import Evaluated
     from processing.measure.region import Region
     from processing.measure.section import Cut
     from processing.measure.table import Table
@@ -27,16 +36,9 @@ measure = typer.Typer(
     no_args_is_help=True,
 )
 
-Session = Annotated[Path, typer.Argument(help="The session folder.")]
 Fields = Annotated[list[str] | None, typer.Option("--field", help="Field to give; repeatable. All unless given.")]
 Out = Annotated[Path | None, typer.Option(help="CSV file to write; standard output unless given.")]
-Run = Annotated[int | None, typer.Option(help="Number of the processing run; the newest unless given.")]
-Reference = Annotated[str, typer.Option(help="What a step is compared with: first or previous.")]
-WithoutRigidMotion = Annotated[bool, typer.Option("--without-rigid-motion", help="Move each step back first.")]
-Window = Annotated[float | None, typer.Option(metavar="MM", help="Strain window; the run's own unless given.")]
-SethHill = Annotated[float | None, typer.Option(metavar="M", help="Strains of this exponent as well.")]
 Within = Annotated[float, typer.Option(metavar="MM", help="How far a position may be from the surface.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 
 
 @measure.command()
@@ -62,7 +64,7 @@ def point(
     positions = [_numbers("--at", text, 3) for text in at or ()]
     if not (positions or vertex or face):
         raise InputError("name a place: --at X,Y,Z, --vertex INDEX or --face INDEX")
-    seen = _seen(session, run, reference, without_rigid_motion, window, seth_hill)
+    seen = results_of(session, run, reference, without_rigid_motion, window, seth_hill)
     mesh = seen.results.mesh
     places = [nearest_place(mesh, xyz, within) for xyz in positions]
     places += [place_of_vertex(mesh, index) for index in vertex or ()]
@@ -86,7 +88,7 @@ def extensometer(
     from processing.measure.place import nearest_place
 
     ends = _numbers("--from", from_, 3), _numbers("--to", to, 3)
-    seen = _seen(session, run, reference)
+    seen = results_of(session, run, reference)
     start, end = (nearest_place(seen.results.mesh, xyz, within) for xyz in ends)
     _give(measured(seen, start, end), out, as_json)
 
@@ -110,7 +112,7 @@ def section(
     from processing.measure.section import section as measured
 
     cut = _cut(z, theta, plane)
-    seen = _seen(session, run, reference, without_rigid_motion, window, seth_hill)
+    seen = results_of(session, run, reference, without_rigid_motion, window, seth_hill)
     _give(measured(seen, cut, field or ()), out, as_json)
 
 
@@ -136,7 +138,7 @@ def region(
     from processing.measure.region import region_statistics
 
     part = _region(box, sphere, patch, faces)
-    seen = _seen(session, run, reference, without_rigid_motion, window, seth_hill)
+    seen = results_of(session, run, reference, without_rigid_motion, window, seth_hill)
     _give(region_statistics(seen, part, field or ()), out, as_json)
 
 
@@ -151,24 +153,9 @@ def strain(
     """Study the strain window: strain and its scatter over windows of several widths, without correlating again."""
     from processing.measure.window_study import window_study
 
-    seen = _seen(session, run, reference)
+    seen = results_of(session, run, reference)
     widths = window or [0.0, 3.0, 5.0, 8.0, 12.0]
     _give(window_study(seen.results, widths, seen.evaluation.previous), out, as_json)
-
-
-def _seen(
-    session: Path,
-    run: int | None,
-    reference: str,
-    without_rigid_motion: bool = False,
-    window: float | None = None,
-    exponent: float | None = None,
-) -> Evaluated:
-    from processing.evaluation import Evaluation, evaluated
-    from processing.session import newest_results
-
-    how = Evaluation.of(reference, without_rigid_motion, window, exponent)
-    return evaluated(newest_results(session, run), how)
 
 
 def _cut(z: float | None, theta: float | None, plane: str | None) -> Cut:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from controller.console import narrated, say
-from controller.measuring import AsJson, Reference, Run, Window, WithoutRigidMotion
+from controller.options import AsJson, Reference, Run, Session, Window, WithoutRigidMotion, results_of
 from processing.errors import InputError
 from processing.progress import Progress
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from processing.pictures.scale import Scale
     from processing.session import Session as Captured
 
-Session = Annotated[Path, typer.Argument(help="The session folder.")]
 FieldName = Annotated[str, typer.Option("--field", help="Field that gives the colours.")]
 Limits = Annotated[str | None, typer.Option(metavar="LOW,HIGH", help="Of the colours; from all steps unless given.")]
 Opacity = Annotated[float, typer.Option(min=0.0, max=1.0, help="Of the colours over the photograph.")]
@@ -62,7 +61,8 @@ def overlay(
     from processing.pictures.overlay import photograph, with_bar
     from processing.session import read_session
 
-    seen, scale = _seen(session, run, field, limits, reference, without_rigid_motion, window)
+    seen = results_of(session, run, reference, without_rigid_motion, window)
+    scale = _scale(seen, field, limits)
     number = _step(seen, step)
     captured = read_session(session)
     name = seen.steps[number]
@@ -100,7 +100,8 @@ def animate(
 
     if camera is not None and azimuth is not None:
         raise InputError("--camera shows its photographs, --azimuth the body without them; give one of them")
-    seen, scale = _seen(session, run, field, limits, reference, without_rigid_motion, window)
+    seen = results_of(session, run, reference, without_rigid_motion, window)
+    scale = _scale(seen, field, limits)
     if camera is not None:
         frames = overlay_frames(seen, read_session(session), camera, scale, size, opacity)
     else:
@@ -110,21 +111,10 @@ def animate(
     _told([out], as_json)
 
 
-def _seen(
-    session: Path,
-    run: int | None,
-    field: str,
-    limits: str | None,
-    reference: str,
-    without_rigid_motion: bool,
-    window: float | None,
-) -> tuple[Evaluated, Scale]:
-    from processing.evaluation import Evaluation, evaluated
+def _scale(seen: Evaluated, field: str, limits: str | None) -> Scale:
     from processing.pictures.scale import scale_of
-    from processing.session import newest_results
 
-    seen = evaluated(newest_results(session, run), Evaluation.of(reference, without_rigid_motion, window))
-    return seen, scale_of(seen, field, None if limits is None else _two(limits))
+    return scale_of(seen, field, None if limits is None else _two(limits))
 
 
 def _two(text: str) -> tuple[float, float]:
