@@ -6,6 +6,7 @@
     SRC/board/<camera>/*.{png,jpg,tif}      checkerboard views, any number a camera
     SRC/target/<camera>.{png,jpg,tif}       calibration object
     SRC/specimen/<camera>/*.{png,jpg,tif}   steps in natural order; the first is the reference configuration
+    SRC/static/<camera>/*.{png,jpg,tif}     optional: the specimen at rest beside the reference, again and again
     SRC/mask/<camera>.png                   optional region of interest on the reference image
 
 Everything is decoded and checked before the session appears, so a refused folder leaves nothing behind.
@@ -30,6 +31,8 @@ from processing.rig import Rig, parse_rig, read_rig
 log = logging.getLogger(__name__)
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm")
+
+_COUNTED = {"specimen": "step", "static": "capture"}
 
 Progress = Callable[[int, int, str], None]
 
@@ -86,7 +89,9 @@ def import_folder(
 
 def _find_views(src: Path, rig: Rig) -> list[_View]:
     views: list[_View] = []
-    for kind in ("board", "specimen"):
+    for kind in ("board", "specimen", "static"):
+        if kind == "static" and not (src / kind).is_dir():
+            continue
         steps: dict[str, int] = {}
         for camera in rig.cameras:
             if kind == "board" and camera.intrinsics is not None and not (src / kind / camera.id).is_dir():
@@ -94,15 +99,16 @@ def _find_views(src: Path, rig: Rig) -> list[_View]:
             images = _images(src / kind / camera.id, kind, camera.id)
             steps[camera.id] = len(images)
             views += [_View(kind, index, camera.id, path) for index, path in enumerate(images)]
-        if kind == "specimen" and len(set(steps.values())) > 1:
+        if kind != "board" and len(set(steps.values())) > 1:
             told = ", ".join(f"{camera} {count}" for camera, count in steps.items())
             raise InputError(
-                f"{src / kind}: the cameras have different numbers of steps ({told}); every step needs all cameras"
+                f"{src / kind}: the cameras have different numbers of {_COUNTED[kind]}s ({told}); "
+                f"every {_COUNTED[kind]} needs all cameras"
             )
         _tell_strangers(src / kind, rig)
     for camera in rig.cameras:
         views.append(_View("target", 0, camera.id, _target(src, camera.id)))
-    order = {"board": 0, "target": 1, "specimen": 2}
+    order = {"board": 0, "target": 1, "specimen": 2, "static": 3}
     return sorted(views, key=lambda view: (order[view.kind], view.index))
 
 

@@ -63,6 +63,31 @@ def test_every_image_becomes_a_byte_copy_in_its_capture(src, tmp_path):
     assert seen[-1] == (29, 29)
 
 
+def at_rest(src):
+    for n, camera in enumerate(("201", "202")):
+        for k in range(2):
+            write_image(src / "static" / camera / f"rest{k}.png", 5000 + 10 * n + k)
+
+
+def spoil_captures_at_rest(src):
+    at_rest(src)
+    (src / "static" / "201" / "rest1.png").unlink()
+
+
+def spoil_camera_at_rest(src):
+    at_rest(src)
+    shutil.rmtree(src / "static" / "202")
+
+
+def test_captures_at_rest_are_taken_along(src, tmp_path):
+    at_rest(src)
+    session = read_session(import_folder(src, tmp_path / "made"))
+    assert [c.kind for c in session.captures[-3:]] == ["specimen", "static", "static"]
+    rest = session.of_kind("static")[1].images
+    assert rest["202"].read_bytes() == (src / "static" / "202" / "rest1.png").read_bytes()
+    assert len(session.of_kind("specimen")) == 11
+
+
 def spoil_truncate_jpeg(src):
     path = src / "specimen" / "202" / "step3.jpg"
     path.write_bytes(path.read_bytes()[:-40])
@@ -121,6 +146,8 @@ def remove(*parts):
         (spoil_mask_size, "mask/201.png: the mask is 5 x 5 px but its image is 32 x 24 px"),
         (spoil_rig, "unknown key 'square_cm'"),
         (spoil_steps, "different numbers of steps .201 11, 202 10"),
+        (spoil_captures_at_rest, "different numbers of captures .201 1, 202 2"),
+        (spoil_camera_at_rest, "static/202: the static folder of camera '202' is missing"),
     ],
 )
 def test_a_bad_folder_is_refused_and_leaves_nothing(src, tmp_path, spoil, told):
