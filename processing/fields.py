@@ -3,7 +3,7 @@
 Every strain is a function of the two principal values E1, E2 and of directions, so few arrays are kept and the table
 says how each field follows from them. A rigid motion changes displacements, the Euler-Almansi tensor and directions in
 the current configuration; stretches, J, principal strains, magnitudes, equivalent strain, shear and isotropy are the
-same with and without it.
+same with and without it. Linear strain would take a rotation for strain and is always that after the rigid motion.
 """
 
 from __future__ import annotations
@@ -78,14 +78,19 @@ def _stretch(E: Array) -> Array:
     return np.sqrt(1.0 + 2.0 * E)
 
 
-def _principal(m: float, E: Array) -> Array:
+def _seth_hill(m: float, E: Array) -> Array:
     """Principal strain of the Seth-Hill family m from that of Green-Lagrange; small strains keep their digits."""
     log = 0.5 * np.log1p(2.0 * E)
     return log if m == 0 else np.expm1(2.0 * m * log) / (2.0 * m)
 
 
-def _scalar(measure: Callable[[Array, Array], Array], m: float, E1: Array, E2: Array) -> Array:
-    return measure(_principal(m, E1), _principal(m, E2))
+def _bazant(E: Array) -> Array:
+    """The same of Bažant's family with m = 1, ½ (λ - 1/λ)."""
+    return np.sinh(0.5 * np.log1p(2.0 * E))
+
+
+def _scalar(measure: Callable[[Array, Array], Array], principal: Callable[[Array], Array], *two: Array) -> Array:
+    return measure(*(principal(values) for values in two))
 
 
 _SCALARS: tuple[tuple[str, str, Callable[[Array, Array], Array], float | None], ...] = (
@@ -97,22 +102,26 @@ _SCALARS: tuple[tuple[str, str, Callable[[Array, Array], Array], float | None], 
 )
 
 
-def _family(name: str, label: str, m: float) -> Iterator[Field]:
+def _family(
+    name: str, label: str, principal: Callable[[Array], Array], of: tuple[str, str] = ("E1", "E2")
+) -> Iterator[Field]:
     symbol = f"{label} {name}" if name in "Ee" else label
     for suffix, scalar, measure, centre in _SCALARS:
         text = f"{symbol}{suffix}, {scalar}" if name in "Ee" and suffix in "12" else f"{symbol}, {scalar}"
-        value = partial(_scalar, measure, m)
-        yield Field(name + suffix, text, "", "face", centre, group=f"{label} strain", of=("E1", "E2"), value=value)
+        value = partial(_scalar, measure, principal)
+        yield Field(name + suffix, text, "", "face", centre, group=f"{label} strain", of=of, value=value)
 
 
 _DEFORMATION = (
     Field("J", "Area ratio J", "", "face", 1.0, group="Stretch"),
     Field("lambda1", "Smaller stretch λ1", "", "face", 1.0, group="Stretch"),
     Field("lambda2", "Larger stretch λ2", "", "face", 1.0, group="Stretch"),
-    *_family("E", "Green-Lagrange", strain.GREEN_LAGRANGE),
-    *_family("e", "Euler-Almansi", strain.EULER_ALMANSI),
-    *_family("hencky", "Hencky", strain.HENCKY),
-    *_family("biot", "Biot", strain.BIOT),
+    *_family("E", "Green-Lagrange", partial(_seth_hill, strain.GREEN_LAGRANGE)),
+    *_family("e", "Euler-Almansi", partial(_seth_hill, strain.EULER_ALMANSI)),
+    *_family("hencky", "Hencky", partial(_seth_hill, strain.HENCKY)),
+    *_family("biot", "Biot", partial(_seth_hill, strain.BIOT)),
+    *_family("bazant", "Bažant (m = 1)", _bazant),
+    *_family("linear", "Linear (infinitesimal)", _itself, ("linear1", "linear2")),
 )
 _OVER_STRETCHES: dict[str, Callable[..., Array]] = {
     "J": lambda E1, E2: _stretch(E1) * _stretch(E2),
@@ -162,6 +171,17 @@ FIELDS = (
         Field(f"window_sigma_lambda{k}", f"Window: Standard deviation of λ{k}", "", "face", None, False, "Uncertainty")
         for k in (1, 2)
     ),
+    Field("sigma_calibration", "Standard deviation of the position by the calibration", "mm", "point", None, False,
+          "Uncertainty", ("sigma_calibration",), _length),
+    Field("sigma_total", "Standard deviation of the position by noise and calibration", "mm", "point", None, False,
+          "Uncertainty", ("sigma_xyz", "sigma_calibration"), lambda *parts: _length(np.concatenate(parts, axis=-1))),
+    Field("sigma_displacement_calibration", "Standard deviation of the displacement by the calibration", "mm", "point",
+          None, False, "Uncertainty", ("sigma_displacement_calibration",), _length),
+    *(
+        Field(f"sigma_lambda_calibration{k}", f"Standard deviation of λ{k} by the calibration", "", "face", None, False,
+              "Uncertainty")
+        for k in (1, 2)
+    ),
     Field("chi2", "Disagreement of the cameras, χ² a degree of freedom", "", "point"),
     Field("correlation", "Correlation C_LS (0 best)", "", "point"),
     Field("face_correlation", "Correlation C_LS, worst corner", "", "face"),
@@ -201,7 +221,9 @@ class StepFields:
 class Certainty:
     """What is known of each point and triangle beside its place, at one step; None where it is not known.
 
-    correlation : (N,) C_LS. sigma_xyz, sigma_displacement : (N, 3) mm. sigma_lambda : (M, 2). chi2 : (N,).
+    correlation : (N,) C_LS. sigma_xyz, sigma_displacement : (N, 3) mm and sigma_lambda : (M, 2), by the noise of the
+    images. chi2 : (N,). sigma_calibration, sigma_displacement_calibration : (N, 3) mm and sigma_lambda_calibration :
+    (M, 2), by the covariance of the cameras.
     """
 
     correlation: Array
@@ -209,6 +231,9 @@ class Certainty:
     sigma_displacement: Array | None = None
     sigma_lambda: Array | None = None
     chi2: Array | None = None
+    sigma_calibration: Array | None = None
+    sigma_displacement_calibration: Array | None = None
+    sigma_lambda_calibration: Array | None = None
 
 
 def field(name: str) -> Field:
@@ -233,7 +258,7 @@ def field(name: str) -> Field:
 
 def seth_hill_fields(exponent: float) -> tuple[Field, ...]:
     """The fields of the Seth-Hill family with any exponent."""
-    fields = _family("seth_hill", f"Seth-Hill m = {exponent:g}", exponent)
+    fields = _family("seth_hill", f"Seth-Hill m = {exponent:g}", partial(_seth_hill, exponent))
     return tuple(replace(entry, name=f"{entry.name}:{exponent:g}") for entry in fields)
 
 
@@ -269,16 +294,20 @@ def compute_fields(
         "sigma_xyz": certainty.sigma_xyz,
         "sigma_displacement": certainty.sigma_displacement,
         "chi2": certainty.chi2,
+        "sigma_calibration": certainty.sigma_calibration,
+        "sigma_displacement_calibration": certainty.sigma_displacement_calibration,
     }
     face = {
         **_of_deformation(found),
+        **_linear(found, to_reference),
         "isotropy": found.isotropy,
         "area": found.area,
         "face_correlation": certainty.correlation[faces].max(axis=1),
         "pair": pair.astype(float),
     }
-    if certainty.sigma_lambda is not None:
-        face["sigma_lambda1"], face["sigma_lambda2"] = certainty.sigma_lambda.T
+    for name in ("sigma_lambda", "sigma_lambda_calibration"):
+        if (sigma := getattr(certainty, name)) is not None:
+            face[f"{name}1"], face[f"{name}2"] = sigma.T
     if window is not None:
         over = window.deformation(current, reference)
         face |= {f"window_{name}": values for name, values in _of_deformation(over).items()}
@@ -291,6 +320,12 @@ def compute_fields(
 def _of_deformation(found: Deformation) -> dict[str, Array]:
     names = ("J", "lambda1", "lambda2", "E1", "E2", *_DIRECTIONS)
     return {**{name: getattr(found, name) for name in names}, "E_tensor": _six(found.E), "e_tensor": _six(found.e)}
+
+
+def _linear(found: Deformation, to_reference: RigidMotion) -> dict[str, Array]:
+    """Principal linear strains, after the rigid motion: what is left of the rotation counts as strain."""
+    values = strain.infinitesimal_principal(to_reference.R @ found.F, found.normal_reference)
+    return dict(zip(("linear1", "linear2"), values, strict=True))
 
 
 def _six(tensor: Array) -> Array:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.results import Matches, Results
+from processing.results import WHERE_KNOWN, Matches, Results
 from processing.strain_window import strain_window
 
 Array = NDArray[np.float64]
@@ -24,9 +24,7 @@ def part(results: Results, steps: Sequence[int]) -> Results:
     if not index or index[0] != 0:
         raise ValueError("results keep their reference, step 0, as the first")
 
-    def known(values: Array | None) -> Array | None:
-        return None if values is None else values[index]
-
+    known: dict[str, Any] = {name: getattr(results, name) for name in WHERE_KNOWN}
     return replace(
         results,
         steps=tuple(results.steps[k] for k in index),
@@ -35,9 +33,7 @@ def part(results: Results, steps: Sequence[int]) -> Results:
         sigma_xyz=results.sigma_xyz[index],
         status=results.status[index],
         matches=tuple(_part(matches, index) for matches in results.matches),
-        sigma_displacement=known(results.sigma_displacement),
-        sigma_lambda=known(results.sigma_lambda),
-        chi2=known(results.chi2),
+        **{name: values[index] for name, values in known.items() if values is not None},
     )
 
 

@@ -33,6 +33,7 @@ from processing.ring import Ring, calibrate_ring, control_points
 from processing.ring_surface import RingSurface, ring_surface
 from processing.session import Capture, Session, new_run, read_session
 from processing.settings import Settings
+from processing.stated_uncertainty import camera_covariance, with_uncertainty
 from processing.step_images import step_image
 from processing.surface import PairSurface, pair_surface
 from processing.sweep import Search
@@ -104,6 +105,7 @@ def measure(
         surfaces, more_warnings = _surfaces(session, ring, tuple(errors), steps, settings, stages, executor)
         results, agreement = pairs_surface(session, ring, surfaces, steps, settings)
         drift = {"-".join(surface.matches.cameras): surface.drift for surface in surfaces}
+    results = with_uncertainty(results, camera_covariance(ring.bundle))
     results, drift, floor = _noise_floor(results, drift, steps)
     found = summary.summarise(results, ring, errors, drift, agreement, (*ring.warnings, *warnings, *more_warnings))
     found["noise_floor"] = floor

@@ -13,7 +13,7 @@
         matches/<k>/             2D matches of a camera pair, or of a camera alone: xy, px, c_ls, sigma, status, vertex
         settings, calibration, summary    text: TOML, JSON, JSON
 
-What follows from the stored arrays is computed when it is read: a step takes about 70 bytes a point and 120 a triangle.
+What follows from the stored arrays is computed when it is read: a step takes about 100 bytes a point, 130 a triangle.
 """
 
 from __future__ import annotations
@@ -51,9 +51,16 @@ SCHEMA = 2
 _KEPT = (
     "displacement", "correlation", "sigma_xyz", "sigma_displacement", "chi2",
     "J", "lambda1", "lambda2", "E1", "E2", "E_tensor", "direction1_reference", "direction1_current", "isotropy",
+    "linear1", "linear2",
+    "sigma_calibration", "sigma_displacement_calibration", "sigma_lambda_calibration1", "sigma_lambda_calibration2",
     "face_correlation", "sigma_lambda1", "sigma_lambda2", "window_lambda1", "window_lambda2", "window_E1", "window_E2",
     "window_sigma_lambda1", "window_sigma_lambda2",
 )  # fmt: skip
+#: Arrays of a result that not every run has, and whether they have a number or a vector a point, or two numbers a face.
+WHERE_KNOWN = {
+    "sigma_displacement": "vector", "sigma_lambda": "face", "chi2": "point", "sigma_calibration": "vector",
+    "sigma_displacement_calibration": "vector", "sigma_lambda_calibration": "face",
+}  # fmt: skip
 #: Arrays that are the same at every step.
 _CONSTANT = ("area", "pair")
 
@@ -94,7 +101,8 @@ class Results:
     correlation : (F, N) C_LS, the largest over the images used. sigma_xyz : (F, N, 3). status : (F, N), 0 measured.
     settings : TOML text. calibration, summary : JSON values.
     sigma_displacement : (F, N, 3) mm; sigma_lambda : (F, M, 2), of λ1 and λ2 of each triangle; chi2 : (F, N), a degree
-    of freedom; each None where it was not found.
+    of freedom. sigma_calibration, sigma_displacement_calibration : (F, N, 3) mm, sigma_lambda_calibration : (F, M, 2),
+    by the covariance of the cameras alone. Each None where it was not found.
     """
 
     rig: str
@@ -116,12 +124,16 @@ class Results:
     sigma_displacement: Array | None = None
     sigma_lambda: Array | None = None
     chi2: Array | None = None
+    sigma_calibration: Array | None = None
+    sigma_displacement_calibration: Array | None = None
+    sigma_lambda_calibration: Array | None = None
 
     def __post_init__(self) -> None:
         F, N, M = len(self.steps), len(self.vertices_ref), len(self.faces)
         per_vertex = {"correlation": (F, N), "sigma_xyz": (F, N, 3), "status": (F, N), "vertex_pair": (N,)}
         _check(self, {**per_vertex, "vertices_ref": (N, 3), "vertices": (F, N, 3), "faces": (M, 3), "pair": (M,)})
-        where_known = {"sigma_displacement": (F, N, 3), "sigma_lambda": (F, M, 2), "chi2": (F, N)}
+        ends = {"point": (N,), "vector": (N, 3), "face": (M, 2)}
+        where_known = {name: (F, *ends[kind]) for name, kind in WHERE_KNOWN.items()}
         _check(self, {name: shape for name, shape in where_known.items() if getattr(self, name) is not None})
         if not np.isfinite(self.vertices_ref).all():
             raise ValueError("a vertex without a reference position cannot be tracked; leave it out")
@@ -208,17 +220,38 @@ class Results:
         motion, current = self.motion(step, previous), self.vertices[step]
         if rigid_motion_removed:
             motion, current = RigidMotion(np.eye(3), np.zeros(3)), motion.apply(current)
-        of_motion = None if previous else step  # deviations are known of what happened since the reference
+        of_motion = None if previous else step  # what cameras add is known of the motion since the reference
         certainty = Certainty(
             self.correlation[step],
             self.sigma_xyz[step],
-            _at(self.sigma_displacement, of_motion),
-            _at(self.sigma_lambda, of_motion),
+            self._since(self.sigma_displacement, step, previous),
+            self._stretches_since(step, previous),
             _at(self.chi2, step),
+            _at(self.sigma_calibration, step),
+            _at(self.sigma_displacement_calibration, of_motion),
+            _at(self.sigma_lambda_calibration, of_motion),
         )
         return compute_fields(
             self.before(step, previous), current, self.faces, motion, certainty, self.pair, window, scatter
         )
+
+    def _since(self, sigma: Array | None, step: int, previous: bool) -> Array | None:
+        """Standard deviations of a step's motion, since the reference or since the step before it.
+
+        Half of the variance of a motion since the reference is the reference image's, half the step's own: two
+        motions differ by the halves of the two steps.
+        """
+        if sigma is None or not previous or step < 2:
+            return _at(sigma, step)
+        return np.asarray(np.sqrt(0.5 * (sigma[step] ** 2 + sigma[step - 1] ** 2)))
+
+    def _stretches_since(self, step: int, previous: bool) -> Array | None:
+        """The same of the stretches: the step before turned and sized the triangle, so both have their mean."""
+        sigma = self._since(self.sigma_lambda, step, previous)
+        if sigma is None or not previous or step < 2:
+            return sigma
+        mean = np.sqrt(np.mean(sigma**2, axis=1, keepdims=True) / self.deformation(step - 1).J[:, None])
+        return np.broadcast_to(mean, sigma.shape)
 
 
 def write_results(path: Path, results: Results, progress: Callable[[float], None] = lambda _: None) -> None:
@@ -262,6 +295,7 @@ def read_results(path: Path, matches: bool = True) -> Results:
         steps = tuple(json.loads(own.attrs["steps"]))
         F, N = len(steps), len(own["reference"])
         measured = group["PointData/measured"][:].reshape(F, N).astype(bool)
+        known: dict[str, Any] = {name: _stored(group, name, kind, F) for name, kind in WHERE_KNOWN.items()}
         return Results(
             rig=str(own.attrs["rig"]),
             steps=steps,
@@ -279,9 +313,7 @@ def read_results(path: Path, matches: bool = True) -> Results:
             settings=_text(own, "settings"),
             calibration=json.loads(_text(own, "calibration")),
             summary=json.loads(_text(own, "summary")),
-            sigma_displacement=_stored(group, "PointData/sigma_displacement", (F, N, 3)),
-            sigma_lambda=_sigma_lambda(group, F),
-            chi2=_stored(group, "PointData/chi2", (F, N)),
+            **known,
         )
 
 
@@ -398,15 +430,14 @@ def _write_rest(own: h5py.Group, results: Results, ranges: Ranges) -> None:
     own.require_group("matches")
 
 
-def _stored(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Array | None:
-    return group[name][:].reshape(shape).astype(float) if name in group else None
-
-
-def _sigma_lambda(group: h5py.Group, steps: int) -> Array | None:
-    if "CellData/sigma_lambda1" not in group:
+def _stored(group: h5py.Group, name: str, kind: str, steps: int) -> Array | None:
+    """One of the arrays that not every run has, (F, N), (F, N, 3) or (F, M, 2)."""
+    places = [f"CellData/{name}{k}" for k in (1, 2)] if kind == "face" else [f"PointData/{name}"]
+    if not all(place in group for place in places):
         return None
-    parts = [group[f"CellData/sigma_lambda{k}"][:].reshape(steps, -1) for k in (1, 2)]
-    return np.stack(parts, axis=-1).astype(float)
+    parts = [group[place][:].astype(float) for place in places]
+    stored = np.stack(parts, axis=-1) if kind == "face" else parts[0]
+    return stored.reshape(steps, -1, *stored.shape[1:])
 
 
 def _open(path: Path) -> h5py.File:

@@ -74,5 +74,14 @@ def infinitesimal(F: Array, normal_reference: Array) -> Array:
     return np.asarray(in_plane @ linear @ in_plane)
 
 
+def infinitesimal_principal(F: Array, normal_reference: Array) -> tuple[Array, Array]:
+    """Principal values (...), first ≤ second, of the same tensor in the tangent plane."""
+    linear = infinitesimal(F, normal_reference)
+    half = 0.5 * np.trace(linear, axis1=-2, axis2=-1)
+    square = np.einsum("...ij,...ij->...", linear, linear)
+    radius = np.sqrt(np.maximum(0.5 * square - half**2, 0.0))
+    return half - radius, half + radius
+
+
 def _square(direction: Array) -> Array:
     return direction[..., :, None] * direction[..., None, :]

@@ -11,12 +11,19 @@ from numpy.typing import NDArray
 
 from processing.calibration.quality import ReconstructionError
 from processing.drift import drift_sentences
+from processing.fields import available
 from processing.measure.window_study import gauge
 from processing.mesh import Mesh
 from processing.results import Results
 from processing.ring import Ring
 
 Array = NDArray[np.float64]
+
+#: Why nothing is stated of what the calibration adds.
+ALONE = (
+    "each camera was calibrated alone, which states no covariance: what the calibration adds to the uncertainty is not "
+    "known; with calibration.method=bundle it is"
+)
 
 
 def summarise(
@@ -48,6 +55,7 @@ def summarise(
         "drift_px": {who: _finite(values) for who, values in drift.items()},
         "agreement": dict(agreement),
         "strain": _strain(results),
+        "uncertainty": _uncertainty(results, ring),
         "steps": steps,
         "warnings": [*warnings, *drift_sentences(drift, results.steps)],
     }
@@ -73,6 +81,32 @@ def _strain(results: Results) -> dict[str, float | None]:
         "gauge_mm": _number(alone.length),
         "window_mm": results.window_mm,
         "window_gauge_mm": _number(over.length) if results.window_mm > 0 else None,
+    }
+
+
+def _uncertainty(results: Results, ring: Ring) -> dict[str, Any]:
+    """Medians of the standard deviations at the last step that was measured, by noise and by the calibration.
+
+    None for what is not known; ``why`` tells why the calibration's are not.
+    """
+    last = int(np.flatnonzero(np.isfinite(results.vertices[..., 0]).any(axis=1))[-1])
+    arrays = results.fields(last)
+    known = {entry.name: entry for entry in available(arrays.names)}
+
+    def row(names: Mapping[str, str]) -> dict[str, float | None]:
+        return {what: _median(arrays.scalar(known[n])) if n in known else None for what, n in names.items()}
+
+    return {
+        "step": results.steps[last],
+        "noise": row({"position_mm": "sigma", "displacement_mm": "sigma_displacement", "stretch": "sigma_lambda2"}),
+        "calibration": row(
+            {
+                "position_mm": "sigma_calibration",
+                "displacement_mm": "sigma_displacement_calibration",
+                "stretch": "sigma_lambda_calibration2",
+            }
+        ),
+        "why": None if ring.bundle is not None else ALONE,
     }
 
 
@@ -142,6 +176,11 @@ def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
         if strain["window_gauge_mm"] is not None:
             value += f", over the window of {strain['window_mm']:g} mm {strain['window_gauge_mm']:.1f} mm"
         rows.append({"figure": "a strain averages over (virtual strain gauge)", "value": value})
+    for part, figures_of in (("noise", "image noise"), ("calibration", "calibration")):
+        known = figures["uncertainty"][part]
+        if known["displacement_mm"] is not None:
+            value = f"{known['position_mm']:.4f} mm, {known['displacement_mm']:.5f} mm, {known['stretch']:.1e}"
+            rows.append({"figure": f"standard deviations by the {figures_of}: place, displacement, λ2", "value": value})
     for step in figures["steps"][1:]:
         if step["measured"]:
             rows.append(

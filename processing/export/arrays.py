@@ -16,6 +16,9 @@ def export_npz(seen: Evaluated, out: Path) -> None:
     """Write ``vertices_ref`` (N, 3), ``vertices`` (F, N, 3), ``faces`` (M, 3), ``lambda1``, ``lambda2``, ``J`` (F, M),
     ``E`` (F, M, 3, 3), ``correlation`` (F, N), ``sigma_xyz`` (F, N, 3) and ``pair`` (M,).
 
+    ``sigma_xyz`` is the standard deviation of a position over repeated noise of the images. What the calibration adds,
+    common to all points and steps, stands apart: ``sigma_calibration`` (F, N, 3), where it is known.
+
     mm, world frame; step 0 is the reference, with identity deformation; NaN where not measured. With a strain window,
     the four of deformation also as ``window_…``.
     """  # fmt: skip
@@ -36,6 +39,7 @@ def arrays(seen: Evaluated) -> dict[str, Any]:
             for name in _SCALARS:
                 found[prefix + name][step] = fields.face[prefix + name]
             found[f"{prefix}E"][step] = square(fields.face[f"{prefix}E_tensor"])
+    by_cameras = {} if results.sigma_calibration is None else {"sigma_calibration": results.sigma_calibration}
     return {
         "vertices_ref": results.vertices_ref,
         "vertices": np.stack([seen.positions(step) for step in range(F)]),
@@ -43,6 +47,7 @@ def arrays(seen: Evaluated) -> dict[str, Any]:
         **found,
         "correlation": results.correlation,
         "sigma_xyz": results.sigma_xyz,
+        **by_cameras,
         "pair": results.pair,
     }
 

@@ -13,6 +13,10 @@ STATED = {
     "sigma": "position", "sigma_displacement": "displacement", "sigma_lambda1": "stretch λ1",
     "sigma_lambda2": "stretch λ2", "sigma_E1": "strain E1", "sigma_E2": "strain E2",
     "window_sigma_lambda1": "stretch λ1 over the window", "window_sigma_lambda2": "stretch λ2 over the window",
+    "sigma_calibration": "position, by the calibration",
+    "sigma_displacement_calibration": "displacement, by the calibration",
+    "sigma_lambda_calibration1": "stretch λ1, by the calibration",
+    "sigma_lambda_calibration2": "stretch λ2, by the calibration",
 }  # fmt: skip
 
 
@@ -72,9 +76,12 @@ def noise(document: Document, results: Results, gathered: Gathered) -> None:
             ("standard deviation of", "unit", "median", "95 %"),
             ((STATED[name], row["unit"], figure(row["median"], 3), figure(row["p95"], 3))
              for name, row in stated.items()),
-            "Over all points or triangles of the last step: scatter over repeated image noise. Errors of the "
-            "calibration are common to all steps and stand in the section on calibration.",
+            "Over all points or triangles of the last step: scatter over repeated image noise; and by the calibration, "
+            "from the covariance of the cameras, an error that all points and steps share.",
         )  # fmt: skip
+    why = results.summary.get("uncertainty", {}).get("why")
+    if why:
+        document.text(f"{why[0].upper()}{why[1:]}.")
 
 
 def _stated(gathered: Gathered) -> dict[str, dict[str, Any]]:

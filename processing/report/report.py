@@ -27,7 +27,9 @@ _MAPS = (
     "displacement", "displacement_x", "displacement_y", "displacement_z", "lambda1", "lambda2", "J", "E1", "E2",
     "E_equivalent", "window_lambda1", "window_lambda2",
 )  # fmt: skip
-_CERTAINTY = ("sigma", "sigma_displacement", "sigma_lambda1", "sigma_lambda2", "chi2", "correlation")
+_CERTAINTY = (
+    "sigma", "sigma_displacement", "sigma_lambda1", "sigma_lambda2", "sigma_calibration", "chi2", "correlation",
+)  # fmt: skip
 _COURSES = ("displacement", "J", "lambda1", "lambda2", "E_equivalent", "correlation")
 _STEPS_SHOWN = 4
 _WORTHWHILE = 0.2  # share of a view that must show the surface's outer side

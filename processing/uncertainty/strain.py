@@ -56,21 +56,30 @@ def stretch_sigma(
 
     Where λ1 and λ2 are nearly alike their order sorts the noise too; there the figures are a little large.
     """
-    D, _ = directors(reference, faces)
-    first, second = _reciprocal_in_plane(D)
     variance = np.zeros((len(faces), 2))
-    slopes = np.empty((2, len(faces), 3, 3))  # stretch, triangle, corner, component
-    lines = (
-        (found.direction1_reference, found.direction1_current),
-        (found.direction2_reference, found.direction2_current),
-    )
-    for k, (before, after) in enumerate(lines):
-        slopes[k, :, 1] = np.einsum("mi,mi->m", first, before)[:, None] * after
-        slopes[k, :, 2] = np.einsum("mi,mi->m", second, before)[:, None] * after
-        slopes[k, :, 0] = -(slopes[k, :, 1] + slopes[k, :, 2])
+    slopes, _ = stretch_slopes(found, reference, faces)
     for one, at, scatter in zip(gain, px, sigma, strict=True):
         _add_camera(variance, slopes, one, at, scatter, faces, radius, order)
     return np.sqrt(np.maximum(variance, 0.0))
+
+
+def stretch_slopes(found: Deformation, reference: Array, faces: Faces) -> tuple[Array, Array]:
+    """How λ1 and λ2 move with the current positions of the corners, and, turned about, with the reference ones.
+
+    (2, M, 3, 3) each: stretch, triangle, corner, component. ``δλ = Σ_k g_k · δx_k - Σ_k h_k · δX_k`` with
+    ``h_2 = (D¹·N) λ N`` and its like: the corners that an edge is measured from count against those it is measured to.
+    """
+    D, _ = directors(reference, faces)
+    first, second = _reciprocal_in_plane(D)
+    current, before = np.empty((2, len(faces), 3, 3)), np.empty((2, len(faces), 3, 3))
+    lines = ((found.direction1_reference, found.lambda1), (found.direction2_reference, found.lambda2))
+    for k, (N, stretch) in enumerate(lines):
+        after = np.einsum("mij,mj->mi", found.F, N) / stretch[:, None]
+        for slopes, along in ((current, after), (before, stretch[:, None] * N)):
+            slopes[k, :, 1] = np.einsum("mi,mi->m", first, N)[:, None] * along
+            slopes[k, :, 2] = np.einsum("mi,mi->m", second, N)[:, None] * along
+            slopes[k, :, 0] = -(slopes[k, :, 1] + slopes[k, :, 2])
+    return current, before
 
 
 def _add_camera(

@@ -11,6 +11,7 @@ from processing.camera import Camera, Intrinsics
 from processing.errors import InputError
 from processing.fields import FIELDS, Field
 from processing.results import (
+    WHERE_KNOWN,
     Matches,
     Results,
     read_field,
@@ -157,6 +158,9 @@ def everything_known() -> Results:
     return replace(
         result, settings=settings, sigma_displacement=rng.uniform(0, 0.01, (3, 36, 3)),
         sigma_lambda=rng.uniform(0, 1e-3, (3, 50, 2)), chi2=rng.uniform(0, 3, (3, 36)),
+        sigma_calibration=rng.uniform(0, 0.01, (3, 36, 3)),
+        sigma_displacement_calibration=rng.uniform(0, 0.01, (3, 36, 3)),
+        sigma_lambda_calibration=rng.uniform(0, 1e-3, (3, 50, 2)),
     )  # fmt: skip
 
 
@@ -166,9 +170,12 @@ def test_what_is_known_beside_the_rest_has_its_fields(tmp_path: Path) -> None:
     summary = read_summary(path)
     assert [row["name"] for row in summary["fields"]] == [entry.name for entry in FIELDS]
     back = read_results(path)
-    for name in ("sigma_displacement", "sigma_lambda", "chi2"):
+    for name in WHERE_KNOWN:
         np.testing.assert_allclose(getattr(back, name), getattr(result, name), rtol=1e-6)
     np.testing.assert_allclose(read_field(path, "sigma_lambda2", 1)[0], result.sigma_lambda[1, :, 1], rtol=1e-6)
+    total, _ = read_field(path, "sigma_total", 1)
+    parts = np.concatenate([result.sigma_xyz[1], result.sigma_calibration[1]], axis=1)
+    np.testing.assert_allclose(total, np.linalg.norm(parts, axis=1), rtol=1e-6)
     found = result.deformation(2)
     whole = np.isfinite(found.J)
     sigma_E2, _ = read_field(path, "sigma_E2", 2)  # dE = λ dλ
@@ -182,13 +189,22 @@ def test_what_is_known_beside_the_rest_has_its_fields(tmp_path: Path) -> None:
     np.testing.assert_allclose(seth_hill, (found.lambda2**0.5 - 1) * 2, atol=1e-7)
 
 
-def test_from_one_step_to_the_next_nothing_is_claimed_of_deviations() -> None:
+def test_from_one_step_to_the_next_deviations_are_those_of_two_images() -> None:
     result = everything_known()
-    since_reference, since_before = result.fields(2), result.fields(2, previous=True)
-    assert {"sigma_displacement", "sigma_lambda1"} <= since_reference.names
-    assert not {"sigma_displacement", "sigma_lambda1"} & since_before.names
+    rng = np.random.default_rng(7)
+    one, noise = 0.003, rng.normal(0, 0.003, (3, 20000))  # of the reference image and of two steps' images
+    stated = np.full((3, 36, 3), one * np.sqrt(2.0))
+    result = replace(result, sigma_displacement=stated, sigma_lambda=np.full((3, 50, 2), 1e-3))
+    steps = [result.fields(k, previous=True) for k in range(3)]
+    spread = np.std((noise[2] - noise[0]) - (noise[1] - noise[0]))
+    np.testing.assert_allclose(steps[2].point["sigma_displacement"], spread, rtol=0.03)
+    np.testing.assert_allclose(steps[1].point["sigma_displacement"], stated[1])  # the step before is the reference
+    # A triangle that was stretched before the step has longer edges, and its stretch is surer.
+    wanted = 1e-3 / np.sqrt(result.deformation(1).J)
+    np.testing.assert_allclose(steps[2].face["sigma_lambda1"], wanted)
+    assert not {"sigma_displacement_calibration", "sigma_lambda_calibration1"} & steps[2].names
     moved = result.vertices[2] - result.vertices[1]
-    np.testing.assert_array_equal(since_before.point["displacement"], moved)
+    np.testing.assert_array_equal(steps[2].point["displacement"], moved)
 
 
 def test_a_run_without_a_window_says_how_to_have_one(written: Path) -> None:
@@ -202,8 +218,8 @@ def test_a_step_takes_a_bounded_number_of_bytes(tmp_path: Path) -> None:
     write_results(tmp_path / "results.h5", everything_known())
     with h5py.File(tmp_path / "results.h5") as file:
         sizes = {place: sum(d.nbytes for d in file[f"VTKHDF/{place}"].values()) for place in ("PointData", "CellData")}
-    assert sizes["PointData"] / (3 * 36) <= 70 - 24  # a position takes 24
-    assert sizes["CellData"] / (3 * 50) <= 125
+    assert sizes["PointData"] / (3 * 36) <= 100 - 24  # a position takes 24
+    assert sizes["CellData"] / (3 * 50) <= 130
 
 
 def test_a_mesh_is_read_alone(written: Path) -> None:

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from processing import strain
 from processing.deformation import deformation
-from processing.fields import FIELDS, field, seth_hill_fields
+from processing.fields import FIELDS, Certainty, compute_fields, field, seth_hill_fields
+from processing.rigid_motion import motion_to_reference
 
 STRETCHES = np.linspace(0.3, 3.0, 50)
 
@@ -83,6 +84,25 @@ def test_linear_strain_is_that_of_theory_and_takes_a_rotation_for_strain() -> No
     )
 
 
+def test_principal_linear_strains_are_those_of_its_tensor_after_the_rigid_motion() -> None:
+    reference, current, faces = one_triangle()
+    found = deformation(reference, current, faces)
+    tensor = strain.infinitesimal(found.F, found.normal_reference)[0]
+    first, second = strain.infinitesimal_principal(found.F, found.normal_reference)
+    values = sorted(np.linalg.eigvalsh(tensor), key=abs)[1:]  # the one along the normal is 0
+    np.testing.assert_allclose([first[0], second[0]], sorted(values), rtol=1e-9)
+    # A small stretch and a large turn of the whole: the field shows the stretch alone.
+    turn = Rotation.from_rotvec([0.4, -0.2, 0.9]).as_matrix()
+    moved = reference * 1.001 @ turn.T + [3.0, 4.0, 5.0]
+    certainty = Certainty(np.zeros(3), np.zeros((3, 3)))
+    fields = compute_fields(
+        reference, moved, faces, motion_to_reference(reference, moved), certainty, np.zeros(1, np.int64)
+    )
+    for name in ("linear1", "linear2"):
+        np.testing.assert_allclose(fields.scalar(field(name)), 1e-3, rtol=1e-9)
+    np.testing.assert_allclose(fields.scalar(field("linear_magnitude")), np.sqrt(2) * 1e-3, rtol=1e-9)
+
+
 def test_every_field_of_strain_has_the_value_of_its_family() -> None:
     found = deformation(*one_triangle())
     arrays = {"E1": found.E1, "E2": found.E2}
@@ -95,6 +115,8 @@ def test_every_field_of_strain_has_the_value_of_its_family() -> None:
         ):  # fmt: skip
             values = field(f"{family}{suffix}{end}").from_arrays(arrays.__getitem__)
             np.testing.assert_allclose(values, truth, rtol=1e-12, err_msg=family + suffix)
+    bazant = strain.bazant(found.lambda2, 1.0)
+    np.testing.assert_allclose(field("bazant2").from_arrays(arrays.__getitem__), bazant, rtol=1e-12)
     for name in ("e1", "e2", "e_magnitude", "e_equivalent", "e_shear", "E_magnitude", "E_equivalent", "E_shear"):
         np.testing.assert_allclose(field(name).from_arrays(arrays.__getitem__), getattr(found, name), rtol=1e-12)
     assert len({entry.name for entry in FIELDS}) == len(FIELDS)

@@ -1,0 +1,188 @@
+"""What the results of a run say of their own uncertainty, completed from the matches that they rest on.
+
+Two parts that never mix: the noise of the images, which another exposure would draw anew, and the calibration, which
+all points and steps share. Of the global way the first is known before; of camera pairs it is found here.
+
+A pair's images are all matched to the reference image of its first camera. With δ what noise makes of a subset there,
+ε of the same subset in another image, both in px of the reference, and G the gradient of the match between cameras, the
+displacement is off by ``A₁ (ε₁ - δ) + A₂ G (ε₂ - δ) - A₂⁰ G⁰ (ε₂⁰ - δ)``: of δ hardly more than A₁ is left. The noise
+shows in the matches in time; what more a match between cameras leaves over is the same in every exposure.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.calibration.bundle import BundleFit
+from processing.calibration.parameters import PER_CAMERA
+from processing.camera import Camera
+from processing.results import Matches, Results
+from processing.uncertainty.calibration import (
+    CameraCovariance,
+    Shares,
+    shares,
+    sigma_of,
+    stretch_sigma_by_cameras,
+)
+from processing.uncertainty.position import covariance, position_gain
+from processing.uncertainty.strain import stretch_sigma
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# The square of a stated deviation counts the noise of the reference and what the interpolation leaves of the other's.
+_BOTH = 1.85
+# Places in the reference images of different pairs are this far apart, px: their subsets have nothing in common.
+_APART = 1e6
+
+
+def camera_covariance(fit: BundleFit | None) -> CameraCovariance | None:
+    """What a bundle adjustment knows of the cameras; None where each camera was calibrated alone."""
+    if fit is None:
+        return None
+    size = PER_CAMERA * len(fit.cameras)
+    return CameraCovariance(fit.cameras, fit.covariance[:size, :size])
+
+
+def with_uncertainty(results: Results, known: CameraCovariance | None) -> Results:
+    """The same results with every standard deviation that can be stated of them.
+
+    known : of the cameras; None where nothing is: then nothing is stated of what the calibration adds.
+    """
+    pairwise = any(len(matches.cameras) == 2 for matches in results.matches)
+    if pairwise and results.sigma_displacement is None:
+        results = _with_scatter(results)
+    return results if known is None else _with_calibration(results, known, followed=not pairwise)
+
+
+def _with_calibration(results: Results, known: CameraCovariance, followed: bool) -> Results:
+    """What the uncertain cameras add. followed : cameras followed the points from the projection of the reference."""
+    F, N, M = len(results.steps), len(results.vertices_ref), len(results.faces)
+    position, displacement = np.full((F, N, 3), np.nan), np.full((F, N, 3), np.nan)
+    stretches = np.full((F, M, 2), np.nan)
+    at_first: Shares = shares(results.cameras, results.vertices_ref, _gain(results, 0), known)
+    position[0], displacement[0], stretches[0] = sigma_of(at_first), 0.0, 0.0
+    for step in range(1, F):
+        anchor = (results.vertices_ref, at_first) if followed else None
+        now = shares(results.cameras, results.vertices[step], _gain(results, step), known, anchor)
+        position[step], displacement[step] = sigma_of(now), sigma_of(now - at_first)
+        found = results.deformation(step)
+        stretches[step] = stretch_sigma_by_cameras(found, results.vertices_ref, results.faces, at_first, now)
+    return replace(
+        results,
+        sigma_calibration=position,
+        sigma_displacement_calibration=displacement,
+        sigma_lambda_calibration=stretches,
+    )
+
+
+def _gain(results: Results, step: int) -> Array:
+    """How the points of a step move with each pixel of each camera, (C, N, 3, 2) mm a px."""
+    index = {camera.id: k for k, camera in enumerate(results.cameras)}
+    sigma = np.full((len(results.cameras), len(results.vertices_ref), 2), np.nan)
+    for matches in results.matches:
+        used = (matches.vertex >= 0) & (matches.status[step] == 0)
+        for view, id_ in enumerate(matches.cameras):
+            # A pair's points are triangulated with all pixels alike.
+            alike = 1.0 if len(matches.cameras) == 2 else matches.sigma[step, view, used]
+            sigma[index[id_], matches.vertex[used]] = alike
+    return position_gain(results.cameras, results.vertices[step], sigma)
+
+
+@dataclass(frozen=True)
+class _Sources:
+    """Independent errors, all in px of the reference images, and what they do to the points of one step.
+
+    gain : (4, N, 3, 2) mm a px: of the reference image, of the step's two images, of the second camera's reference.
+    px : (N, 2) places in the reference images. sigma : (4, N, 2) px.
+    """
+
+    gain: Array
+    px: Array
+    sigma: Array
+
+
+def _with_scatter(results: Results) -> Results:
+    """Standard deviations of displacements and stretches of camera pairs over repeated noise."""
+    F, N, M = len(results.steps), len(results.vertices_ref), len(results.faces)
+    displacement, stretches = np.full((F, N, 3), np.nan), np.full((F, M, 2), np.nan)
+    displacement[0], stretches[0] = 0.0, 0.0
+    group = tomllib.loads(results.settings).get("correlation", {})
+    radius, order = int(group.get("radius_px", 20)), int(group.get("order", 1))
+    cameras = {camera.id: camera for camera in results.cameras}
+    scatter = [_noise_in_time(matches) for matches in results.matches]
+    first = [_stretched(matches, results.faces, 0, N) for matches in results.matches]
+    for step in range(1, F):
+        parts = _Sources(np.zeros((4, N, 3, 2)), np.full((N, 2), np.nan), np.full((4, N, 2), np.nan))
+        for k, matches in enumerate(results.matches):
+            pair = [cameras[id_] for id_ in matches.cameras]
+            _fill(parts, results, pair, matches, scatter[k][step], first[k], step)
+            held = matches.vertex >= 0
+            parts.px[matches.vertex[held]] = matches.xy[held] + (k * _APART, 0.0)
+        found = results.deformation(step)
+        displacement[step] = np.sqrt(np.einsum("nii->ni", covariance(parts.gain, parts.sigma)))
+        stretches[step] = stretch_sigma(
+            found, results.vertices_ref, results.faces, parts.gain, np.broadcast_to(parts.px, (4, N, 2)),
+            parts.sigma, radius, order,
+        )  # fmt: skip
+        displacement[step, ~np.isfinite(results.vertices[step]).all(axis=1)] = np.nan
+        stretches[step, ~np.isfinite(found.J)] = np.nan
+    return replace(results, sigma_displacement=displacement, sigma_lambda=stretches)
+
+
+def _noise_in_time(matches: Matches) -> Array:
+    """Standard deviations (F, n, 2) px of one subset's place by the noise of one image, NaN where there is no match.
+
+    What the first camera's own images leave over in the quietest step is noise; motion and light add to the others.
+    """
+    stated = np.where((matches.status == 0)[..., None], matches.sigma[:, 0], np.nan) / np.sqrt(_BOTH)
+    level = np.array([np.nanmedian(one) if np.isfinite(one).any() else np.nan for one in stated])
+    level[0] = np.nan
+    with np.errstate(invalid="ignore"):
+        share = np.nanmin(level) / level if np.isfinite(level).any() else level
+    return np.asarray(stated * share[:, None, None])
+
+
+def _fill(
+    parts: _Sources, results: Results, pair: Sequence[Camera], matches: Matches, noise: Array, first: Array, step: int
+) -> None:
+    """Add the points of one pair. noise : (n, 2) px. first : (n, 2, 2) gradients of the match at the reference."""
+    used = np.flatnonzero((matches.vertex >= 0) & (matches.status[step] == 0) & np.isfinite(noise).all(axis=1))
+    who = matches.vertex[used]
+    alike = np.ones((2, len(used), 2))
+    before = position_gain(pair, results.vertices_ref[who], alike)
+    now = position_gain(pair, results.vertices[step, who], alike)
+    G0 = first[used]
+    G = _stretched(matches, results.faces, step, len(results.vertices_ref))[used]
+    seen, seen_first = now[1] @ G, before[1] @ G0
+    parts.gain[:, who] = np.stack([now[0] + seen - seen_first, now[0], seen, seen_first])
+    # A patch that is larger in the second image has more pixels there that tell its place.
+    larger = [np.ones(len(used)), np.ones(len(used)), np.abs(np.linalg.det(G)), np.abs(np.linalg.det(G0))]
+    parts.sigma[:, who] = noise[used] / np.sqrt(np.stack(larger))[..., None]
+
+
+def _stretched(matches: Matches, faces: Ints, step: int, count: int) -> Array:
+    """Gradients (n, 2, 2) of the second camera's pixels of a step by the reference's, from those of the neighbours.
+
+    faces : (M, 3) of ``count`` vertices. Where no neighbour was matched the median of all stands for it.
+    """
+    row = np.full(count, -1)
+    held = np.flatnonzero((matches.vertex >= 0) & (matches.status[step] == 0))
+    row[matches.vertex[held]] = held
+    edges = row[np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])]
+    a, b = edges[(edges >= 0).all(axis=1)].T
+    apart, there = matches.xy[b] - matches.xy[a], matches.px[step, 1, b] - matches.px[step, 1, a]
+    square, mixed = np.zeros((len(matches.xy), 2, 2)), np.zeros((len(matches.xy), 2, 2))
+    for end in (a, b):
+        np.add.at(square, end, apart[:, :, None] * apart[:, None, :])
+        np.add.at(mixed, end, there[:, :, None] * apart[:, None, :])
+    spans = np.linalg.det(square) > 1e-3 * np.trace(square, axis1=1, axis2=2) ** 2
+    out = np.full((len(matches.xy), 2, 2), np.nan)
+    out[spans] = mixed[spans] @ np.linalg.inv(square[spans])
+    out[~spans] = np.median(out[spans], axis=0) if spans.any() else np.eye(2)
+    return out
