@@ -116,12 +116,14 @@ def _with_scatter(results: Results) -> Results:
     radius, order = int(group.get("radius_px", 20)), int(group.get("order", 1))
     cameras = {camera.id: camera for camera in results.cameras}
     scatter = [_noise_in_time(matches) for matches in results.matches]
-    first = [_stretched(matches, results.faces, 0, N) for matches in results.matches]
+    edges = [_edges(matches, results.faces, N) for matches in results.matches]
+    first = [_stretched(*each, 0) for each in zip(results.matches, edges, strict=True)]
     for step in range(1, F):
         parts = _Sources(np.zeros((4, N, 3, 2)), np.full((N, 2), np.nan), np.full((4, N, 2), np.nan))
         for k, matches in enumerate(results.matches):
             pair = [cameras[id_] for id_ in matches.cameras]
-            _fill(parts, results, pair, matches, scatter[k][step], first[k], step)
+            gradients = first[k], _stretched(matches, edges[k], step)
+            _fill(parts, results, pair, matches, scatter[k][step], gradients, step)
             held = matches.vertex >= 0
             parts.px[matches.vertex[held]] = matches.xy[held] + (k * _APART, 0.0)
         found = results.deformation(step)
@@ -149,16 +151,21 @@ def _noise_in_time(matches: Matches) -> Array:
 
 
 def _fill(
-    parts: _Sources, results: Results, pair: Sequence[Camera], matches: Matches, noise: Array, first: Array, step: int
+    parts: _Sources,
+    results: Results,
+    pair: Sequence[Camera],
+    matches: Matches,
+    noise: Array,
+    gradients: tuple[Array, Array],
+    step: int,
 ) -> None:
-    """Add the points of one pair. noise : (n, 2) px. first : (n, 2, 2) gradients of the match at the reference."""
+    """Add the points of one pair. noise : (n, 2) px. gradients : (n, 2, 2) of the match at the reference and now."""
     used = np.flatnonzero((matches.vertex >= 0) & (matches.status[step] == 0) & np.isfinite(noise).all(axis=1))
     who = matches.vertex[used]
     alike = np.ones((2, len(used), 2))
     before = position_gain(pair, results.vertices_ref[who], alike)
     now = position_gain(pair, results.vertices[step, who], alike)
-    G0 = first[used]
-    G = _stretched(matches, results.faces, step, len(results.vertices_ref))[used]
+    G0, G = (each[used] for each in gradients)
     seen, seen_first = now[1] @ G, before[1] @ G0
     parts.gain[:, who] = np.stack([now[0] + seen - seen_first, now[0], seen, seen_first])
     # A patch that is larger in the second image has more pixels there that tell its place.
@@ -166,16 +173,24 @@ def _fill(
     parts.sigma[:, who] = noise[used] / np.sqrt(np.stack(larger))[..., None]
 
 
-def _stretched(matches: Matches, faces: Ints, step: int, count: int) -> Array:
+def _edges(matches: Matches, faces: Ints, count: int) -> Ints:
+    """Neighbouring matches (E, 2), by the triangles (M, 3) of ``count`` vertices."""
+    row = np.full(count, -1)
+    held = np.flatnonzero(matches.vertex >= 0)
+    row[matches.vertex[held]] = held
+    own = row[faces]
+    corners = own[(own >= 0).sum(axis=1) > 1]
+    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
+    single = np.unique(edges[edges[:, 0] >= 0] @ [len(matches.xy), 1])
+    return np.stack(np.divmod(single, len(matches.xy)), axis=1)
+
+
+def _stretched(matches: Matches, edges: Ints, step: int) -> Array:
     """Gradients (n, 2, 2) of the second camera's pixels of a step by the reference's, from those of the neighbours.
 
-    faces : (M, 3) of ``count`` vertices. Where no neighbour was matched the median of all stands for it.
+    Where no neighbour was matched the median of all stands for it.
     """
-    row = np.full(count, -1)
-    held = np.flatnonzero((matches.vertex >= 0) & (matches.status[step] == 0))
-    row[matches.vertex[held]] = held
-    edges = row[np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])]
-    a, b = edges[(edges >= 0).all(axis=1)].T
+    a, b = edges[(matches.status[step][edges] == 0).all(axis=1)].T
     apart, there = matches.xy[b] - matches.xy[a], matches.px[step, 1, b] - matches.px[step, 1, a]
     square, mixed = np.zeros((len(matches.xy), 2, 2)), np.zeros((len(matches.xy), 2, 2))
     for end in (a, b):
