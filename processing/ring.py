@@ -186,7 +186,8 @@ def _adjusted(
     session: Session, calibrated: dict[str, CameraCalibration], keys: list[str], settings: CalibrationGroup
 ) -> tuple[dict[str, CameraCalibration], BundleFit]:
     """The cameras adjusted together, from the session's folder if they are there, else made and kept."""
-    digest = hashlib.sha256(f"{_VERSION} {keys} {settings}".encode()).hexdigest()[:16]
+    own = settings.model_copy(update={"refine_poses": False})  # which comes after the calibration
+    digest = hashlib.sha256(f"{_VERSION} {keys} {own}".encode()).hexdigest()[:16]
     kept = session.path / "calibration" / f"bundle-{digest}.json"
     if kept.is_file():
         values = json.loads(kept.read_text(encoding="utf-8"))

@@ -24,6 +24,7 @@ from processing.multiview.views import incidence
 from processing.outliers import Lost
 from processing.results import Matches, Results
 from processing.settings import Settings
+from processing.steadied import SteadiedCameras
 from processing.sweep import Search
 from processing.triangulation import reprojection_residuals
 
@@ -41,8 +42,8 @@ class RingSurface:
     """Results, how well the cameras agree, and a sentence for each that took no part.
 
     drift : (F,) px for each camera, the mean vertical residual of each step. agreement : views a point, RMS residual of
-    the cameras at the reference (px), and the places of the surface that two cameras see and none could be matched in,
-    by the reason.
+    the cameras at the reference (px), the places of the surface that two cameras see and none could be matched in, by
+    the reason, and the steps at which cameras were seen to have moved.
     """
 
     results: Results
@@ -89,6 +90,7 @@ def ring_surface(
     if not len(shape.faces):
         raise ComputationError("too few neighbouring points of the surface were measured to make a triangle")
     rate = f"{shape.made / shape.seconds:,.0f} points/s" if shape.seconds else ""
+    steadied = SteadiedCameras(cameras)
     motion = measure_motion(
         cameras,
         shape,
@@ -99,13 +101,14 @@ def ring_surface(
         _tracking(settings),
         settings.surface.sigma_max_px,
         lambda share, what: tell(shape_share + (1 - shape_share) * share, what, rate),
+        steadied if settings.calibration.refine_poses else None,
     )
     residuals = reprojection_residuals(cameras, shape.xyz, shape.px)
     return RingSurface(
         _results(rig, cameras, pairs, steps, shape, motion, settings),
         _drift(cameras, residuals, motion),
-        _agreement(shape, residuals),
-        _idle(cameras, shape),
+        {**_agreement(shape, residuals), "moved_cameras": steadied.figures(steps)},
+        _idle(cameras, shape) + steadied.sentences(steps),
     )
 
 

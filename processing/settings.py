@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from processing.errors import InputError
 
@@ -57,6 +57,8 @@ class CalibrationGroup(_Group):
     print_error_mm, radius_error_mm, pitch_error_mm, tilt_error_deg : of the bundle: how far, as standard deviations,
     the dots, the target's radius, its columns' spacing and the turn of the sheet on it may be from what rig.toml
     says; 0 holds them.
+    refine_poses : of surface.method global: where cameras have moved between the steps, their poses are found again
+    from the points that they follow.
     """
 
     method: Literal["dlt", "bundle"] = "dlt"
@@ -70,6 +72,7 @@ class CalibrationGroup(_Group):
     radius_error_mm: float = Field(default=0.0, ge=0, le=5)
     pitch_error_mm: float = Field(default=0.0, ge=0, le=5)
     tilt_error_deg: float = Field(default=0.0, ge=0, le=5)
+    refine_poses: bool = False
 
 
 class SurfaceGroup(_Group):
@@ -122,6 +125,15 @@ class Settings(_Group):
     surface: SurfaceGroup = SurfaceGroup()
     tracking: TrackingGroup = TrackingGroup()
     strain: StrainGroup = StrainGroup()
+
+    @model_validator(mode="after")
+    def _poses_need_many_views(self) -> Settings:
+        if self.calibration.refine_poses and self.surface.method != "global":
+            raise ValueError(
+                "calibration.refine_poses needs surface.method=global: two cameras alone do not tell a camera's motion "
+                "from the surface's"
+            )
+        return self
 
     def to_toml(self) -> str:
         """The settings as the text of a TOML file that :func:`load_settings` reads back."""
@@ -203,7 +215,7 @@ def _sentence(error: Any) -> str:
             return f"unknown setting '{where}'; [{error['loc'][0]}] has {known}"
         return f"unknown group of settings '{where}'; known are {', '.join(Settings.model_fields)}"
     if error["type"] == "value_error":
-        return f"{where}: {error['ctx']['error']}"
+        return f"{where}: {error['ctx']['error']}".removeprefix(": ")
     wanted = _WANTED.get(error["type"].split("_")[0])
     must = f"must be {wanted}" if wanted else error["msg"].replace("Input should be", "must be")
     return f"{where} {must}, not {error['input']!r}"

@@ -24,6 +24,7 @@ from processing.uncertainty.texture import Texture
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+Placed = Callable[[int, Array, Array], Sequence[Camera]]
 
 log = logging.getLogger(__name__)
 
@@ -82,11 +83,12 @@ def measure_motion(
     options: Tracking,
     sigma_max: float,
     progress: Callable[[float, str], None] = lambda *_: None,
+    placed: Placed | None = None,
 ) -> Motion:
     """Follow the points in every camera that saw them at the reference and triangulate every step from all cameras.
 
     image : gives the grey image of a camera id and a step, None where there is none. sigma_max : px, the least certain
-    match that is believed.
+    match that is believed. placed : where the cameras stood at a step, by px and sigma (C, n, 2) of what they saw.
     """
     tracks = []
     for k, camera in enumerate(cameras):
@@ -115,7 +117,7 @@ def measure_motion(
         used = np.zeros(status.shape, bool)
         tracks.append(CameraTrack(k, vertex, found.px, sigma, noise, weight, variance, found.c_ls, status, used))
     progress(1.0, "")
-    return _triangulated(cameras, shape, tuple(tracks), steps)
+    return _triangulated(cameras, shape, tuple(tracks), steps, placed)
 
 
 def _parted(found: Track, texture: Texture, variance: float) -> tuple[Array, Array]:
@@ -129,7 +131,11 @@ def _parted(found: Track, texture: Texture, variance: float) -> tuple[Array, Arr
 
 
 def _triangulated(
-    cameras: Sequence[Camera], shape: ReferenceShape, tracks: tuple[CameraTrack, ...], steps: int
+    cameras: Sequence[Camera],
+    shape: ReferenceShape,
+    tracks: tuple[CameraTrack, ...],
+    steps: int,
+    placed: Placed | None = None,
 ) -> Motion:
     n, count = len(shape.xyz), len(cameras)
     motion = Motion(
@@ -146,11 +152,11 @@ def _triangulated(
     for one in tracks:
         one.used[0] = True
     for step in range(1, steps):
-        _step(cameras, shape, motion, step)
+        _step(cameras, shape, motion, step, placed)
     return motion
 
 
-def _step(cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, step: int) -> None:
+def _step(cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, step: int, placed: Placed | None) -> None:
     """Fill one step of the motion."""
     n, count = len(shape.xyz), len(cameras)
     px, sigma = np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan)
@@ -163,6 +169,8 @@ def _step(cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, step
         sigma[one.camera, who] = one.weight[step, good]
         c_ls[one.camera, who] = one.c_ls[step, good]
         status[one.vertex[~good]] = one.status[step, ~good]
+    if placed is not None:
+        cameras = placed(step, px, sigma)
     points, used = triangulate_agreeing(cameras, px, sigma)
     enough: Mask = np.asarray(np.isfinite(px[..., 0]).sum(axis=0) >= 2)
     lost: Mask = np.asarray(~np.isfinite(points.xyz).all(axis=1))
