@@ -215,12 +215,16 @@ class CaptureWriter:
         with self._lock:
             return _read_json(self.path / "capture.json")
 
-    def store(self, camera: str, manifest: Manifest, image: bytes) -> Stored:
+    def store(self, camera: str, manifest: Manifest, image: bytes, *, sha256: str | None = None) -> Stored:
         """Archive an image of a node under its camera's name.
+
+        sha256 : of `image`, if the caller has computed it from these bytes.
 
         The image's bytes must have the manifest's hash. An identical repeat changes nothing; another image of
         the same camera is kept aside and the first stays. After the close, the camera's status becomes late.
         """
+        if (sha256 or hashlib.sha256(image).hexdigest()) != manifest.sha256:
+            raise ValueError(f"the image of camera {camera} does not have the checksum it came with")
         entry = {
             "width": manifest.width,
             "height": manifest.height,
@@ -244,21 +248,19 @@ class CaptureWriter:
     def _store(
         self, camera: str, suffix: str, image: bytes, sha256: str, entry: dict[str, Any], shared: Path | None = None
     ) -> Stored:
-        if hashlib.sha256(image).hexdigest() != sha256:
-            raise ValueError(f"the image of camera {camera} does not have the checksum it came with")
+        if camera not in self.record()["cameras"]:
+            raise ValueError(f"camera {camera} is not expected in capture {self.capture_id}")
+        path = self.path / f"{camera}{suffix}"
+        try:  # without the lock: the disk takes several images at a time
+            if shared is None or not _linked(shared, path):
+                place(path, image)
+            verdict = "archived"
+        except FileExistsError:
+            if hashlib.sha256(path.read_bytes()).hexdigest() != sha256:
+                return self._keep_aside(camera, path, image)
+            verdict = "repeat"
         with self._lock:
             record = self.record()
-            if camera not in record["cameras"]:
-                raise ValueError(f"camera {camera} is not expected in capture {self.capture_id}")
-            path = self.path / f"{camera}{suffix}"
-            try:
-                if shared is None or not _linked(shared, path):
-                    place(path, image)
-                verdict = "archived"
-            except FileExistsError:
-                if hashlib.sha256(path.read_bytes()).hexdigest() != sha256:
-                    return self._keep_aside(camera, path, image)
-                verdict = "repeat"
             if record["cameras"][camera]["sha256"] == sha256:
                 return Stored("repeat", path.name)
             status = "ok" if record["state"] == "open" else "late"

@@ -67,10 +67,19 @@ class Catalogue:
                 (name, header.get("rig"), header.get("created"), header.get("source"), str(path), _signature(path)),
             )
             for record in _captures(path):
-                row = (name, record["capture_id"], record.get("number", 0), record.get("kind"), json.dumps(record))
-                self._db.execute("insert or replace into captures values (?, ?, ?, ?, ?)", row)
+                self._keep(name, record)
             for run, finished_at, summary in _runs(path):
                 self._db.execute("insert into runs values (?, ?, ?, ?)", (name, run, finished_at, json.dumps(summary)))
+
+    def refresh_capture(self, name: str, capture_id: str) -> dict[str, Any] | None:
+        """Read one capture's record anew and return it, None where there is none: however many captures there are."""
+        with self._lock, self._transaction():
+            if self._db.execute("select 1 from sessions where name = ?", (name,)).fetchone() is None:
+                self.refresh(name)
+            record = _record(self.root / name / "captures" / capture_id / "capture.json")
+            if record is not None:
+                self._keep(name, record)
+            return record
 
     def sessions(self) -> list[dict[str, Any]]:
         """All sessions, newest first, with the number of captures of each kind and of runs."""
@@ -123,6 +132,10 @@ class Catalogue:
         (runs,) = self._db.execute("select count(*) from runs where session = ?", (name,)).fetchone()
         return {"captures": counts, "runs": runs}
 
+    def _keep(self, name: str, record: dict[str, Any]) -> None:
+        row = (name, record["capture_id"], record.get("number", 0), record.get("kind"), json.dumps(record))
+        self._db.execute("insert or replace into captures values (?, ?, ?, ?, ?)", row)
+
     def _forget(self, name: str) -> None:
         self._db.execute("delete from sessions where name = ?", (name,))
         self._db.execute("delete from captures where session = ?", (name,))
@@ -142,9 +155,15 @@ class Catalogue:
 
 def _captures(path: Path) -> Iterator[dict[str, Any]]:
     for file in (path / "captures").glob("*/capture.json"):
-        record = _read_json(file)
-        if record is not None and record.get("capture_id") == file.parent.name:
+        record = _record(file)
+        if record is not None:
             yield record
+
+
+def _record(file: Path) -> dict[str, Any] | None:
+    """The record of a capture; None if it is not readable or another capture's."""
+    record = _read_json(file)
+    return record if record is not None and record.get("capture_id") == file.parent.name else None
 
 
 def _runs(path: Path) -> Iterator[tuple[str, str, dict[str, Any]]]:

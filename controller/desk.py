@@ -101,6 +101,7 @@ class Desk:
         self._ring: Ring | None = None
         self._clock = clock
         self._lock = Lock()
+        self._publishing = Lock()
         self._selected: str | None = None
         self._rounds: dict[str, Round] = {}
         self._running: str | None = None
@@ -337,12 +338,10 @@ class Desk:
         self.live.publish("sessions", {"sessions": self.catalogue.sessions(), "current": self.current()})
 
     def _publish_capture(self, session: str, capture_id: str) -> None:
-        self.catalogue.refresh(session)
-        try:
-            record = self.catalogue.capture(session, capture_id)
-        except KeyError:  # the round was refused before the archive made a folder
-            return
-        self.live.publish("capture", {"session": session, "record": record})
+        with self._publishing:  # an older record must not be told after a newer one
+            record = self.catalogue.refresh_capture(session, capture_id)
+            if record is not None:  # else the round was refused before the archive made a folder
+                self.live.publish("capture", {"session": session, "record": record})
 
     def _job_changed(self, job: Job) -> None:
         if job.state == "done":

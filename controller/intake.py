@@ -10,21 +10,25 @@ import hashlib
 import logging
 import queue
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
 from controller.archive import Archive
 from controller.capture import judge
 from controller.rounds import capture_event
-from node_agent.wire import Failure, Manifest
+from node_agent.wire import CaptureKey, Failure, Manifest
 
 log = logging.getLogger(__name__)
 
 INBOX_BYTES = 512 << 20
+ARCHIVISTS = 4  # threads: one waits for the disk while another computes a checksum
+
+_Image = tuple[str, CaptureKey, str]  # node, capture, SHA-256
 
 
 class Intake:
-    """A bounded queue of images and the thread that archives them.
+    """A bounded queue of images and the threads that archive them.
 
     Parameters
     ----------
@@ -53,30 +57,45 @@ class Intake:
         self._on_event = on_event
         self._limit = limit
         self._waiting = 0
+        self._here: set[_Image] = set()
         self._lock = threading.Lock()
         self._inbox: queue.Queue[tuple[Manifest, bytes] | None] = queue.Queue()
-        self._thread = threading.Thread(target=self._work, name="archivist", daemon=True)
+        self._threads = [
+            threading.Thread(target=self._work, name=f"archivist-{k}", daemon=True) for k in range(ARCHIVISTS)
+        ]
 
     def start(self) -> None:
-        self._thread.start()
+        for thread in self._threads:
+            thread.start()
 
     def stop(self, timeout: float) -> None:
         """Archive what has arrived, then end; wait at most `timeout` seconds for it."""
-        self._inbox.put(None)
-        self._thread.join(timeout)
+        deadline = time.monotonic() + timeout
+        for _ in self._threads:
+            self._inbox.put(None)
+        for thread in self._threads:
+            thread.join(max(deadline - time.monotonic(), 0.0))
 
     def has_room(self, size: int) -> bool:
         """Whether an image of `size` bytes would be taken."""
         with self._lock:
             return self._waiting + size <= self._limit
 
-    def put(self, manifest: Manifest, image: bytes) -> bool:
-        """Queue an image; returns at once, False if there was no room."""
+    def holds(self, manifest: Manifest) -> bool:
+        """Whether this very image waits here already: it came again, or was pulled while it was being pushed."""
         with self._lock:
+            return _image(manifest) in self._here
+
+    def put(self, manifest: Manifest, image: bytes) -> bool:
+        """Queue an image; returns at once, False if there was no room. One that waits here already is not queued."""
+        with self._lock:
+            if _image(manifest) in self._here:
+                return True
             if self._waiting + len(image) > self._limit:
                 log.warning("the inbox is full; the image of %s from %s will be pulled", manifest.key, manifest.node)
                 return False
             self._waiting += len(image)
+            self._here.add(_image(manifest))
         self._inbox.put((manifest, image))
         return True
 
@@ -90,14 +109,17 @@ class Intake:
             finally:
                 with self._lock:
                     self._waiting -= len(image)
+                    self._here.discard(_image(manifest))
+                del parcel, image  # not held until the next one comes
 
     def take(self, manifest: Manifest, image: bytes) -> None:
         """Check one image, archive it and acknowledge it, or tell the node that it is unknown here."""
         capture = self._archive.capture(manifest.key.session, manifest.key.capture_id)
         record = capture.record() if capture else None
+        sha256 = hashlib.sha256(image).hexdigest()
         judgement = judge(
             manifest,
-            hashlib.sha256(image).hexdigest(),
+            sha256,
             len(image),
             record["fire_at_ns"] if record else None,
             {camera: entry["sha256"] for camera, entry in record["cameras"].items()} if record else {},
@@ -109,11 +131,13 @@ class Intake:
             log.warning("image from %s is not wanted: %s", manifest.node, judgement.reason)
             self._acknowledge(manifest, "unknown")
             return
-        if judgement.verdict == "archive":
-            capture.store(manifest.node, manifest, image)
-            self._on_event(capture_event(capture.record()))
+        new = judgement.verdict == "archive"
+        if new:
+            capture.store(manifest.node, manifest, image, sha256=sha256)
         self._acknowledge(manifest, "archived")
         self._on_archived(manifest)
+        if new:  # last: whoever watches must not keep the node waiting
+            self._on_event(capture_event(capture.record()))
 
     def wants(self, manifest: Manifest) -> bool:
         """Whether an image that a node holds should be pulled; acknowledges it if it is safe already."""
@@ -141,3 +165,7 @@ class Intake:
         if entry["reason"] != failure.reason:
             capture.fail(failure.node, failure.reason)
             self._on_event(capture_event(capture.record()))
+
+
+def _image(manifest: Manifest) -> _Image:
+    return manifest.node, manifest.key, manifest.sha256

@@ -241,7 +241,7 @@ class RigLink:
         except WireError as error:
             log.warning("an image on %s has no usable manifest: %s", sample.key_expr, error)
             return
-        if self._intake.has_room(len(sample.payload)):
+        if self._intake.has_room(len(sample.payload)) and not self._intake.holds(manifest):
             self._intake.put(manifest, sample.payload.to_bytes())
 
     def _acknowledge(self, manifest: Manifest, verdict: str) -> None:
@@ -301,6 +301,8 @@ class RigLink:
 
     def fetch(self, manifest: Manifest) -> None:
         """Pull an image that a node holds; it enters the inbox like a pushed one. Returns at once."""
+        if self._intake.holds(manifest):
+            return
 
         def receive(reply: zenoh.Reply) -> None:
             if reply.ok is not None:

@@ -407,4 +407,6 @@ class Agent:
         parcel = self._parcels.get(event.key)
         if parcel is None:
             return [Decline(event.question, f"node {self.node} holds no image of {event.key}")]
+        if parcel.sending:
+            return [Decline(event.question, f"node {self.node} is sending the image of {event.key} at this moment")]
         return [AnswerImage(event.question, parcel.manifest)]

@@ -6,13 +6,13 @@
     id = "cam_01"
     controller = "tcp/192.168.1.10:7447"
     spool = "/var/lib/ringdic/spool"
-    camera = "pi"                       # or "virtual", "pattern"
+    camera = "pi"                       # or "virtual", "pattern", "playback"
 
     [pi]                                # settings of the camera chosen, all optional
     size = [3280, 2464]
     sync = "client"
 
-A relative spool folder is relative to the configuration file.
+A relative spool folder is relative to the configuration file, and so is the image of a playback.
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ _CAMERA_KEYS: dict[str, dict[str, type | tuple[type, ...]]] = {
         "jitter_us": (int, float),
         "seed": int,
     },
+    "playback": {"image": str},
 }
 
 
@@ -120,6 +121,8 @@ def _parse(table: dict[str, Any], folder: Path) -> NodeConfig:
     settings = table.get(table["camera"], {})
     if not isinstance(settings, dict):
         raise ConfigError(f"[{table['camera']}] must be a table")
+    if table["camera"] == "playback" and isinstance(settings.get("image"), str):
+        settings = {**settings, "image": str(folder / settings["image"])}
     return NodeConfig(
         rig=table["rig"],
         id=table["id"],
@@ -138,6 +141,10 @@ def make_camera(config: NodeConfig, clock: Clock) -> Camera:
         from node_agent.cameras.pattern import PatternCamera
 
         return PatternCamera(config.id, clock, **settings)
+    if config.camera == "playback":
+        from node_agent.cameras.playback import PlaybackCamera
+
+        return PlaybackCamera(clock, **settings)
     if config.camera == "virtual":
         from node_agent.cameras.virtual import VirtualCamera
 

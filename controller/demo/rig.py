@@ -6,7 +6,7 @@ import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,11 +33,24 @@ class Setting:
         """Folder of the sessions."""
         return self.folder / "archive"
 
+    def node_tables(self, ids: list[str]) -> dict[str, str]:
+        """What the configuration of each camera's node says of its camera."""
+        table = f'camera = "virtual"\n\n[virtual]\ncameras = {self.cameras}\nscale = {self.scale}\nseed = {self.seed}\n'
+        return dict.fromkeys(ids, table)
+
+
+@dataclass(frozen=True)
+class Running:
+    """A controller at work: its page's address, its Zenoh endpoint, its process id."""
+
+    address: str
+    endpoint: str
+    pid: int
+
 
 @contextmanager
-def running_controller(setting: Setting, rig_toml: str, settings_toml: str) -> Iterator[tuple[str, str]]:
-    """The controller as a process of its own; its page's address and its Zenoh endpoint."""
-    folder = setting.folder
+def running_controller(folder: Path, rig_toml: str, settings_toml: str) -> Iterator[Running]:
+    """The controller as a process of its own; its archive is ``folder/archive``."""
     (folder / "rig.toml").write_text(rig_toml, encoding="utf-8")
     (folder / "settings.toml").write_text(settings_toml, encoding="utf-8")
     endpoint = free_endpoint(ControllerConfig()).endpoint
@@ -55,25 +68,28 @@ def running_controller(setting: Setting, rig_toml: str, settings_toml: str) -> I
             text=True,
         )
         try:
-            yield _address(process, folder / "controller.log"), endpoint
+            yield Running(_address(process, folder / "controller.log"), endpoint, process.pid)
         finally:
             _end([process])
 
 
 @contextmanager
-def running_nodes(setting: Setting, rig: str, ids: list[str], endpoint: str) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """One node process a camera."""
+def running_nodes(
+    parent: Path, rig: str, tables: Mapping[str, str], endpoint: str
+) -> Iterator[list[subprocess.Popen[bytes]]]:
+    """One node process a camera in ``parent/nodes/<camera>``, its spool there.
+
+    tables : by camera, the end of the node's configuration: ``camera = …`` and that camera's table.
+    """
     processes: list[subprocess.Popen[bytes]] = []
     logs = []
     try:
-        for id_ in ids:
-            folder = setting.folder / "nodes" / id_
+        for id_, table in tables.items():
+            folder = parent / "nodes" / id_
             folder.mkdir(parents=True)
             config = folder / "node.toml"
             config.write_text(
-                f'rig = "{rig}"\nid = "{id_}"\ncontroller = "{endpoint}"\nspool = "spool"\ncamera = "virtual"\n\n'
-                f"[virtual]\ncameras = {setting.cameras}\nscale = {setting.scale}\nseed = {setting.seed}\n",
-                encoding="utf-8",
+                f'rig = "{rig}"\nid = "{id_}"\ncontroller = "{endpoint}"\nspool = "spool"\n{table}', encoding="utf-8"
             )
             log = (folder / "node.log").open("w", encoding="utf-8")
             logs.append(log)

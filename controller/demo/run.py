@@ -41,10 +41,10 @@ def run_demo(folder: Path, *, cameras: int, scale: float, steps: int, serve: boo
     name = parse_rig(rig.rig_toml()).name
     ids = [camera.id for camera in rig.cameras]
     with (
-        running_controller(setting, rig.rig_toml(), settings_for(scale)) as (address, endpoint),
-        running_nodes(setting, name, ids, endpoint) as nodes,
+        running_controller(setting.folder, rig.rig_toml(), settings_for(scale)) as running,
+        running_nodes(setting.folder, name, setting.node_tables(ids), running.endpoint) as nodes,
     ):
-        client = Client(address)
+        client, address = Client(running.address), running.address
         client.wait_for_nodes(ids, _START, lambda: check_alive(nodes, setting.folder))
         say(f"{cameras} nodes and the controller are up; the page is at {address}")
         session = client.post("/sessions", {"name": "demo"})["name"]

@@ -77,3 +77,15 @@ def test_a_damaged_record_hides_nothing_else(tmp_path: Path, caplog: pytest.LogC
     assert [session["name"] for session in catalogue.sessions()] == ["limb"]
     assert [record["capture_id"] for record in catalogue.captures("limb")] == ["0002-target"]
     assert "0001-board" in caplog.text
+
+
+def test_one_capture_is_read_anew_without_the_others(tmp_path: Path) -> None:
+    folder = a_session(tmp_path, "limb", ("board",))
+    catalogue = Catalogue(tmp_path)
+    a_capture(folder, 2, "target")
+    a_capture(folder, 3, "specimen")
+    assert catalogue.refresh_capture("limb", "0002-target") == catalogue.capture("limb", "0002-target")
+    assert [record["number"] for record in catalogue.captures("limb")] == [1, 2], "the third was not looked at"
+    assert catalogue.refresh_capture("limb", "0009-board") is None
+    a_session(tmp_path, "later", ("board",))
+    assert catalogue.refresh_capture("later", "0001-board") is not None, "a session made since the last look"

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from controller.archive import Archive
+from controller.archive import Archive, verify
 from controller.intake import Intake
 from node_agent.wire import CaptureKey, Failure, Manifest
 
@@ -111,6 +111,43 @@ def test_a_full_inbox_drops_and_a_worked_off_one_takes_again(tmp_path):
     desk.intake.stop(timeout=10)
     assert desk.intake.has_room(len(IMAGE))
     assert desk.acks == [("201", "archived")]
+
+
+def test_an_image_that_waits_already_takes_no_second_room(tmp_path):
+    desk = Desk(tmp_path, limit=len(IMAGE))
+    assert not desk.intake.holds(manifest_of())
+    assert desk.intake.put(manifest_of(), IMAGE)
+    assert desk.intake.holds(manifest_of())
+    assert desk.intake.put(manifest_of(), IMAGE), "pulled while it was being pushed"
+    desk.intake.start()
+    desk.intake.stop(timeout=10)
+    assert desk.acks == [("201", "archived")]
+    assert not desk.intake.holds(manifest_of())
+
+
+def test_images_archived_side_by_side_are_all_in_the_record(tmp_path):
+    cameras = [f"cam_{k:02d}" for k in range(40)]
+    desk = Desk(tmp_path)
+    capture = desk.session.begin_capture("board", cameras, fire_at_ns=70)
+    for camera in cameras:
+        key = CaptureKey("s", capture.capture_id, 70)
+        desk.intake.put(replace(manifest_of(camera.encode(), camera), key=key), camera.encode())
+    desk.intake.start()
+    desk.intake.stop(timeout=30)
+    assert sorted(desk.acks) == [(camera, "archived") for camera in cameras]
+    assert {entry["status"] for entry in capture.record()["cameras"].values()} == {"ok"}
+    assert verify(desk.session.path) == []
+
+
+def test_whoever_watches_does_not_keep_the_node_waiting(desk):
+    desk.intake = Intake(
+        desk.archive,
+        lambda manifest, verdict: desk.events.append({"ack": verdict}),
+        lambda manifest: None,
+        desk.events.append,
+    )
+    desk.intake.take(manifest_of(), IMAGE)
+    assert [event.get("ack") for event in desk.events] == ["archived", None]
 
 
 def test_a_damaged_record_costs_no_image_and_does_not_end_the_archivist(desk):

@@ -181,6 +181,14 @@ def test_the_inventory_tells_what_is_under_way_and_a_missing_image_is_declined()
     assert isinstance(agent.handle(FetchAsked(KEY, 9), NOW)[0], Decline)
 
 
+def test_an_image_on_its_way_is_not_given_a_second_time_beside():
+    agent = capturing_agent()
+    assert agent.handle(FrameSpooled(MANIFEST), at(1)) == [Publish(MANIFEST)]
+    assert isinstance(agent.handle(FetchAsked(KEY, 9), at(1))[0], Decline)
+    agent.handle(Sent(KEY), at(2))
+    assert agent.handle(FetchAsked(KEY, 10), at(2)) == [AnswerImage(10, MANIFEST)]
+
+
 def test_a_node_that_captures_does_not_change_its_camera():
     agent = capturing_agent()
     (answer,) = agent.handle(arm(TWO), NOW)

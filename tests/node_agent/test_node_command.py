@@ -12,9 +12,10 @@ import pytest
 
 from node_agent.cameras.camera import CameraError, Frame, Shot, check_settings
 from node_agent.cameras.pattern import PatternCamera
+from node_agent.cameras.playback import PlaybackCamera
 from node_agent.cli import main
 from node_agent.clock import SystemClock, parse_tracking
-from node_agent.config import ConfigError, read_config
+from node_agent.config import ConfigError, make_camera, read_config
 
 SOUND = """
 rig = "ring"
@@ -132,3 +133,24 @@ def test_the_offset_of_the_clock_is_read_from_chrony():
     assert error == pytest.approx(0.012 + 0.1 + 0.2)
     assert parse_tracking("00000000,,0,0.0,0.0,0.0,0.0,0.0,0.0,0.0,1.0,1.0,0.0,Not synchronised\n") is None
     assert parse_tracking("506 Cannot talk to daemon\n") is None
+
+
+@pytest.mark.parametrize("deepest", [255, 65535])
+def test_a_played_back_image_is_the_file_byte_for_byte(config, tmp_path, deepest):
+    plane = np.random.default_rng(1).integers(0, deepest + 1, (6, 8)).astype(np.uint8 if deepest == 255 else ">u2")
+    content = f"P5\n8 6\n{deepest}\n".encode() + plane.tobytes()
+    (tmp_path / "plane.pgm").write_bytes(content)
+    config.write_text(SOUND.split("camera =")[0] + 'camera = "playback"\n[playback]\nimage = "plane.pgm"\n')
+    camera = make_camera(read_config(config), SystemClock())
+    assert b"".join(camera.capture(Shot(0, "static", 0)).pgm()) == content
+
+
+@pytest.mark.parametrize(
+    ("content", "told"), [(b"P2\n1 1\n255\n0", "not a binary PGM"), (b"P5\n8 6\n255\nabc", "cut off"), (None, "read")]
+)
+def test_what_cannot_be_played_back_is_refused_with_its_file(tmp_path, content, told):
+    path = tmp_path / "plane.pgm"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(CameraError, match=f"plane.pgm.*{told}"):
+        PlaybackCamera(SystemClock(), image=str(path))

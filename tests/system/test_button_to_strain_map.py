@@ -34,10 +34,10 @@ def rig(tmp_path: Path) -> Iterator[tuple[str, Setting]]:
     ids = [camera.id for camera in pair.cameras]
     warm_up()
     with (
-        running_controller(setting, pair.rig_toml(), settings_for(SCALE)) as (address, endpoint),
-        running_nodes(setting, parse_rig(pair.rig_toml()).name, ids, endpoint) as nodes,
+        running_controller(tmp_path, pair.rig_toml(), settings_for(SCALE)) as running,
+        running_nodes(tmp_path, parse_rig(pair.rig_toml()).name, setting.node_tables(ids), running.endpoint) as nodes,
     ):
-        yield address, setting
+        yield running.address, setting
         check_alive(nodes, tmp_path)
 
 

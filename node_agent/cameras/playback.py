@@ -1,0 +1,62 @@
+"""A camera that delivers one image from a file again and again: real bytes at full size, and nothing to compute."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from node_agent.cameras.camera import CameraError, Frame, Lock, Shot, check_settings
+from node_agent.clock import Clock, sleep_until
+
+_HEADER = re.compile(rb"P5\s+(\d+)\s+(\d+)\s+(\d+)\s")
+
+
+class PlaybackCamera:
+    """Every frame is the image of the file, read once.
+
+    Parameters
+    ----------
+    image : str
+        A binary PGM file (P5, no comments), 8 or 16 bit. Raises CameraError if it is none.
+    """
+
+    def __init__(self, clock: Clock, *, image: str = "") -> None:
+        self._clock = clock
+        self._pixels = read_pgm(Path(image))
+
+    def lock(self, settings: Mapping[str, Any]) -> Lock:
+        check_settings(settings)
+        return Lock(metadata=dict(settings), sync="simulated")
+
+    def capture(self, shot: Shot) -> Frame:
+        sleep_until(self._clock, shot.fire_at_ns)
+        return Frame(self._pixels, shot.fire_at_ns)
+
+    def versions(self) -> dict[str, str]:
+        return {"camera": "playback"}
+
+    def close(self) -> None:
+        pass
+
+
+def read_pgm(path: Path) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
+    """The pixels (height, width) of a binary PGM file without comments. Raises CameraError."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise CameraError(f"{path}: cannot be read ({error.strerror}); name a PGM file") from error
+    header = _HEADER.match(content)
+    if header is None:
+        raise CameraError(f"{path}: not a binary PGM file; the camera plays back PGM only")
+    width, height, deepest = (int(number) for number in header.groups())
+    bytes_each = 1 if deepest < 256 else 2
+    if len(content) - header.end() != width * height * bytes_each:
+        raise CameraError(f"{path}: the file is cut off or too long for {width} x {height} pixels; write it anew")
+    if bytes_each == 1:
+        return np.frombuffer(content, np.uint8, offset=header.end()).reshape(height, width)
+    return np.frombuffer(content, ">u2", offset=header.end()).reshape(height, width).astype(np.uint16)

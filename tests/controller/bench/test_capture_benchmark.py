@@ -1,0 +1,43 @@
+"""The capture benchmark on a small rig: the same processes and the same code, few and small images."""
+
+from __future__ import annotations
+
+import pytest
+
+from controller.bench.capture import bench_capture, capture_ratios
+from processing.errors import InputError
+
+SIZE = (400, 500)
+
+
+def test_three_nodes_deliver_what_they_played_back():
+    found = bench_capture((3,), rounds=2, size=SIZE)
+    (run,) = found["runs"]
+    header = len(b"P5\n400 500\n255\n")
+    assert found["image_bytes"] == 400 * 500 + header
+    assert (run["nodes"], run["rounds"], run["verified"]) == (3, 2, 6)
+    assert run["bytes"] == 3 * found["image_bytes"]
+    for name in ("archived_s", "acknowledged_s", "pressed_s"):
+        assert 0 < run[name]["median"] <= run[name]["largest"], name
+    # The press comes at least the trigger's lead before the moment.
+    assert run["pressed_s"]["median"] > run["acknowledged_s"]["median"] + 0.3
+    assert run["mb_per_second"] == pytest.approx(run["bytes"] / 1e6 / run["acknowledged_s"]["median"])
+    assert run["controller_memory_mb"] is None or run["controller_memory_mb"] > 10
+
+
+def test_ratios_tell_how_much_better_the_new_result_is():
+    def result(seconds: float, cpu: float | None) -> dict:
+        times = {"median": seconds, "largest": seconds}
+        run = {"nodes": 12, "bytes": 100, "archived_s": times, "acknowledged_s": times}
+        return {"runs": [{**run, "controller_cpu_s": cpu, "controller_memory_mb": 200.0}]}
+
+    (row,) = capture_ratios(result(1.0, None), result(2.0, 3.0))
+    assert row == {
+        "nodes": 12,
+        "archived": 2.0,
+        "acknowledged": 2.0,
+        "controller_cpu": None,
+        "controller_memory": 1.0,
+    }
+    with pytest.raises(InputError, match="no capture run in common"):
+        capture_ratios(result(1.0, 1.0), {"runs": []})
