@@ -27,17 +27,21 @@ from processing.correlation import (
     prepare_reference,
     search_hypotheses,
 )
+from processing.correlation.seeds import flow_starts
 from processing.errors import ComputationError
 from processing.proxy import compose, stereo_hypotheses
 from processing.region import paint, well_seen
 from processing.results import Matches
-from processing.sweep import Search, convincing, radii_of, sweep
+from processing.start_field import lattice_spacing, match_from_lattice, on_lattice
+from processing.sweep import SWEEP_RADII, Search, convincing, radii_of, sweep
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 Mask = NDArray[np.bool_]
 
 _STAGES = ("prepare", "start", "refine")
+_HELD = 0.6  # ZNCC under the warp that optical flow tells, from which on it is a start value
+_ENOUGH = 0.8  # share of the points that must hold, or start values are looked for in other ways
 
 
 @dataclass(frozen=True)
@@ -105,7 +109,9 @@ def match_reference(
     progress(0.5)
     xy, faces = grid(region, settings.step)
     reference = prepare_reference(first, region, settings)
-    found = correlate(reference, current, xy, settings, start=_start_at(xy, seeds, warps))
+    found = match_from_lattice(
+        reference, current, xy, settings, _start_at(xy, seeds, warps), lattice_spacing(settings, SWEEP_RADII)
+    )
     return Grid(region, xy, faces), _of_step(xy, None, found, reference=True)
 
 
@@ -120,13 +126,34 @@ def match_step(
     settings = stereo.settings
     in_time = between = None
     if first is not None:
-        in_time = correlate(reference, prepare_current(first, settings=settings), xy, settings)
+        in_time = _match_in_time(reference, prepare_current(first, settings=settings), xy, settings)
     if in_time is not None and second is not None:
         current = prepare_current(second, settings=settings)
         start = _start_after_motion(stereo, reference, current, xy, in_time)
         if np.isfinite(start).any():
-            between = correlate(reference, current, xy, settings, start=start)
+            between = match_from_lattice(reference, current, xy, settings, start, lattice_spacing(settings))
     return _of_step(xy, in_time, between)
+
+
+def _match_in_time(reference: Reference, current: Current, xy: Array, settings: CorrelationSettings) -> Correlation:
+    """The first camera's points in its image of a step, from where optical flow puts some of them.
+
+    Where that leads to few matches the correlation looks for start values in its own ways.
+    """
+    chosen = np.flatnonzero(on_lattice(xy, lattice_spacing(settings)))
+    flow = flow_starts(reference, current, xy[chosen], settings.radius)[:, [0, 6, 1, 2, 7, 8]]
+    known = np.flatnonzero(np.isfinite(flow).all(axis=1))
+    warps, zncc, _ = search_hypotheses(reference, current, xy[chosen[known]], flow[known][:, None], settings.radius)
+    held = zncc > _HELD
+    if held.sum() < _ENOUGH * max(len(chosen), 1):
+        return correlate(reference, current, xy, settings)
+    start = np.full((len(xy), 6), np.nan)
+    start[chosen[known[held]]] = warps[held]
+    found = match_from_lattice(reference, current, xy, settings, start, lattice_spacing(settings))
+    if found.good.mean() >= _ENOUGH:
+        return found
+    searched = correlate(reference, current, xy, settings)
+    return searched if searched.good.sum() > found.good.sum() else found
 
 
 def collect(pair: tuple[str, str], grid_: Grid, steps: Sequence[StepMatches]) -> PairMatches:
@@ -180,8 +207,7 @@ def _start_after_motion(
 ) -> Array:
     """Start values (n, 6) in the second camera's image of a later step, from the first camera's motion and a sweep."""
     settings = stereo.settings
-    spacing = settings.step * max(1, round(2 * settings.radius / settings.step))
-    chosen = np.flatnonzero((in_time.status == Status.GOOD) & (np.mod(xy, spacing) == 0).all(axis=1))
+    chosen = np.flatnonzero((in_time.status == Status.GOOD) & on_lattice(xy, lattice_spacing(settings)))
     moved = xy[chosen] + in_time.uv[chosen]
     hypotheses = stereo_hypotheses(*stereo.cameras, moved, stereo.radii, settings.radius)
     motion = np.concatenate([in_time.uv[chosen], in_time.gradient[chosen].reshape(-1, 4)], axis=1)

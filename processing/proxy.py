@@ -16,6 +16,8 @@ from processing.camera import Camera
 
 Array = NDArray[np.float64]
 
+_APART = 4  # radii from one that is followed exactly to the next
+
 
 @dataclass(frozen=True)
 class Hypotheses:
@@ -46,8 +48,21 @@ def on_cylinder(camera: Camera, px: Array, radii: Array) -> Array:
 def stereo_hypotheses(first: Camera, second: Camera, px: Array, radii: Array, half_width: float) -> Hypotheses:
     """Hypotheses for positions px (n, 2) of the first image in the second, for proxies of the given radii (K,) mm.
 
-    The gradients are central differences over ``half_width`` px, about the radius of a subset.
+    The gradients are central differences over ``half_width`` px, about the radius of a subset. Of a long row of radii
+    every fourth is followed exactly, the others lie evenly between: along a line of sight a match moves evenly.
     """
+    fewer = radii if len(radii) <= 2 * _APART else np.append(radii[:-1:_APART], radii[-1])
+    warps, xyz = _exact_hypotheses(first, second, px, fewer, half_width)
+    if len(fewer) < len(radii):
+        at = np.clip(np.searchsorted(fewer, radii, side="right") - 1, 0, len(fewer) - 2)
+        share = ((radii - fewer[at]) / (fewer[at + 1] - fewer[at]))[:, None]
+        warps = warps[:, at] + share * (warps[:, at + 1] - warps[:, at])
+        xyz = xyz[:, at] + share * (xyz[:, at + 1] - xyz[:, at])
+    return Hypotheses(warps, xyz, radii)
+
+
+def _exact_hypotheses(first: Camera, second: Camera, px: Array, radii: Array, half_width: float) -> tuple[Array, Array]:
+    """Warps (n, K, 6) and places (n, K, 3) mm on the proxies."""
     offsets = half_width * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=float)
     n, k = len(px), len(radii)
     around = (px[:, None, :] + offsets).reshape(-1, 2)
@@ -62,7 +77,7 @@ def stereo_hypotheses(first: Camera, second: Camera, px: Array, radii: Array, ha
     width, height = second.size
     inside = (seen[:, 0] >= 0).all(-1) & (seen[:, 0, :, 0] < width) & (seen[:, 0, :, 1] < height)
     warps[~inside] = np.nan
-    return Hypotheses(warps, xyz[:, 0], radii)
+    return warps, xyz[:, 0]
 
 
 def compose(inner: Array, outer: Array) -> Array:

@@ -65,11 +65,15 @@ def coherent(radius: Array, convincing: Mask, tolerance: float, least: int = 0) 
 
 def contrast(image: NDArray[np.generic], xy: Array, half_width: int) -> Array:
     """Root mean square of the grey level's gradient in a square about each position (..., 2) of an image. (...)."""
-    grey = image.astype(np.float32)
-    energy = cv2.Sobel(grey, -1, 1, 0, scale=0.125) ** 2 + cv2.Sobel(grey, -1, 0, 1, scale=0.125) ** 2
-    size = (2 * half_width + 1, 2 * half_width + 1)
-    mean = cv2.blur(energy, size)
-    return np.sqrt(mean[xy[..., 1].astype(int), xy[..., 0].astype(int)]).astype(float)
+    at = xy.reshape(-1, 2).astype(int)
+    if not len(at):
+        return np.zeros(xy.shape[:-1])
+    margin = half_width + 2
+    low, high = np.maximum(at.min(axis=0) - margin, 0), at.max(axis=0) + margin + 1
+    grey = image[low[1] : high[1], low[0] : high[0]].astype(np.float32)
+    along_x, along_y = cv2.Sobel(grey, -1, 1, 0, scale=0.125), cv2.Sobel(grey, -1, 0, 1, scale=0.125)
+    mean = cv2.blur(along_x * along_x + along_y * along_y, (2 * half_width + 1, 2 * half_width + 1))
+    return np.sqrt(mean[at[:, 1] - low[1], at[:, 0] - low[0]]).astype(float).reshape(xy.shape[:-1])
 
 
 def lattice_normals(xyz: Array) -> Array:

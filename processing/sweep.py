@@ -15,10 +15,13 @@ from processing.camera import Camera
 from processing.correlation import CorrelationSettings, Current, prepare_reference, search_hypotheses
 from processing.proxy import on_cylinder, stereo_hypotheses, sweep_radii
 from processing.region import Lattice, coherent, contrast, lattice
+from processing.start_field import lattice_spacing
 
 # Beside the speckled surface there may be bare skin that matches, but poorly: less contrast than this share of the
 # usual is no speckle.
 _LEAST_CONTRAST = 0.3
+#: Subset radii from one position of the sweep to the next, to a multiple of the grid's step.
+SWEEP_RADII = 1.5
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8] | NDArray[np.uint16]
@@ -83,7 +86,7 @@ def sweep(
     of a connected piece of surface that is kept; 0 keeps the largest alone.
     """
     first, second = cameras
-    spacing = settings.step * max(1, round(1.5 * settings.radius / settings.step))
+    spacing = lattice_spacing(settings, SWEEP_RADII)
     points = lattice(first.size, spacing, settings.radius + 2)
     shape = points.xy.shape[:2]
     px = points.xy.reshape(-1, 2)
@@ -99,9 +102,10 @@ def sweep(
     believed = convincing(search, zncc, second_best)
     believed &= (which > 0) & (which < len(radii) - 1)
     if mask is None:
-        texture = contrast(image, px, settings.radius)
-        usual = float(np.median(texture[believed])) if believed.any() else 0.0
-        believed &= texture > _LEAST_CONTRAST * usual
+        seen = np.flatnonzero(believed)
+        texture = contrast(image, px[seen], settings.radius)
+        usual = float(np.median(texture)) if len(seen) else 0.0
+        believed[seen[~(texture > _LEAST_CONTRAST * usual)]] = False
     good = coherent(radii[which].reshape(shape), believed.reshape(shape), tolerance=2.0, least=least)
     xyz = _spread(hypotheses.xyz[np.arange(len(met)), nearest], met, len(px)).reshape(*shape, 3)
     return Sweep(points, px, warps, xyz, good)

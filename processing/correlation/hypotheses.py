@@ -12,6 +12,10 @@ from processing.correlation.prepared import Current, Reference
 
 Array = NDArray[np.float64]
 
+_MANY = 16  # warps a point from which on they are first tried on fewer pixels
+_THINNED = 2  # every so many of the pixels each way at first
+_DOUBT = 0.3  # ZNCC that the first trial may be off: three standard deviations of 80 pixels that are not alike
+
 
 def search_hypotheses(
     reference: Reference,
@@ -53,52 +57,80 @@ def search_hypotheses(
     return best, zncc, np.where(apart, score, -1.0).max(axis=1)
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath={"contract", "reassoc", "arcp", "nsz"})
+_FAST = {"contract", "reassoc", "arcp", "nsz"}
+
+
+@nb.njit(cache=True, nogil=True, fastmath=_FAST)
+def _pixels(grey, mask, left_of_mask, top_of_mask, jx, iy, off_x, off_y, radius, stride, px):  # type: ignore[no-untyped-def]
+    """Every so many pixels of the circular subset that the mask leaves: dx, dy and grey level less its mean, in px.
+
+    Returns their number and the norm of the levels.
+    """
+    n, total = 0, 0.0
+    for dy in range(-(radius // stride) * stride, radius + 1, stride):
+        for dx in range(-(radius // stride) * stride, radius + 1, stride):
+            i, j = iy + dy - top_of_mask, jx + dx - left_of_mask
+            if dx * dx + dy * dy > radius * radius or i < 0 or j < 0 or i >= mask.shape[0] or j >= mask.shape[1]:
+                continue
+            if mask[i, j]:
+                px[0, n], px[1, n], px[2, n] = dx + off_x, dy + off_y, grey[iy + dy, jx + dx]
+                total += px[2, n]
+                n += 1
+    mean, square = total / max(n, 1), 0.0
+    for m in range(n):
+        px[2, m] -= mean
+        square += px[2, m] * px[2, m]
+    return n, math.sqrt(square)
+
+
+@nb.njit(cache=True, nogil=True, fastmath=_FAST)
+def _alike(image, x0, y0, warp, px, n, norm):  # type: ignore[no-untyped-def]
+    """ZNCC of n pixels with the image under a warp (6,), bilinear; -1 where they leave it or the warp is NaN."""
+    u, v, ux, uy, vx, vy = warp[0], warp[1], warp[2], warp[3], warp[4], warp[5]
+    if n < 8 or not norm > 0.0 or not math.isfinite(u + v + ux + uy + vx + vy):
+        return -1.0
+    height, width = image.shape
+    s_g = s_gg = s_fg = 0.0
+    for m in range(n):
+        dx, dy = px[0, m], px[1, m]
+        x = x0 + u + (1.0 + ux) * dx + uy * dy
+        y = y0 + v + vx * dx + (1.0 + vy) * dy
+        if not (x >= 0.0 and y >= 0.0 and x < width - 1 and y < height - 1):
+            return -1.0
+        left, top = np.uint64(x), np.uint64(y)
+        fx, fy = x - left, y - top
+        right, below = left + np.uint64(1), top + np.uint64(1)
+        g = (1.0 - fy) * ((1.0 - fx) * image[top, left] + fx * image[top, right]) + fy * (
+            (1.0 - fx) * image[below, left] + fx * image[below, right]
+        )
+        s_g += g
+        s_gg += g * g
+        s_fg += g * px[2, m]
+    variance = s_gg - s_g * s_g / n
+    return s_fg / (norm * math.sqrt(variance)) if variance > 1e-9 * n else -1.0
+
+
+@nb.njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
 def _score(grey, mask, left_of_mask, top_of_mask, image, xy, warps, radius, stride, score):  # type: ignore[no-untyped-def]
     """ZNCC (n, K) of every warp; -1 where the subset leaves either image or the warp is NaN. Bilinear in the current.
 
-    grey, image : the whole images, xy : (n, 2) px in them; mask : (h, w) of the box whose corner is given.
+    grey, image : the whole images, xy : (n, 2) px in them; mask : (h, w) of the box whose corner is given. Of many
+    warps those that a quarter of the pixels shows to be far from the best keep that first score.
     """
-    height, width = image.shape
+    count = warps.shape[1]
     for k in nb.prange(xy.shape[0]):
         jx, iy = math.floor(xy[k, 0] + 0.5), math.floor(xy[k, 1] + 0.5)
         off_x, off_y = jx - xy[k, 0], iy - xy[k, 1]
         px = np.empty((3, (2 * (radius // stride) + 1) ** 2))
-        n = 0
-        for dy in range(-(radius // stride) * stride, radius + 1, stride):
-            for dx in range(-(radius // stride) * stride, radius + 1, stride):
-                i, j = iy + dy - top_of_mask, jx + dx - left_of_mask
-                if dx * dx + dy * dy > radius * radius or i < 0 or j < 0 or i >= mask.shape[0] or j >= mask.shape[1]:
-                    continue
-                if mask[i, j]:
-                    px[0, n], px[1, n], px[2, n] = dx + off_x, dy + off_y, grey[iy + dy, jx + dx]
-                    n += 1
-        mean = np.sum(px[2, :n]) / max(n, 1)
-        px[2, :n] -= mean
-        norm = math.sqrt(np.sum(px[2, :n] ** 2))
-        for h in range(warps.shape[1]):
-            u, v, ux, uy, vx, vy = warps[k, h]
-            score[k, h] = -1.0
-            if n < 8 or not norm > 0.0 or not math.isfinite(u + v + ux + uy + vx + vy):
-                continue
-            s_g = s_gg = s_fg = 0.0
-            inside = True
-            for m in range(n):
-                dx, dy = px[0, m], px[1, m]
-                x = xy[k, 0] + u + (1.0 + ux) * dx + uy * dy
-                y = xy[k, 1] + v + vx * dx + (1.0 + vy) * dy
-                if not (x >= 0.0 and y >= 0.0 and x < width - 1 and y < height - 1):
-                    inside = False
-                    break
-                left, top = np.uint64(x), np.uint64(y)
-                fx, fy = x - left, y - top
-                right, below = left + np.uint64(1), top + np.uint64(1)
-                g = (1.0 - fy) * ((1.0 - fx) * image[top, left] + fx * image[top, right]) + fy * (
-                    (1.0 - fx) * image[below, left] + fx * image[below, right]
-                )
-                s_g += g
-                s_gg += g * g
-                s_fg += g * px[2, m]
-            variance = s_gg - s_g * s_g / n
-            if inside and variance > 1e-9 * n:
-                score[k, h] = s_fg / (norm * math.sqrt(variance))
+        limit = -2.0
+        if count >= _MANY:
+            n, norm = _pixels(
+                grey, mask, left_of_mask, top_of_mask, jx, iy, off_x, off_y, radius, _THINNED * stride, px
+            )
+            for h in range(count):
+                score[k, h] = _alike(image, xy[k, 0], xy[k, 1], warps[k, h], px, n, norm)
+            limit = max(np.max(score[k]) - _DOUBT, -0.99)
+        n, norm = _pixels(grey, mask, left_of_mask, top_of_mask, jx, iy, off_x, off_y, radius, stride, px)
+        for h in range(count):
+            if count < _MANY or score[k, h] > limit:
+                score[k, h] = _alike(image, xy[k, 0], xy[k, 1], warps[k, h], px, n, norm)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -27,6 +27,7 @@ Progress = Callable[[int, int], None]
 
 _LEVELS = (0.9, 0.8, 0.6)  # reliability in steps, ZNCC; the last one is settings.zncc_min
 _RETRIES = 3
+_PATIENCE = 15  # iterations of a point that failed before
 _STRETCH = 4.0  # largest stretch and compression of a subset between two images
 
 
@@ -84,7 +85,7 @@ class Field:
         part = self.region if self.region is not None else self.current.around(*self._reached(start, index))
         self._filter(part)
         status, zncc, iterations, sigma, found = refine(
-            self.reference, part, self.xy[index], start, self.settings, follow
+            self.reference, part, self.xy[index], start, self._patient(index), follow
         )
         beyond = np.flatnonzero(status == Status.OUTSIDE)
         if part is not self.current and len(beyond):  # of the region, but perhaps not of the image
@@ -107,6 +108,15 @@ class Field:
         if self.progress is not None:
             self.progress(int(self.good.sum()), len(self.xy))
         return keep
+
+    def _patient(self, index: NDArray[np.int64]) -> CorrelationSettings:
+        """The settings for points (k,): where none has been matched from elsewhere before, fewer iterations will tell.
+
+        Gauss-Newton from another start value converges in a few steps or, at the rim of what both images show, never.
+        """
+        if (self.iterations[index] > 0).all() and self.settings.max_iterations > _PATIENCE:
+            return replace(self.settings, max_iterations=_PATIENCE)
+        return self.settings
 
     def _filter(self, part: Current) -> None:
         began = time.perf_counter()
@@ -160,7 +170,11 @@ class Field:
         worth = np.where(offer[index], self.zncc[self.near[index]], -np.inf)
         slot = np.argmax(worth, axis=1)
         self.tried[index, slot] = True
-        self.attempt(index, predicted(self.xy, self.parameters, self.near[index, slot], index))
+        start = predicted(self.xy, self.parameters, self.near[index, slot], index)
+        failed = self.iterations[index] > 0
+        for part in (~failed, failed):
+            if part.any():
+                self.attempt(index[part], start[part])
         return True
 
     def retry_from_fit(self) -> None:

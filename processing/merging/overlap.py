@@ -7,7 +7,6 @@ compete (Solav et al. 2018, overlap removal; there for two surfaces, here for an
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
+from processing.merging import kernels
 from processing.mesh import Mesh
 from processing.projection import Projector
 from processing.topology import neighbours
@@ -76,28 +76,7 @@ def closer_than(mesh: Mesh, owner: Indices, gap: float, reach: float) -> Indices
     around = tree.query_ball_point(centroids[large], np.hypot(radius[large] + radius.max() + gap, reach))
     more = np.array([(a, b) for a, row in zip(large, around, strict=True) for b in row if a != b], np.int64)
     pairs = np.concatenate([pairs, more.reshape(-1, 2)])
-    pairs = pairs[owner[pairs[:, 0]] != owner[pairs[:, 1]]]
-    first, second = pairs.T
-    normal = normals[first] + normals[second]
-    apart = centroids[second] - centroids[first]
-    same_side = np.einsum("ni,ni->n", normals[first], normals[second]) > _SAME_SIDE
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    height = np.einsum("ni,ni->n", apart, normal)
-    beside = np.sqrt(np.maximum(np.einsum("ni,ni->n", apart, apart) - height**2, 0.0))
-    near = same_side & (np.abs(height) < reach) & (beside < radius[first] + radius[second] + gap)
-    first, second, normal = first[near], second[near], normal[near]
-    return np.stack([first, second], 1)[_separation(corners[first], corners[second], normal) < gap]
-
-
-def _separation(first: Array, second: Array, normal: Array) -> Array:
-    """Widest gap (n,) between two triangles (n, 3, 3) seen along normals, over the directions across their edges."""
-    widest = np.full(len(first), -np.inf)
-    for one, two in ((first, second), (second, first)):
-        for k in range(3):
-            across = np.cross(one[:, (k + 1) % 3] - one[:, k], normal)  # outwards from the triangle
-            across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
-            widest = np.maximum(widest, np.einsum("nki,ni->nk", two - one[:, k, None], across).min(axis=1))
-    return widest
+    return pairs[kernels.closer(pairs, owner, centroids, normals, corners, radius, gap, reach, _SAME_SIDE)]
 
 
 def badness(mesh: Mesh, owner: Indices, covered: Cover, correlation: Array, weights: Mapping[str, float]) -> Array:
@@ -158,29 +137,11 @@ def peel(faces: Indices, alive: Mask, competing: Indices, bad: Array) -> Mask:
     """
     competing = competing[alive[competing].all(axis=1)]
     start, rival = _rivals(len(faces), competing)
-    left = np.diff(start).tolist()
-    beside = neighbours(faces).tolist()
-    living: list[bool] = alive.tolist()
-    order = (-bad).tolist()
-    queue = [(order[f], f) for f in np.unique(competing).tolist() if any(g < 0 or not living[g] for g in beside[f])]
-    if not queue and len(competing):  # closed surfaces: somewhere the first has to go
-        worst = int(competing.ravel()[np.argmax(bad[competing])])
-        queue = [(order[worst], worst)]
-    heapq.heapify(queue)
-    while queue:
-        _, f = heapq.heappop(queue)
-        if not living[f] or not left[f]:
-            continue
-        living[f] = False
-        for g in rival[start[f] : start[f + 1]]:
-            left[g] -= 1
-        for g in beside[f]:
-            if g >= 0 and living[g] and left[g]:
-                heapq.heappush(queue, (order[g], g))
-    kept = np.array(living, dtype=bool)
+    kept = alive.copy()
+    kernels.peel(start, rival, neighbours(faces), kept, bad)
     for first, second in competing[kept[competing].all(axis=1)].tolist():  # what no border reached
         if kept[first] and kept[second]:
-            kept[first if order[first] < order[second] else second] = False
+            kept[first if bad[first] > bad[second] else second] = False
     return kept
 
 
@@ -191,30 +152,13 @@ def regrow(faces: Indices, alive: Mask, candidate: Mask, competing: Indices, bad
     neighbours there come first, of these the best.
     """
     start, rival = _rivals(len(faces), competing)
-    beside = neighbours(faces).tolist()
-    living: list[bool] = alive.tolist()
-    wanted: list[bool] = (candidate & ~alive).tolist()
-    order = bad.tolist()
-    queue = [(-_count(beside[f], living), order[f], f) for f in np.flatnonzero(candidate & ~alive).tolist()]
-    queue = [entry for entry in queue if entry[0] < 0]
-    heapq.heapify(queue)
-    while queue:
-        _, _, f = heapq.heappop(queue)
-        if living[f] or any(living[g] for g in rival[start[f] : start[f + 1]]):
-            continue
-        living[f] = True
-        for g in beside[f]:
-            if g >= 0 and wanted[g] and not living[g]:
-                heapq.heappush(queue, (-_count(beside[g], living), order[g], g))
-    return np.array(living, dtype=bool)
+    living = alive.copy()
+    kernels.regrow(start, rival, neighbours(faces), living, candidate & ~alive, bad)
+    return living
 
 
-def _count(beside: list[int], living: list[bool]) -> int:
-    return sum(g >= 0 and living[g] for g in beside)
-
-
-def _rivals(M: int, competing: Indices) -> tuple[list[int], list[int]]:
+def _rivals(M: int, competing: Indices) -> tuple[Indices, Indices]:
     """For each triangle, where its competitors begin (M + 1) in a row of all of them."""
     both = np.concatenate([competing, competing[:, ::-1]])
     matrix = coo_array((np.ones(len(both), bool), (both[:, 0], both[:, 1])), shape=(M, M)).tocsr()
-    return matrix.indptr.tolist(), matrix.indices.tolist()
+    return matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64)
