@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from controller import measuring, reporting
+from controller.bench.command import bench
 from controller.console import narrated, show_table
 from controller.options import AsJson, Reference, Run, Session, SethHill, Window, WithoutRigidMotion
 from processing.errors import InputError, RingdicError
@@ -30,7 +31,7 @@ Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="GROUP.NAM
 SettingsFile = Annotated[Path | None, typer.Option("--settings", help="Settings as a TOML file.")]
 app.add_typer(measuring.measure)
 app.command()(measuring.strain)
-for _command in (reporting.report, reporting.overlay, reporting.animate):
+for _command in (reporting.report, reporting.overlay, reporting.animate, bench):
     app.command()(_command)
 
 
@@ -170,31 +171,6 @@ def validate(
     found = run_validation(out, scale=scale, quick=quick, only=only or (), images_only=images_only)
     if as_json:
         _print_json(found)
-
-
-@app.command()
-def bench(
-    data: Annotated[Path | None, typer.Option(help="Folder of the MultiDIC rig; else synthetic.")] = None,
-    repeats: Annotated[int, typer.Option(min=1, help="Runs of which the best counts.")] = 5,
-    interpolation: Annotated[str, typer.Option(help="cubic or quintic.")] = "cubic",
-    compare: Annotated[Path | None, typer.Option(help="An earlier result (JSON) to compare with.")] = None,
-    as_json: AsJson = False,
-) -> None:
-    """How fast the correlation is on this machine."""
-    from processing.correlation.bench import bench_correlation, ratios, read_result
-
-    before = read_result(compare) if compare is not None else None
-    result: dict[str, Any] = {
-        "correlation": bench_correlation(
-            data, repeats=repeats, interpolation=interpolation, say=lambda line: typer.echo(line, err=True)
-        )
-    }
-    if before is not None:
-        result["ratios"] = ratios(result, before)
-        for row in result["ratios"]:
-            typer.echo("  ".join(f"{name} {value:.3g}" for name, value in row.items()), err=True)
-    if as_json:
-        _print_json(result)
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ from node_agent.virtual_rig.lens import VirtualCamera
 from node_agent.virtual_rig.render import STAMP, render
 from node_agent.virtual_rig.scenes import Scene
 
-_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Darkroom:
         path = self.path(shot)
         if path.is_file():  # another process was faster
             return
-        coding = _PNG if shot.jpeg is None else [cv2.IMWRITE_JPEG_QUALITY, shot.jpeg]
+        coding = PNG if shot.jpeg is None else [cv2.IMWRITE_JPEG_QUALITY, shot.jpeg]
         _, coded = cv2.imencode(path.suffix, render(shot.camera, shot.scene, shot.seed), coding)
         aside = path.with_name(f".{path.stem}-{os.getpid()}.partial")
         aside.write_bytes(coded.tobytes())

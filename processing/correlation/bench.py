@@ -113,7 +113,7 @@ def read_result(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     except ValueError as error:
         raise InputError(f"{path}: not a JSON file ({error}); give what `ringdic bench --json` printed") from error
-    if not isinstance(result, dict) or not isinstance(result.get("correlation"), dict):
+    if not isinstance(result, dict) or not any(isinstance(part, dict) for part in result.values()):
         raise InputError(f"{path}: not a result of the benchmark; give what `ringdic bench --json` printed")
     return result
 
