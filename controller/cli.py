@@ -18,6 +18,8 @@ from controller.bench.command import bench
 from controller.console import narrated, show_table
 from controller.options import AsJson, Reference, Run, Session, SethHill, Window, WithoutRigidMotion
 from processing.errors import InputError, RingdicError
+from processing.progress import Progress
+from processing.session import read_session
 
 app = typer.Typer(
     name="ringdic",
@@ -84,19 +86,26 @@ def process(
     session: Session,
     settings: SettingsFile = None,
     set_: Overrides = None,
-    cluster: Annotated[str | None, typer.Option(help="Address of a cluster's scheduler.")] = None,
+    cluster: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a dask cluster.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Calibrate, correlate, triangulate and compute strain, with nothing to click."""
     from processing.settings import load_settings
 
-    if cluster is not None:
-        raise InputError("--cluster: computing on a cluster is not available in this version; leave the option out")
     chosen = load_settings(settings, set_ or [])
     from processing.pipeline import process_session  # takes a while: what was typed is checked first
 
+    executor = None
+    if cluster is not None:
+        from processing.cluster import ClusterExecutor
+
+        executor = ClusterExecutor(cluster)
+        session = read_session(session.resolve()).path  # the workers' working folders are others
     with narrated() as report:
-        run = process_session(session, chosen, report)
+        if executor is not None:
+            report(Progress("prepare", 0.0, f"asking the workers of {cluster}"))
+            executor.check(session)
+        run = process_session(session, chosen, report, executor)
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     if as_json:
         _print_json({"run": str(run), **summary})

@@ -5,17 +5,20 @@ that it depends on; where the file is there, the task is done. An executor runs 
 in threads of this process, others elsewhere, all of them the same tasks.
 
 ``task``    a task, its key and its output file
+``agenda``  which tasks may start and which have ended
 ``local``   the executor of one machine
 ``memory``  what a process keeps between tasks: decoded images, prepared references
 ``work``    the folder of the outputs, kept within a size
 """
 
-from processing.tasks.local import LocalExecutor
+from processing.tasks.agenda import Agenda
+from processing.tasks.local import LocalExecutor, kernels_side_by_side
 from processing.tasks.memory import Memory, kept
 from processing.tasks.task import Arrays, Executor, Ran, Task, Told, code_stamp, digest, file_digest, read_output
 from processing.tasks.work import tidy, work_folder
 
 __all__ = [
+    "Agenda",
     "Arrays",
     "Executor",
     "LocalExecutor",
@@ -27,6 +30,7 @@ __all__ = [
     "digest",
     "file_digest",
     "kept",
+    "kernels_side_by_side",
     "read_output",
     "tidy",
     "work_folder",

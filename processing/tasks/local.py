@@ -10,6 +10,7 @@ from contextlib import contextmanager
 import cv2
 import numba
 
+from processing.tasks.agenda import Agenda
 from processing.tasks.task import Ran, Task, Told
 
 _TOGETHER = ("omp", "tbb")  # layers of numba whose kernels may be started from several threads at once
@@ -26,39 +27,20 @@ class LocalExecutor:
 
     def run(self, tasks: Sequence[Task], told: Told) -> None:
         """See ``Executor.run``. Tasks start in the order given as soon as what they need is there."""
-        waiting = [task for task in tasks if not task.done]
-        count = 0
-        for task in tasks:
-            if task.done:
-                count += 1
-                told(task, task.run(), count, len(tasks))
-        if not waiting:
+        agenda = Agenda(tasks, told)
+        if not agenda:
             return
         cores = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-        workers = min(self._workers or (os.cpu_count() or 1), len(waiting)) if _kernels_side_by_side() else 1
-        left = {task.key for task in waiting}
+        workers = min(self._workers or (os.cpu_count() or 1), len(agenda)) if kernels_side_by_side() else 1
         running: dict[Future[Ran], Task] = {}
         share = max(1, cores // workers)
         with _single_threaded_filters(workers > 1), ThreadPoolExecutor(workers, "task") as pool:
-            try:
-                while waiting or running:
-                    while len(running) < workers and (ready := _next(waiting, left)) is not None:
-                        waiting.remove(ready)
-                        running[pool.submit(_run, ready, share)] = ready
-                    ended, _ = wait(running, return_when=FIRST_COMPLETED)
-                    for future in ended:
-                        task = running.pop(future)
-                        ran = future.result()
-                        left.discard(task.key)
-                        count += 1
-                        told(task, ran, count, len(tasks))
-            finally:
-                waiting.clear()
-
-
-def _next(waiting: Sequence[Task], left: set[str]) -> Task | None:
-    """The first task whose needs are all met."""
-    return next((task for task in waiting if not left.intersection(task.needs)), None)
+            while agenda:
+                while len(running) < workers and (ready := agenda.start()) is not None:
+                    running[pool.submit(_run, ready, share)] = ready
+                ended, _ = wait(running, return_when=FIRST_COMPLETED)
+                for future in ended:
+                    agenda.ended(running.pop(future), future.result())
 
 
 def _run(task: Task, threads: int) -> Ran:
@@ -66,7 +48,8 @@ def _run(task: Task, threads: int) -> Ran:
     return task.run()
 
 
-def _kernels_side_by_side() -> bool:
+def kernels_side_by_side() -> bool:
+    """Whether kernels may run in several threads of this process at once; False before the first has run."""
     try:
         return numba.threading_layer() in _TOGETHER
     except ValueError:  # no kernel has run yet

@@ -356,7 +356,7 @@ def test_a_bad_session_is_not_processed(
         (("--set", "correlation.radius_px=large"), ["correlation.radius_px must be a whole number", "'large'"]),
         (("--set", "correlation.order=3"), ["correlation.order must be 1 or 2", "3"]),
         (("--settings", "none.toml"), ["none.toml", "no such settings file"]),
-        (("--cluster", "tcp://here:1"), ["--cluster", "not available", "leave the option out"]),
+        (("--cluster", "tcp://127.0.0.1:1"), ["no scheduler answers at tcp://127.0.0.1:1", "dask scheduler"]),
     ],
 )
 def test_unusable_settings_are_named(refused: Refusal, good: Work, option: tuple[str, str], words: list[str]) -> None:
