@@ -11,7 +11,8 @@ from threading import Event, Lock, Thread
 from typing import Any, Protocol
 
 from controller.catalogue import Catalogue
-from controller.jobs import Command, Job, Jobs
+from controller.children import Command
+from controller.jobs import Job, Jobs
 from controller.live import Live
 from processing.errors import InputError
 from processing.rig import Rig, parse_rig

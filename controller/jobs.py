@@ -1,44 +1,44 @@
-"""Processing jobs: one at a time, each in a child process, with its progress read line by line and its log kept.
+"""Processing jobs: one at a time, in child processes, with their progress read line by line and their log kept.
 
 ::
 
     queued → running → done | failed | cancelled
     queued → superseded (a newer capture of the same session) | cancelled
+    running → queued (a whole session gives way to a single step, and goes on from what it has found)
 
 The child prints JSON lines: progress ``{"stage", "done", "rate", "left_s", "message"}`` and at the end
-``{"state": "done", "run", "summary"}`` or ``{"state": "failed", "error"}``. Every other line is log, and so is the
-begin of every stage.
+``{"state": "done", "run", "summary"}``, ``{"state": "failed", "error"}`` or ``{"state": "stopped"}``. Every other
+line is log, and so is the begin of every stage.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-import os
-import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from shutil import rmtree
 from threading import Condition, Thread
 from typing import Any
 
+from controller.children import ChildPerJob, Command, Order, Processing, Work, message_of
+
 logger = logging.getLogger(__name__)
 
-Command = Callable[[Path], list[str]]
 FINISHED = ("done", "failed", "cancelled", "superseded")
 _PROGRESS = ("stage", "done", "rate", "left_s", "message")
 _NOTICE_EVERY = 0.2  # seconds between two notices of progress alone
-_KILL_AFTER = 5.0  # seconds that a cancelled child has to end by itself
 
 
 @dataclass(frozen=True)
 class Job:
-    """One processing of one session. ``done`` is the share of the work, 0 … 1; ``left_s`` an estimate or None."""
+    """One processing of one session, or with ``step`` (a capture's id) of that step alone, at once.
+
+    ``done`` is the share of the work, 0 … 1; ``left_s`` an estimate or None; ``run`` the number of the run it made.
+    """
 
     id: str
     session: str
@@ -55,21 +55,12 @@ class Job:
     run: str | None = None
     started_at: str | None = None
     finished_at: str | None = None
+    step: str | None = None
 
     @property
     def finished(self) -> bool:
         """Nothing about it will change any more."""
         return self.state in FINISHED
-
-
-def processing_command(settings: Path | None = None) -> Command:
-    """The command that processes a session folder in a child process of this interpreter."""
-
-    def command(session: Path) -> list[str]:
-        chosen = ["--settings", str(settings)] if settings else []
-        return [sys.executable, "-m", "processing", str(session), *chosen]
-
-    return command
 
 
 class Jobs:
@@ -79,19 +70,24 @@ class Jobs:
     ----------
     folder
         Where each job keeps its record and log.
-    command
-        From a session folder to the child's command line.
+    processing
+        What carries out the jobs; or from a session folder to the command line of a child of its own for each.
     on_change
         Told of every change, from the working thread.
+
+    Single steps come before whole sessions, which give way to them; the rest in the order of their submission.
     """
 
-    def __init__(self, folder: Path, command: Command, on_change: Callable[[Job], None] = lambda _: None) -> None:
+    def __init__(
+        self, folder: Path, processing: Command | Processing, on_change: Callable[[Job], None] = lambda _: None
+    ) -> None:
         self._folder = Path(folder)
-        self._command = command
+        self._processing: Processing = ChildPerJob(processing) if callable(processing) else processing
         self._on_change = on_change
         self._jobs: dict[str, Job] = {}
         self._paths: dict[str, Path] = {}
-        self._child: subprocess.Popen[str] | None = None
+        self._due: dict[str, float] = {}  # when a queued job may begin, s
+        self._work_now: Work | None = None
         self._changed = Condition()
         self._closing = False
         self._noticed = 0.0  # when progress was last told, s
@@ -100,13 +96,16 @@ class Jobs:
         self._worker.start()
 
     def close(self, timeout: float = 10.0) -> None:
-        """Cancel what runs and end the thread."""
+        """Cancel what runs, end the thread and the children."""
         with self._changed:
             self._closing = True
-            running = [job for job in self._jobs.values() if job.state == "running"]
+            for job in [job for job in self._jobs.values() if job.state == "running"]:
+                self._update(job.id, state="cancelled", finished_at=_now(), left_s=None)
+            work = self._work_now
             self._changed.notify_all()
-        for job in running:
-            self.cancel(job.id)
+        self._processing.close()
+        if work is not None:
+            work.end()
         self._worker.join(timeout)
 
     def list(self) -> list[Job]:
@@ -130,19 +129,38 @@ class Jobs:
         except FileNotFoundError:
             return ""
 
-    def submit(self, session: str, path: Path, *, reason: str, automatic: bool = False) -> Job:
-        """Queue a job. An automatic one takes the place of a queued automatic job of the same session."""
+    def submit(
+        self,
+        session: str,
+        path: Path,
+        *,
+        reason: str,
+        automatic: bool = False,
+        step: str | None = None,
+        after: float = 0.0,
+    ) -> Job:
+        """Queue a job, to be begun after so many seconds at the soonest.
+
+        An automatic one takes the place of a queued automatic job of the same session and kind (a step or the whole).
+        A job of a step is kept until the session's next one.
+        """
         with self._changed:
-            superseded = [
+            alike = [
                 job
                 for job in self._jobs.values()
-                if automatic and job.automatic and job.session == session and job.state == "queued"
+                if automatic and job.automatic and job.session == session and (job.step is None) == (step is None)
             ]
-            job = Job(self._new_id(), session, reason, automatic, _now())
+            job = Job(self._new_id(), session, reason, automatic, _now(), step=step)
             self._jobs[job.id], self._paths[job.id] = job, Path(path)
+            self._due[job.id] = time.monotonic() + after
             self._keep(job)
-            for old in superseded:
-                self._update(old.id, state="superseded", finished_at=_now(), message=f"replaced by job {job.id}")
+            for old in alike:
+                if old.state == "queued":
+                    self._update(old.id, state="superseded", finished_at=_now(), message=f"replaced by job {job.id}")
+                elif step is not None and old.finished:
+                    self._forget(old.id)
+            if step is not None:
+                self._make_way()
             self._changed.notify_all()
         self._on_change(job)
         return job
@@ -156,9 +174,9 @@ class Jobs:
             if job.state != "running":
                 return job
             job = self._update(job_id, state="cancelled", finished_at=_now(), left_s=None)
-            child = self._child
-        if child is not None:
-            _end(child)
+            work = self._work_now
+        if work is not None:
+            work.end()
         return job
 
     def wait(self, job_id: str, timeout: float) -> Job:
@@ -171,48 +189,40 @@ class Jobs:
     def _work(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._closing or self._next() is not None)
+                while not self._closing and self._next() is None:
+                    self._changed.wait(self._until_due())
                 if self._closing:
                     return
                 job = self._next()
                 assert job is not None
-                self._update(job.id, state="running", started_at=_now())
+                self._update(job.id, state="running", started_at=_now(), message="")
             try:
-                self._run(job.id)
+                self._run(job)
             except OSError as error:
                 logger.exception("job %s could not be run", job.id)
                 self._finish(job.id, state="failed", error=f"The processing could not be started: {error}")
 
-    def _run(self, job_id: str) -> None:
-        """Start the child, follow its lines to the end, settle how it went."""
-        command = self._command(self._paths[job_id])
-        with (self._folder / job_id / "log.txt").open("a", encoding="utf-8") as log:
-            child = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-                encoding="utf-8",
-                errors="replace",
-                env={**os.environ, "PYTHONUNBUFFERED": "1", "PYTHONIOENCODING": "utf-8"},
-                start_new_session=os.name == "posix",
-            )
+    def _run(self, job: Job) -> None:
+        """Have it carried out, follow the lines to the end, settle how it went."""
+        with (self._folder / job.id / "log.txt").open("a", encoding="utf-8") as log:
+            work = self._processing.begin(Order(self._paths[job.id], job.step))
             with self._changed:
-                self._child = child
-                cancelled = self._jobs[job_id].finished
+                self._work_now = work
+                cancelled = self._jobs[job.id].finished
+                if job.step is None and any(other.step and other.state == "queued" for other in self._jobs.values()):
+                    work.give_way()
             if cancelled:
-                _end(child)
+                work.end()
             outcome: dict[str, Any] = {}
             told = ""
-            for line in _lines(child):
-                message = _message(line)
+            for line in work.lines():
+                message = message_of(line)
                 if message is None:
                     log.write(line)
                 elif "state" in message:
                     outcome = message
                 else:
-                    self._progress(job_id, message)
+                    self._progress(job.id, message)
                     step = f"{message.get('stage', '')} {message.get('message', '')}".rstrip()
                     if step != told:
                         log.write(f"{datetime.now():%H:%M:%S} {step}\n")
@@ -220,17 +230,44 @@ class Jobs:
                 log.flush()
             if outcome.get("error"):
                 log.write(f"{datetime.now():%H:%M:%S} failed: {outcome['error']}\n")
-            code = child.wait()
+            code = work.wait()
             with self._changed:
-                self._child = None
-        self._settle(job_id, code, outcome)
+                self._work_now = None
+        self._settle(job.id, code, outcome)
 
     def _settle(self, job_id: str, code: int, outcome: dict[str, Any]) -> None:
-        if code == 0 and outcome.get("state") == "done":
+        state = outcome.get("state")
+        if code == 0 and state == "done":
             self._finish(job_id, state="done", done=1.0, run=outcome.get("run"), message="")
+        elif code == 0 and state == "stopped":
+            self._wait_again(job_id)
         else:
             sentence = outcome.get("error") or f"The processing ended with exit code {code}; see its log."
             self._finish(job_id, state="failed", error=str(sentence))
+
+    def _wait_again(self, job_id: str) -> None:
+        """Queue a job once more that gave way, unless a newer capture's job waits in its place."""
+        with self._changed:
+            job = self._jobs[job_id]
+            if job.finished:  # it was cancelled meanwhile
+                return
+            newer = [
+                other.id
+                for other in self._jobs.values()
+                if other.state == "queued" and other.automatic and other.step is None and other.session == job.session
+            ]
+            if job.automatic and newer:
+                self._update(
+                    job_id, state="superseded", finished_at=_now(), left_s=None, message=f"replaced by job {max(newer)}"
+                )
+            else:
+                self._update(job_id, state="queued", stage="", left_s=None, message="gave way to a newer step")
+
+    def _make_way(self) -> None:
+        """Ask the whole session that is being processed to stop; a step comes first."""
+        running = [job for job in self._jobs.values() if job.state == "running" and job.step is None]
+        if running and self._work_now is not None:
+            self._work_now.give_way()
 
     def _finish(self, job_id: str, **changes: Any) -> None:
         with self._changed:
@@ -258,7 +295,18 @@ class Jobs:
         return job
 
     def _next(self) -> Job | None:
-        return min((job for job in self._jobs.values() if job.state == "queued"), key=lambda j: j.id, default=None)
+        """The job to begin now: a step before a whole session, the older first."""
+        due = [job for job in self._jobs.values() if job.state == "queued" and self._due[job.id] <= time.monotonic()]
+        return min(due, key=lambda job: (job.step is None, job.id), default=None)
+
+    def _until_due(self) -> float | None:
+        """Seconds until the next job may begin; None if nothing waits."""
+        waiting = [self._due[job.id] for job in self._jobs.values() if job.state == "queued"]
+        return max(0.0, min(waiting) - time.monotonic()) if waiting else None
+
+    def _forget(self, job_id: str) -> None:
+        del self._jobs[job_id]
+        rmtree(self._folder / job_id, ignore_errors=True)
 
     def _new_id(self) -> str:
         return f"{1 + max((int(name) for name in self._jobs), default=0):04d}"
@@ -283,60 +331,6 @@ class Jobs:
                 job = replace(job, state="failed", error=sentence, finished_at=_now(), left_s=None)
                 self._keep(job)
             self._jobs[job.id] = job
-
-
-def _lines(child: subprocess.Popen[str]) -> Iterable[str]:
-    """The child's lines until it has ended, even if a grandchild keeps the pipe open."""
-    lines: SimpleQueue[str | None] = SimpleQueue()
-
-    def read() -> None:
-        assert child.stdout is not None
-        with child.stdout:
-            for line in child.stdout:
-                lines.put(line)
-        lines.put(None)
-
-    Thread(target=read, name="job-output", daemon=True).start()
-    while True:
-        try:
-            line = lines.get(timeout=1.0)
-        except Empty:
-            if child.poll() is not None:
-                return
-            continue
-        if line is None:
-            return
-        yield line
-
-
-def _message(line: str) -> dict[str, Any] | None:
-    """The JSON object of a progress or outcome line; None for a line of log."""
-    if not line.startswith("{"):
-        return None
-    try:
-        message = json.loads(line)
-    except json.JSONDecodeError:
-        return None
-    return message if isinstance(message, dict) and ("stage" in message or "state" in message) else None
-
-
-def _end(child: subprocess.Popen[str]) -> None:
-    """Ask the child and everything it started to end; insist after a while."""
-    _signal(child, signal.SIGTERM)
-    try:
-        child.wait(_KILL_AFTER)
-    except subprocess.TimeoutExpired:
-        _signal(child, getattr(signal, "SIGKILL", signal.SIGTERM))
-
-
-def _signal(child: subprocess.Popen[str], number: int) -> None:
-    try:
-        if os.name == "posix":
-            os.killpg(child.pid, number)
-        else:
-            child.terminate()
-    except ProcessLookupError:  # it has ended meanwhile
-        return
 
 
 def _now() -> str:

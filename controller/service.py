@@ -17,9 +17,9 @@ import uvicorn
 from controller.app import create_app
 from controller.archive import Archive
 from controller.capture import Timing
+from controller.children import Command, processing_command
 from controller.config import ControllerConfig
 from controller.desk import Desk
-from controller.jobs import Command, processing_command
 from controller.rig import RigLink
 from processing.errors import InputError
 from processing.rig import parse_rig, read_rig

@@ -3,6 +3,8 @@
 This is what the controller runs as a child process. Every line is one object: ``{"stage", "done", "rate",
 "left_s", "message"}`` while at work, at last ``{"state": "done", "run", "summary"}`` or
 ``{"state": "failed", "error"}``. Exit codes: 0 done, 2 bad input, 3 could not be computed, 1 a bug.
+
+``python -m processing --serve`` stays warm and takes its orders from standard input; see `processing.serving`.
 """
 
 from __future__ import annotations
@@ -10,38 +12,49 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 import sys
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from processing.errors import RingdicError
-from processing.pipeline import process_session
-from processing.progress import Progress
-from processing.settings import load_settings
+from processing.serving import carry_out, compile_kernels, serve, told
 
 
 def main() -> int:
     """Parse the command line, process, report; the exit code."""
     parser = argparse.ArgumentParser(prog="python -m processing", description="Process a session folder.")
-    parser.add_argument("session", type=Path)
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("session", type=Path, nargs="?")
+    what.add_argument("--serve", action="store_true", help="take orders from standard input")
+    what.add_argument("--compile", action="store_true", help="compile the kernels at low priority, and end")
     parser.add_argument("--settings", type=Path)
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="NAME=VALUE")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
+    if arguments.compile:
+        compile_kernels(_line)
+        return 0
+    if arguments.serve:
+        _serve_to_the_end()
     try:
-        settings = load_settings(arguments.settings, arguments.overrides)
-        run = process_session(arguments.session, settings, _report)
+        _line(carry_out(arguments.session, arguments.settings, arguments.overrides, lambda at: _line(told(at))))
     except RingdicError as error:
         _line({"state": "failed", "error": str(error)})
         return error.exit_code
-    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
-    _line({"state": "done", "run": run.name, "summary": summary})
     return 0
 
 
-def _report(progress: Progress) -> None:
-    _line(asdict(progress))
+def _serve_to_the_end() -> NoReturn:
+    """Serve; end without waiting for the thread that reads the orders."""
+    code = 0
+    try:
+        serve(sys.stdin, _line)
+    except Exception:
+        logging.exception("the processing failed through a fault of its own")
+        code = 1
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def _line(value: dict[str, Any]) -> None:
