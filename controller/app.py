@@ -11,7 +11,7 @@ from fastapi.staticfiles import StaticFiles
 from starlette.types import Scope
 
 from controller.desk import Desk, NotFoundError, RefusedError
-from controller.routes import captures, jobs, live, results, rig, sessions
+from controller.routes import captures, jobs, live, newest, results, rig, sessions
 from processing.errors import RingdicError
 
 STATIC = Path(__file__).parent / "web" / "static"
@@ -34,7 +34,7 @@ def create_app(desk: Desk, static: Path = STATIC) -> FastAPI:
     )
     app.state.desk = desk
     api = APIRouter(prefix="/api/v1", responses={404: {"description": "Not there"}, 409: {"description": "Refused"}})
-    for resource in (rig, sessions, captures, jobs, results, live):
+    for resource in (rig, sessions, captures, jobs, results, newest, live):
         api.include_router(resource.router)
     app.include_router(api)
     _answer_errors(app)

@@ -12,6 +12,8 @@ from pathlib import Path
 from threading import RLock
 from typing import Any
 
+from processing.session import live_results
+
 logger = logging.getLogger(__name__)
 
 _SCHEMA = """
@@ -125,6 +127,13 @@ class Catalogue:
                 {"run": row["run"], "finished_at": row["finished_at"], "summary": json.loads(row["summary"])}
                 for row in self._db.execute(query, (name,))
             ]
+
+    def live(self, name: str) -> tuple[Path, ...]:
+        """Folders of the newest steps that were processed at once, oldest first; none for an unknown session."""
+        try:
+            return live_results(self.path(name))
+        except KeyError:
+            return ()
 
     def _counts(self, name: str) -> dict[str, Any]:
         kinds = self._db.execute("select kind, count(*) from captures where session = ? group by kind", (name,))

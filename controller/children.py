@@ -62,7 +62,9 @@ class Work(Protocol):
 
 
 class Processing(Protocol):
-    """Carries out one order at a time."""
+    """Carries out one order at a time. ``on_change`` is told, from any thread, that its warmth has changed."""
+
+    on_change: Callable[[], None]
 
     @property
     def live(self) -> bool:
@@ -71,6 +73,9 @@ class Processing(Protocol):
     @property
     def warmth(self) -> Warmth:
         """How ready it is."""
+
+    def warm(self) -> None:
+        """Get ready, if that can be done before there is an order."""
 
     def begin(self, order: Order) -> Work:
         """Have an order carried out. OSError if no child can be started."""
@@ -87,6 +92,10 @@ class ChildPerJob:
 
     def __init__(self, command: Command) -> None:
         self._command = command
+        self.on_change: Callable[[], None] = lambda: None
+
+    def warm(self) -> None:
+        """Nothing can be kept warm."""
 
     def begin(self, order: Order) -> Work:
         """Start the child."""
@@ -105,8 +114,6 @@ class WarmChild:
         Its command line; it reads orders as lines of JSON and tells when it is ready.
     settings
         A file of settings for all orders.
-    on_change
-        Told when `warmth` changes, from threads of the children.
 
     A child that ends, by itself or by being cancelled, is replaced; a new one that ends before it was ready is not,
     until the next order.
@@ -114,12 +121,10 @@ class WarmChild:
 
     live = True
 
-    def __init__(
-        self, command: Sequence[str], settings: Path | None = None, on_change: Callable[[], None] = lambda: None
-    ) -> None:
+    def __init__(self, command: Sequence[str], settings: Path | None = None) -> None:
         self._command = list(command)
         self._settings = settings
-        self.on_change = on_change
+        self.on_change: Callable[[], None] = lambda: None
         self._lock = Lock()
         self._child: _ServingChild | None = None
         self._closing = False
@@ -289,16 +294,6 @@ def message_of(line: str) -> dict[str, Any] | None:
         return None
     known = isinstance(message, dict) and any(name in message for name in ("stage", "state", "worker"))
     return message if known else None
-
-
-def processing_command(settings: Path | None = None) -> Command:
-    """The command that processes a session folder in a child process of this interpreter."""
-
-    def command(session: Path) -> list[str]:
-        chosen = ["--settings", str(settings)] if settings else []
-        return [sys.executable, "-m", "processing", str(session), *chosen]
-
-    return command
 
 
 def serving_command() -> list[str]:

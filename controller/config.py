@@ -5,6 +5,7 @@
     archive = "archive"              # folder of the sessions; relative to this file
     rig = "rig.toml"                 # the rig whose nodes are expected; without it the controller only shows
     settings = "settings.toml"       # settings of the processing
+    live = true                      # each step of the specimen is processed at once, and shown
 
     [http]
     host = "127.0.0.1"               # the page has no password: another address opens it to that network
@@ -23,7 +24,7 @@ from typing import Any
 
 from processing.errors import InputError
 
-_KEYS = {"": {"archive", "rig", "settings", "http", "zenoh"}, "http": {"host", "port"}, "zenoh": {"endpoint"}}
+_KEYS = {"": {"archive", "rig", "settings", "live", "http", "zenoh"}, "http": {"host", "port"}, "zenoh": {"endpoint"}}
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class ControllerConfig:
     archive: Path = Path("ringdic-archive")
     rig: Path | None = None
     settings: Path | None = None
+    live: bool = True
     host: str = "127.0.0.1"
     port: int = 8000
     endpoint: str = "tcp/127.0.0.1:7447"
@@ -69,6 +71,8 @@ def _config(tables: dict[str, Any], folder: Path) -> ControllerConfig:
     for name in ("archive", "rig", "settings"):
         if name in tables:
             config = replace(config, **{name: folder / _typed(tables[name], str, name)})
+    if "live" in tables:
+        config = replace(config, live=_typed(tables["live"], bool, "live"))
     for table, types in (("http", {"host": str, "port": int}), ("zenoh", {"endpoint": str})):
         values = _typed(tables.get(table, {}), dict, f"[{table}]")
         _refuse_unknown(table, values)
@@ -86,7 +90,7 @@ def _refuse_unknown(table: str, values: dict[str, Any]) -> None:
 
 
 def _typed(value: Any, kind: type, where: str) -> Any:
-    if not isinstance(value, kind) or isinstance(value, bool):
-        wanted = {str: "text in quotes", int: "a whole number", dict: "a table"}[kind]
+    if not isinstance(value, kind) or isinstance(value, bool) is not (kind is bool):
+        wanted = {bool: "true or false", str: "text in quotes", int: "a whole number", dict: "a table"}[kind]
         raise InputError(f"{where} must be {wanted}, not {value!r}")
     return value

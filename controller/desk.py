@@ -11,7 +11,7 @@ from threading import Event, Lock, Thread
 from typing import Any, Protocol
 
 from controller.catalogue import Catalogue
-from controller.children import Command
+from controller.children import Command, Processing
 from controller.jobs import Job, Jobs
 from controller.live import Live
 from processing.errors import InputError
@@ -70,8 +70,8 @@ class Desk:
     ----------
     root
         The archive's folder.
-    command
-        From a session folder to the command line that processes it.
+    processing
+        What carries out the jobs; or from a session folder to the command line that processes it.
     rig_toml
         The rig as text; without it no session can be made and nothing captured.
     clock
@@ -79,6 +79,10 @@ class Desk:
 
     watch
         Seconds between two looks at the folders for what other programs have put there.
+    live
+        Whether each step is processed at once, and shown, if the processing can do that.
+    quiet
+        Seconds without a capture after which the whole session is then processed.
 
     `connect` adds the archive and the nodes; until then the desk only shows.
     """
@@ -86,10 +90,12 @@ class Desk:
     def __init__(
         self,
         root: Path,
-        command: Command,
+        processing: Command | Processing,
         rig_toml: str | None = None,
         clock: Callable[[], datetime] = lambda: datetime.now(UTC),
         watch: float = 3.0,
+        live: bool = True,
+        quiet: float = 15.0,
     ) -> None:
         self.root = Path(root)
         self.root.mkdir(parents=True, exist_ok=True)
@@ -97,10 +103,13 @@ class Desk:
         self.rig: Rig | None = parse_rig(rig_toml) if rig_toml else None
         self.live = Live(self.snapshot)
         self.catalogue = Catalogue(self.root)
-        self.jobs = Jobs(self.root / ".jobs", command, self._job_changed)
+        self.jobs = Jobs(self.root / ".jobs", processing, self._job_changed)
+        self.jobs.processing.on_change = self._publish_processing
         self._archive: Sessions | None = None
         self._ring: Ring | None = None
         self._clock = clock
+        self._live = live and self.jobs.processing.live
+        self._quiet = quiet
         self._lock = Lock()
         self._publishing = Lock()
         self._selected: str | None = None
@@ -113,6 +122,8 @@ class Desk:
     def connect(self, archive: Sessions | None, ring: Ring | None) -> None:
         """Use this archive and these nodes from now on."""
         self._archive, self._ring = archive, ring
+        if ring is not None:
+            self.jobs.processing.warm()
         self.live.publish_snapshot()
 
     def close(self) -> None:
@@ -180,6 +191,8 @@ class Desk:
             "current": current,
             "captures": self.catalogue.captures(current) if current else [],
             "runs": self.catalogue.runs(current) if current else [],
+            "newest": self.newest_step(current) if current else None,
+            "processing": asdict(self.jobs.processing.warmth),
             "jobs": [asdict(job) for job in self.jobs.list()[:20]],
             "round": running,
         }
@@ -193,6 +206,24 @@ class Desk:
             "missing": self.missing_nodes(),
             "refusal": self.why_no_capture(),
         }
+
+    def newest_step(self, session: str) -> dict[str, Any] | None:
+        """The newest step that was processed at once: its capture, when its images were there, when its results."""
+        for folder in reversed(self.catalogue.live(session)):
+            try:
+                ready = datetime.fromtimestamp((folder / "results.h5").stat().st_mtime, UTC)
+                archived_at = self.catalogue.capture(session, folder.name).get("closed_at")
+            except (FileNotFoundError, KeyError):  # it is being replaced, or its capture was taken away
+                continue
+            seconds = (ready - datetime.fromisoformat(archived_at)).total_seconds() if archived_at else None
+            return {
+                "session": session,
+                "capture_id": folder.name,
+                "archived_at": archived_at,
+                "ready_at": ready.isoformat(timespec="milliseconds"),
+                "seconds": None if seconds is None else round(seconds, 3),
+            }
+        return None
 
     # What can be done ----------------------------------------------------------------------------
 
@@ -301,15 +332,30 @@ class Desk:
             self._end_round(started, state="refused", error=f"The capture failed: {error!r}; see the controller's log.")
             raise
         self._publish_capture(started.session, record["capture_id"])
-        if started.kind == "specimen" and not self._lacking(started.session):
-            path = self.catalogue.path(started.session)
-            self.jobs.submit(started.session, path, reason=record["capture_id"], automatic=True)
+        if started.kind == "specimen":
+            self._process(started.session, record["capture_id"])
         self._end_round(started, state="closed", capture_id=record["capture_id"])
+
+    def _process(self, session: str, capture_id: str) -> None:
+        """Have a new step processed at once, and the whole session when no more follow soon.
+
+        The reference alone is worth it too: what every step is compared with is then found and kept.
+        """
+        path, after = self.catalogue.path(session), 0.0
+        if self._live and not self._uncalibrated(session):
+            self.jobs.submit(session, path, reason=capture_id, automatic=True, step=capture_id)
+            after = self._quiet
+        if not self._lacking(session):
+            self.jobs.submit(session, path, reason=capture_id, automatic=True, after=after)
+
+    def _uncalibrated(self, session: str) -> list[str]:
+        counts = self.catalogue.session(session)["captures"]
+        return [f"no {kind} capture" for kind in ("board", "target") if not counts.get(kind)]
 
     def _lacking(self, session: str) -> str | None:
         """What a session still needs to be processed, in words."""
         counts = self.catalogue.session(session)["captures"]
-        lacking = [f"no {kind} capture" for kind in ("board", "target") if not counts.get(kind)]
+        lacking = self._uncalibrated(session)
         specimens = counts.get("specimen", 0)
         if specimens == 0:
             lacking.append("no specimen capture")
@@ -335,6 +381,9 @@ class Desk:
     def _publish_rig(self) -> None:
         self.live.publish("rig", self.rig_state())
 
+    def _publish_processing(self) -> None:
+        self.live.publish("processing", asdict(self.jobs.processing.warmth))
+
     def _publish_sessions(self) -> None:
         self.live.publish("sessions", {"sessions": self.catalogue.sessions(), "current": self.current()})
 
@@ -345,7 +394,9 @@ class Desk:
                 self.live.publish("capture", {"session": session, "record": record})
 
     def _job_changed(self, job: Job) -> None:
-        if job.state == "done":
+        if job.state == "done" and job.step is not None:
+            self.live.publish("newest", self.newest_step(job.session) or {})
+        elif job.state == "done":
             self.catalogue.sync()
             self.catalogue.refresh(job.session)
             self.live.publish("runs", {"session": job.session, "runs": self.catalogue.runs(job.session)})

@@ -108,6 +108,11 @@ class Jobs:
             work.end()
         self._worker.join(timeout)
 
+    @property
+    def processing(self) -> Processing:
+        """What carries out the jobs."""
+        return self._processing
+
     def list(self) -> list[Job]:
         """All jobs, newest first."""
         with self._changed:

@@ -17,7 +17,7 @@ import uvicorn
 from controller.app import create_app
 from controller.archive import Archive
 from controller.capture import Timing
-from controller.children import Command, processing_command
+from controller.children import Command, WarmChild, serving_command
 from controller.config import ControllerConfig
 from controller.desk import Desk
 from controller.rig import RigLink
@@ -43,7 +43,7 @@ def open_desk(config: ControllerConfig, command: Command | None = None, timing: 
         text = config.rig.read_text(encoding="utf-8")
     if config.settings is not None and not config.settings.is_file():
         raise InputError(f"{config.settings}: no such settings file")
-    desk = Desk(config.archive, command or processing_command(config.settings), text)
+    desk = Desk(config.archive, command or WarmChild(serving_command(), config.settings), text, live=config.live)
     try:
         archive = Archive(config.archive)
         if text is None:

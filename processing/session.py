@@ -17,6 +17,9 @@
       results/
         0001/ …                   one folder a processing run, written aside and renamed: results.h5, settings.toml,
                                   calibration.json, summary.json
+      live/
+        0005-specimen/ …          the newest steps as shown while the capturing goes on: results.h5 of the reference and
+                                  that step; older ones are taken away
 """
 
 from __future__ import annotations
@@ -28,6 +31,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from shutil import rmtree
+from tempfile import mkdtemp
 from typing import Any
 
 from processing.errors import InputError
@@ -35,6 +39,7 @@ from processing.rig import Rig, read_rig
 
 KINDS = ("board", "target", "specimen", "static")
 _MEND = "copy it back, or import the session again"
+_LIVE_KEPT = 2
 _CAPTURE_NAME = re.compile(r"(\d{4,})-(board|target|specimen|static)")
 
 
@@ -105,6 +110,37 @@ def newest_results(path: Path, run: int | None = None) -> Path:
         _require_session(Path(path))
         raise InputError(f"{path}: no results yet; run 'ringdic process {path}' first")
     return finished[-1] / "results.h5"
+
+
+def live_results(path: Path) -> tuple[Path, ...]:
+    """The folders of single steps that were processed at once, oldest first; each is named by its capture."""
+    live = Path(path) / "live"
+    if not live.is_dir():
+        return ()
+    found = [folder for folder in live.iterdir() if _CAPTURE_NAME.fullmatch(folder.name)]
+    return tuple(sorted(found, key=lambda folder: int(folder.name.partition("-")[0])))
+
+
+@contextmanager
+def new_live(path: Path, capture_id: str) -> Iterator[Path]:
+    """A folder to write a single step's results into; it takes its place when everything is written.
+
+    Older ones are taken away, but for the one before: it may be being read.
+    """
+    live = Path(path) / "live"
+    live.mkdir(exist_ok=True)
+    partial = Path(mkdtemp(prefix=f".{capture_id}-", dir=live))
+    try:
+        yield partial
+        final = live / capture_id
+        if final.exists():
+            final.rename(Path(mkdtemp(prefix=".old-", dir=live)) / capture_id)
+        partial.rename(final)
+    except BaseException:
+        rmtree(partial, ignore_errors=True)
+        raise
+    for old in (*live_results(path)[:-_LIVE_KEPT], *live.glob(".old-*")):
+        rmtree(old, ignore_errors=True)
 
 
 @dataclass

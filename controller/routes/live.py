@@ -12,7 +12,8 @@ router = APIRouter(tags=["live"])
 
 @router.get("/live", response_class=EventSourceResponse, summary="Live state")
 async def live(desk: TheDesk) -> AsyncIterable[ServerSentEvent]:
-    """First ``snapshot``, then ``rig``, ``sessions``, ``round``, ``capture``, ``job``, ``runs`` as they change.
+    """First ``snapshot``, then ``rig``, ``sessions``, ``round``, ``capture``, ``job``, ``runs`` as they change,
+    ``processing`` (how ready it is) and ``newest`` (a step that has just been processed at once).
 
     Whoever reconnects gets a new snapshot.
     """

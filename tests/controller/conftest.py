@@ -15,6 +15,7 @@ from fastapi.testclient import TestClient
 
 from controller.app import create_app
 from controller.archive import Archive, SessionWriter
+from controller.children import WarmChild
 from controller.desk import Desk
 from node_agent.wire import CaptureKey, Manifest
 from processing.errors import ComputationError
@@ -69,13 +70,31 @@ def image_of(session: str, capture_id: str, camera: str, kind: str, time_ns: int
 
 
 @pytest.fixture
-def desk(tmp_path: Path, rig_toml: Callable[[str, Sequence[str]], str]) -> Iterator[Desk]:
-    """A desk whose processing is the stand-in."""
-    rig = rig_toml("test-ring", CAMERAS)
-    made = Desk(tmp_path / "archive", lambda session: [*STAND_IN, str(session)], rig)
-    made.connect(Archive(tmp_path / "archive"), StandInRing(made.on_event))
-    yield made
-    made.close()
+def desk_of(tmp_path: Path, rig_toml: Callable[[str, Sequence[str]], str]) -> Iterator[Callable[..., Desk]]:
+    """Call it with what carries out the jobs, and more arguments of a desk: a desk over stand-in cameras."""
+    made: list[Desk] = []
+
+    def make(processing: Any, **more: Any) -> Desk:
+        desk = Desk(tmp_path / "archive", processing, rig_toml("test-ring", CAMERAS), **more)
+        made.append(desk)
+        desk.connect(Archive(tmp_path / "archive"), StandInRing(desk.on_event))
+        return desk
+
+    yield make
+    for desk in made:
+        desk.close()
+
+
+@pytest.fixture
+def desk(desk_of: Callable[..., Desk]) -> Desk:
+    """A desk whose processing is the stand-in, a child for every job."""
+    return desk_of(lambda session: [*STAND_IN, str(session)])
+
+
+@pytest.fixture
+def warm_stand_in() -> WarmChild:
+    """The stand-in as a warm child."""
+    return WarmChild([*STAND_IN, "--serve"])
 
 
 @pytest.fixture

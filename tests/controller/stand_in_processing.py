@@ -1,7 +1,8 @@
 """A stand-in for the processing: the same lines of JSON, and a results file whose truth is known.
 
 A tube of radius 50 mm that is stretched along z by 10 % a step and turned by 5° a step about z; a few points
-are lost in the last step. Run as a program: SESSION [--seconds S] [--fail SENTENCE].
+are lost in the last step. Run as a program: SESSION [--seconds S] [--fail SENTENCE], or --serve [--seconds S] for
+orders on standard input.
 """
 
 import argparse
@@ -13,8 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from processing.camera import Camera
+from processing.noise_floor import part
 from processing.results import Results, write_results
-from processing.session import new_run, read_session
+from processing.session import new_live, new_run, read_session
 
 AROUND, ALONG = 60, 16
 LOST = (400, 401, 402)
@@ -58,29 +60,51 @@ def _moved(reference: np.ndarray, step: int) -> np.ndarray:
     return (reference * [1.0, 1.0, 1.0 + STRETCH * step]) @ R.T
 
 
-def main() -> int:
-    """Print progress, write the run, print the outcome."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("session", type=Path)
-    parser.add_argument("--seconds", type=float, default=0.0)
-    parser.add_argument("--fail", default="")
-    arguments = parser.parse_args()
+def process(session: Path, step: str | None, seconds: float) -> dict:
+    """Tell of progress, write the run or the step's results; the outcome."""
     sys.stderr.write("INFO the tube is computed\n")
     for k in range(10):
         line = {"stage": "correlate", "done": k / 10, "rate": "1000 points/s", "left_s": 1.0, "message": f"part {k}"}
-        sys.stdout.write(json.dumps(line) + "\n")
-        time.sleep(arguments.seconds / 10)
-    if arguments.fail:
-        sys.stdout.write(json.dumps({"state": "failed", "error": arguments.fail}) + "\n")
-        return 2
-    steps = tuple(capture.id for capture in read_session(arguments.session).of_kind("specimen"))
+        _say(line)
+        time.sleep(seconds / 10)
+    steps = tuple(capture.id for capture in read_session(session).of_kind("specimen"))
+    if step is not None:
+        with new_live(session, step) as folder:
+            whole, at = tube(steps), sorted({0, steps.index(step)})
+            write_results(folder / "results.h5", part(whole, at))
+        return {"state": "done", "live": step}
     results = tube(steps)
-    with new_run(arguments.session) as run:
+    with new_run(session) as run:
         write_results(run.folder / "results.h5", results)
         (run.folder / "summary.json").write_text(json.dumps(results.summary))
     assert run.final is not None
-    sys.stdout.write(json.dumps({"state": "done", "run": run.final.name, "summary": results.summary}) + "\n")
+    return {"state": "done", "run": run.final.name, "summary": results.summary}
+
+
+def main() -> int:
+    """Process the session, or one order after the other."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("session", type=Path, nargs="?")
+    parser.add_argument("--serve", action="store_true")
+    parser.add_argument("--seconds", type=float, default=0.0)
+    parser.add_argument("--fail", default="")
+    arguments = parser.parse_args()
+    if arguments.serve:
+        _say({"worker": "ready", "seconds": 0.1})
+        for line in sys.stdin:
+            order = json.loads(line)
+            if "stop" not in order:
+                _say(process(Path(order["session"]), order["step"], arguments.seconds))
+        return 0
+    if arguments.fail:
+        _say({"state": "failed", "error": arguments.fail})
+        return 2
+    _say(process(arguments.session, None, arguments.seconds))
     return 0
+
+
+def _say(line: dict) -> None:
+    print(json.dumps(line), flush=True)
 
 
 if __name__ == "__main__":

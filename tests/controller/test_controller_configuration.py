@@ -17,12 +17,12 @@ def test_without_a_file_the_controller_is_on_loopback() -> None:
 def test_paths_are_taken_from_the_folder_of_the_file(tmp_path: Path) -> None:
     file = tmp_path / "controller.toml"
     file.write_text(
-        'archive = "sessions"\nrig = "/etc/rig.toml"\nsettings = "fine.toml"\n'
+        'archive = "sessions"\nrig = "/etc/rig.toml"\nsettings = "fine.toml"\nlive = false\n'
         '[http]\nhost = "::1"\nport = 0\n[zenoh]\nendpoint = "tcp/0.0.0.0:7448"\n'
     )
     config = read_config(file)
     assert config == ControllerConfig(
-        tmp_path / "sessions", Path("/etc/rig.toml"), tmp_path / "fine.toml", "::1", 0, "tcp/0.0.0.0:7448"
+        tmp_path / "sessions", Path("/etc/rig.toml"), tmp_path / "fine.toml", False, "::1", 0, "tcp/0.0.0.0:7448"
     )
 
 
@@ -35,6 +35,7 @@ def test_paths_are_taken_from_the_folder_of_the_file(tmp_path: Path) -> None:
         ('[http]\nport = "80"', "port"),
         ("[http]\nport = true", "port"),
         ("http = 3", "http"),
+        ("live = 1", "true or false"),
         ('[zenoh]\nendpoint = "localhost"', "endpoint"),
         ("= nothing", "controller.toml"),
     ],
