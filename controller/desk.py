@@ -109,7 +109,7 @@ class Desk:
         self._ring: Ring | None = None
         self._clock = clock
         self._live = live and self.jobs.processing.live
-        self._quiet = quiet
+        self.quiet = quiet
         self._lock = Lock()
         self._publishing = Lock()
         self._selected: str | None = None
@@ -344,7 +344,7 @@ class Desk:
         path, after = self.catalogue.path(session), 0.0
         if self._live and not self._uncalibrated(session):
             self.jobs.submit(session, path, reason=capture_id, automatic=True, step=capture_id)
-            after = self._quiet
+            after = self.quiet
         if not self._lacking(session):
             self.jobs.submit(session, path, reason=capture_id, automatic=True, after=after)
 

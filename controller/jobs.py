@@ -146,16 +146,18 @@ class Jobs:
     ) -> Job:
         """Queue a job, to be begun after so many seconds at the soonest.
 
-        An automatic one takes the place of a queued automatic job of the same session and kind (a step or the whole).
+        It takes the place of a queued automatic job of the same session and kind (a step or the whole).
         A job of a step is kept until the session's next one.
         """
         with self._changed:
             alike = [
                 job
                 for job in self._jobs.values()
-                if automatic and job.automatic and job.session == session and (job.step is None) == (step is None)
+                if job.automatic and job.session == session and (job.step is None) == (step is None)
             ]
             job = Job(self._new_id(), session, reason, automatic, _now(), step=step)
+            if after > 0:
+                job = replace(job, message=f"begins {after:.0f} s after the last capture")
             self._jobs[job.id], self._paths[job.id] = job, Path(path)
             self._due[job.id] = time.monotonic() + after
             self._keep(job)

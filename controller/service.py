@@ -17,7 +17,7 @@ import uvicorn
 from controller.app import create_app
 from controller.archive import Archive
 from controller.capture import Timing
-from controller.children import Command, WarmChild, serving_command
+from controller.children import Command, Processing, WarmChild, serving_command
 from controller.config import ControllerConfig
 from controller.desk import Desk
 from controller.rig import RigLink
@@ -31,11 +31,13 @@ SHUTDOWN_LIMIT = 2  # seconds; an open event stream would keep the server alive 
 
 
 @contextmanager
-def open_desk(config: ControllerConfig, command: Command | None = None, timing: Timing | None = None) -> Iterator[Desk]:
+def open_desk(
+    config: ControllerConfig, processing: Command | Processing | None = None, timing: Timing | None = None
+) -> Iterator[Desk]:
     """The desk with everything behind it: archive, router and nodes if the configuration names a rig, jobs.
 
-    ``command`` replaces the processing's command line, ``timing`` the waits of a capture round. Raises InputError
-    for a bad rig.toml.
+    ``processing`` replaces the warm child that carries out the jobs, ``timing`` the waits of a capture round. Raises
+    InputError for a bad rig.toml.
     """
     text = None
     if config.rig is not None:
@@ -43,7 +45,7 @@ def open_desk(config: ControllerConfig, command: Command | None = None, timing: 
         text = config.rig.read_text(encoding="utf-8")
     if config.settings is not None and not config.settings.is_file():
         raise InputError(f"{config.settings}: no such settings file")
-    desk = Desk(config.archive, command or WarmChild(serving_command(), config.settings), text, live=config.live)
+    desk = Desk(config.archive, processing or WarmChild(serving_command(), config.settings), text, live=config.live)
     try:
         archive = Archive(config.archive)
         if text is None:

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -22,6 +23,7 @@ import uvicorn
 from playwright.sync_api import Browser, Page, expect
 
 from controller.app import STATIC, create_app
+from controller.children import Command, Processing, WarmChild
 from controller.config import ControllerConfig
 from controller.desk import Desk
 from controller.service import SHUTDOWN_LIMIT, free_endpoint, open_desk
@@ -73,31 +75,25 @@ class Station:
             assert time.monotonic() < deadline, f"{what} never came about"
             time.sleep(0.05)
 
+    def capture(self, kind: str) -> None:
+        """Capture, and wait for the close."""
+        begun = self.post("captures", {"kind": kind})["id"]
+        self.until(lambda: self.desk.round(begun).state == "closed", f"the {kind} capture")
+
     def processed_session(self, name: str, steps: int = 3) -> None:
         """A session of its own with results, made without the page."""
         self.post("sessions", {"name": name})
         for kind in ("board", "target", *["specimen"] * steps):
-            begun = self.post("captures", {"kind": kind})["id"]
-            self.until(lambda begun=begun: self.desk.round(begun).state == "closed", f"the {kind} capture")
+            self.capture(kind)
             self.until(lambda: all(job.finished for job in self.desk.jobs.list()), "the end of the jobs")
 
 
-@pytest.fixture(scope="module")
-def station(
-    tmp_path_factory: pytest.TempPathFactory,
-    rig_toml: Callable[[str, Sequence[str]], str],
-    skip_or_fail: Callable[[str], NoReturn],
-) -> Iterator[Station]:
-    if not (STATIC / "index.html").is_file():
-        skip_or_fail("the page is not bundled: install again without RINGDIC_SKIP_PAGE")
-    folder = tmp_path_factory.mktemp("station")
-    (folder / "rig.toml").write_text(rig_toml("page-ring", CAMERAS))
+@contextmanager
+def running_station(folder: Path, rig: str, processing: Command | Processing) -> Iterator[Station]:
+    """A controller served over HTTP, and its nodes."""
+    (folder / "rig.toml").write_text(rig)
     config = free_endpoint(ControllerConfig(archive=folder / "archive", rig=folder / "rig.toml"))
-
-    def command(session: Path) -> list[str]:
-        return [sys.executable, str(STAND_IN), str(session), "--seconds", str(PACE)]
-
-    with open_desk(config, command) as desk, socket.create_server(("127.0.0.1", 0)) as listener:
+    with open_desk(config, processing) as desk, socket.create_server(("127.0.0.1", 0)) as listener:
         server = uvicorn.Server(
             uvicorn.Config(create_app(desk), log_level="warning", timeout_graceful_shutdown=SHUTDOWN_LIMIT)
         )
@@ -121,8 +117,36 @@ def station(
                     process.kill()
 
 
-@pytest.fixture
-def page(browser: Browser, station: Station) -> Iterator[Page]:
+@pytest.fixture(scope="module")
+def bundled(skip_or_fail: Callable[[str], NoReturn]) -> None:
+    if not (STATIC / "index.html").is_file():
+        skip_or_fail("the page is not bundled: install again without RINGDIC_SKIP_PAGE")
+
+
+@pytest.fixture(scope="module")
+def station(
+    bundled: None, tmp_path_factory: pytest.TempPathFactory, rig_toml: Callable[[str, Sequence[str]], str]
+) -> Iterator[Station]:
+    def command(session: Path) -> list[str]:
+        return [sys.executable, str(STAND_IN), str(session), "--seconds", str(PACE)]
+
+    with running_station(tmp_path_factory.mktemp("station"), rig_toml("page-ring", CAMERAS), command) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def live_station(
+    bundled: None, tmp_path_factory: pytest.TempPathFactory, rig_toml: Callable[[str, Sequence[str]], str]
+) -> Iterator[Station]:
+    """A controller that processes every step at once."""
+    processing = WarmChild([sys.executable, str(STAND_IN), "--serve", "--seconds", "0.2"])
+    with running_station(tmp_path_factory.mktemp("live"), rig_toml("page-ring", CAMERAS), processing) as made:
+        made.desk.quiet = 600.0  # the whole session follows when a test wants it
+        yield made
+
+
+@contextmanager
+def opened_page(browser: Browser, station: Station) -> Iterator[Page]:
     """The page, opened; whatever the browser complains about fails the test."""
     complaints: list[str] = []
     context = browser.new_context(viewport={"width": 1440, "height": 900})
@@ -140,6 +164,18 @@ def page(browser: Browser, station: Station) -> Iterator[Page]:
     assert not unexpected, unexpected
     strangers = [address for address in asked if not address.startswith((station.address, "data:"))]
     assert not strangers, strangers  # the page needs nobody but its controller
+
+
+@pytest.fixture
+def page(browser: Browser, station: Station) -> Iterator[Page]:
+    with opened_page(browser, station) as opened:
+        yield opened
+
+
+@pytest.fixture
+def live_page(browser: Browser, live_station: Station) -> Iterator[Page]:
+    with opened_page(browser, live_station) as opened:
+        yield opened
 
 
 def drawn(page: Page) -> np.ndarray:
@@ -328,3 +364,67 @@ def test_a_name_that_is_taken_is_told_and_the_page_fits_a_narrow_window(page: Pa
     expect(page.locator("#notice")).to_contain_text("already")
     page.set_viewport_size({"width": 420, "height": 900})
     assert page.evaluate("document.documentElement.scrollWidth") <= 420
+
+
+def test_the_live_view_follows_the_newest_step_and_keeps_what_the_operator_chose(
+    live_page: Page, live_station: Station
+) -> None:
+    page, station = live_page, live_station
+    surface, axis = page.locator("#surface"), page.locator("#axis-x")
+    station.post("sessions", {"name": "tension"})
+    for kind in ("board", "target", "specimen"):
+        station.capture(kind)
+    expect(surface).to_have_attribute("data-of", "live/0003-specimen", timeout=WAIT)  # the reference: its shape
+    station.capture("specimen")
+    expect(surface).to_have_attribute("data-of", "live/0004-specimen", timeout=WAIT)
+    expect(page.locator("#live-step")).to_contain_text("0004-specimen")
+    assert 0 < float(page.locator("#live-step").get_attribute("data-seconds") or "nan") < WAIT / 1000
+    expect(page.locator("#report")).to_be_hidden()
+    assert max(ticks(page)) == pytest.approx(1.1)
+    station.capture("specimen")
+    expect(surface).to_have_attribute("data-of", "live/0005-specimen", timeout=WAIT)
+    assert max(ticks(page)) == pytest.approx(1.2)  # the limits widen
+
+    page.select_option("#field", "displacement_z")
+    shown(page, "displacement_z/1/false")
+    page.fill("#low", "-7")
+    page.fill("#high", "50")
+    page.press("#high", "Enter")
+    box = surface.bounding_box()
+    assert box is not None
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] + 150, middle[1] + 60, steps=4)
+    page.mouse.up()
+    turned = axis.get_attribute("x2")
+    before = drawn(page)
+    station.capture("specimen")
+    expect(surface).to_have_attribute("data-of", "live/0006-specimen", timeout=WAIT)
+    assert (drawn(page) != before).any()
+    expect(surface).to_have_attribute("data-shown", "displacement_z/1/false")
+    assert axis.get_attribute("x2") == turned
+    assert (page.input_value("#low"), page.input_value("#high")) == ("-7", "50")
+
+    page.uncheck("#follow")
+    station.capture("specimen")
+    expect(page.locator("#live-step")).to_contain_text("0007-specimen", timeout=WAIT)
+    expect(surface).to_have_attribute("data-of", "live/0006-specimen")
+    page.check("#follow")
+    expect(surface).to_have_attribute("data-of", "live/0007-specimen", timeout=WAIT)
+    page.click("#job-start")
+    expect(surface).to_have_attribute("data-of", "results/0001", timeout=WAIT)  # every step of the session
+    expect(page.locator("#step")).to_have_attribute("max", "4")
+    page.select_option("#run", "live")
+    expect(surface).to_have_attribute("data-of", "live/0007-specimen", timeout=WAIT)
+
+
+def test_a_capture_at_rest_is_a_button_and_the_processing_tells_that_it_is_ready(
+    live_page: Page, live_station: Station
+) -> None:
+    live_station.post("sessions", {"name": "rest"})
+    expect(live_page.locator("#session-select")).to_have_value("rest", timeout=WAIT)
+    expect(live_page.locator("#warmth")).to_have_text("ready")
+    live_page.locator("#capture-static").click()
+    listed = live_page.locator("[data-capture='0001-static'][data-state='closed']")
+    expect(listed).to_contain_text(f"{len(CAMERAS)} ok", timeout=WAIT)

@@ -4,7 +4,8 @@ import { post, url } from "./api.js";
 import { byId, clockTime, element, notice } from "./dom.js";
 import { state } from "./live.js";
 
-const KINDS = ["board", "target", "specimen"];
+const KINDS = ["board", "target", "specimen", "static"];
+const HINTS = { static: "Capture the specimen at rest with every camera: tells the noise floor" };
 
 // The buttons ------------------------------------------------------------------------------------
 
@@ -33,7 +34,7 @@ export function showCapture() {
   for (const kind of KINDS) {
     const button = byId(`capture-${kind}`);
     button.disabled = Boolean(why);
-    button.title = why ?? `Capture the ${kind} with every camera`;
+    button.title = why ?? HINTS[kind] ?? `Capture the ${kind} with every camera`;
   }
   const running = state.round && ["arming", "open"].includes(state.round.state);
   const sentence = (running ? roundSentence(state.round) : why) || roundSentence(state.round);

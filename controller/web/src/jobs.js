@@ -6,14 +6,14 @@ import { state } from "./live.js";
 
 const active = (job) => job.state === "running" || job.state === "queued";
 
-/** The job to show: what runs or waits for this session, else its last one. */
+/** The job to show: what runs or waits for this session, else its last one. Single steps are told with the results. */
 function present() {
-  const own = state.jobs.filter((job) => job.session === state.current);
+  const own = state.jobs.filter((job) => job.session === state.current && !job.step);
   return own.find((job) => job.state === "running") ?? own.find(active) ?? own[0] ?? null;
 }
 
 function sentence(job) {
-  if (job.state === "queued") return "waiting for its turn";
+  if (job.state === "queued") return job.message || "waiting for its turn";
   if (job.state === "running") return [job.stage || "starting", job.message].filter(Boolean).join(": ");
   if (job.state === "done") return `done at ${clockTime(job.finished_at)}, run ${job.run}`;
   if (job.state === "failed") return job.error;
@@ -24,11 +24,21 @@ function why(job) {
   return job.automatic ? `started by ${job.reason}` : job.reason;
 }
 
+function warmth() {
+  const { state: how, compiling, seconds } = state.processing ?? {};
+  if (how === "warming") return compiling ? "warming up: compiling its kernels, once on this machine …" : "warming up …";
+  if (how === "ready") return `ready${seconds >= 20 ? `, after ${duration(seconds)} of compiling` : ""}`;
+  return how === "ended" ? "starts anew with the next job" : "";
+}
+
 export function showJobs() {
+  byId("warmth").textContent = warmth();
+  byId("warmth").dataset.state = state.processing?.state ?? "";
   const job = present();
   const box = byId("job");
   byId("job-cancel").hidden = !job || !active(job);
-  byId("job-start").disabled = !state.current || Boolean(job && active(job));
+  const taken = Boolean(job && (job.state === "running" || (job.state === "queued" && !job.automatic)));
+  byId("job-start").disabled = !state.current || taken; // one that waits for the capturing to end can be begun at once
   byId("job-log-box").hidden = !job;
   if (!job) {
     box.replaceChildren(element("p", { class: "muted" }, "No job of this session yet. Processing starts by itself after a specimen capture."));

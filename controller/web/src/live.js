@@ -1,6 +1,17 @@
 // The live state of the controller, kept up to date by its event stream.
 
-export const state = { rig: null, sessions: [], current: null, captures: [], runs: [], jobs: [], round: null, connected: false };
+export const state = {
+  rig: null,
+  sessions: [],
+  current: null,
+  captures: [],
+  runs: [],
+  newest: null, // the newest step that was processed at once
+  jobs: [],
+  processing: null,
+  round: null,
+  connected: false,
+};
 
 const listeners = new Set();
 
@@ -22,7 +33,7 @@ function replaceIn(list, key, item, atFront) {
 const apply = {
   snapshot(snapshot) {
     Object.assign(state, snapshot);
-    changed("rig", "sessions", "captures", "runs", "jobs", "round");
+    changed("rig", "sessions", "captures", "runs", "newest", "jobs", "processing", "round");
   },
   rig(rig) {
     state.rig = rig;
@@ -49,6 +60,15 @@ const apply = {
     if (session !== state.current) return;
     state.runs = runs;
     changed("runs");
+  },
+  newest(newest) {
+    if (newest.session !== state.current) return;
+    state.newest = { ...newest, arrived: performance.now() };
+    changed("newest");
+  },
+  processing(processing) {
+    state.processing = processing;
+    changed("processing");
   },
 };
 

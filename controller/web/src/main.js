@@ -5,7 +5,8 @@ import { byId } from "./dom.js";
 import { showJobs, wireJobs } from "./jobs.js";
 import { follow, onChange, state } from "./live.js";
 import { showNodes } from "./nodes.js";
-import { showRuns, wireResults } from "./results.js";
+import { showFollowed } from "./following.js";
+import { showNewest, wireResults } from "./results.js";
 import { showSessions, wireSessions } from "./sessions.js";
 
 function showConnection() {
@@ -26,8 +27,9 @@ onChange((parts) => {
   if (any("sessions", "rig")) showSessions();
   if (any("rig", "round", "connected", "sessions")) showCapture();
   if (any("captures")) showCaptures();
-  if (any("jobs", "sessions")) showJobs();
-  if (any("runs")) showRuns();
+  if (any("jobs", "sessions", "processing")) showJobs();
+  if (any("jobs", "newest", "sessions", "captures")) showFollowed();
+  if (any("runs", "newest")) showNewest();
 });
 
 follow();

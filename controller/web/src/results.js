@@ -1,10 +1,12 @@
-// The results of a run: choice of run, field and step, limits of the colours, the legend, the figures.
+// The results of a run or of the newest step: what is followed or chosen, field and step, limits, legend, figures.
 
 import { get, getBytes, url } from "./api.js";
 import { SCALES, cssGradient, ticks } from "./colours.js";
 import { byId, counted, element, figure, notice, setOptions } from "./dom.js";
+import { noteDrawn } from "./following.js";
 import { state } from "./live.js";
 
+const LIVE = "live"; // the choice in place of a run
 const FIRST_FIELD = "lambda2";
 const PLAY_EVERY = 900; // ms
 
@@ -13,11 +15,13 @@ let surface = null;
 let header = null; // of the chosen run
 let facesOf = null; // the header whose triangles the viewer has
 let newestShown = null;
+let limitsSoFar = new Map(); // session/field/removed -> [low, high] of all live steps shown
 let limitsByHand = null; // [low, high] typed by the operator for the present field
 let playing = null;
 let viewedSession = null; // the session that the view was made for
 let shownPoints = null; // the positions that the viewer has
-let wanted = 0; // the newest request to show; older ones give up when their numbers arrive
+let opening = 0; // the newest request to open results, and
+let wanted = 0; // the newest to show a step of them: older ones give up when their numbers arrive
 const arrays = new Map(); // address -> promise of an ArrayBuffer
 
 const chosenField = () => header.fields.find((field) => field.name === byId("field").value) ?? header.fields[0];
@@ -28,8 +32,10 @@ const shortTime = (iso) =>
 
 // Loading ----------------------------------------------------------------------------------------
 
+const own = (...parts) => url("sessions", header.session, ...header.place, ...parts);
+
 function bytes(...parts) {
-  const address = `${url("sessions", header.session, "results", header.run, ...parts)}?v=${header.version}&rigid_motion_removed=${removed()}`;
+  const address = `${own(...parts)}?v=${header.version}&rigid_motion_removed=${removed()}`;
   if (!arrays.has(address)) {
     const loading = getBytes(address);
     loading.catch(() => arrays.delete(address));
@@ -39,54 +45,75 @@ function bytes(...parts) {
   return arrays.get(address);
 }
 
-/** Show the runs of the present session; a run that has just been made is shown at once. */
-export async function showRuns() {
-  const runs = [...state.runs].reverse();
-  byId("results-empty").hidden = runs.length > 0;
-  byId("results").hidden = runs.length === 0;
-  setOptions(
-    byId("run"),
-    runs.map(({ run, finished_at }) => ({ value: run, label: `${run}, ${shortTime(finished_at)}` })),
-  );
-  if (!runs.length) {
+const following = () => byId("follow").checked;
+
+/** What is newest in the present session, the live step or the last run: the choice that shows it, and its name. */
+function newest() {
+  const [run, step] = [state.runs.at(-1), state.newest];
+  if (step && (!run || Date.parse(step.ready_at) > Date.parse(run.finished_at) + 999)) {
+    return { choice: LIVE, name: `${state.current}/${step.capture_id}/${step.ready_at}` };
+  }
+  return run ? { choice: run.run, name: `${state.current}/${run.run}/${run.finished_at}` } : null;
+}
+
+/** Offer what there is in the present session; what has just been made is shown at once while it is followed. */
+export async function showNewest() {
+  const latest = newest();
+  byId("results-empty").hidden = latest !== null;
+  byId("results").hidden = byId("follow-line").hidden = latest === null;
+  const runs = [...state.runs].reverse().map(({ run, finished_at }) => ({ value: run, label: `${run}, ${shortTime(finished_at)}` }));
+  const live = state.newest ? [{ value: LIVE, label: `live, ${state.newest.capture_id}` }] : [];
+  setOptions(byId("run"), [...live, ...runs]);
+  if (!latest) {
+    opening++;
     header = null;
     newestShown = null;
     stop();
     return;
   }
-  const newest = `${state.current}/${runs[0].run}/${runs[0].finished_at}`;
-  if (newest === newestShown) return;
-  newestShown = newest;
-  byId("run").value = runs[0].run;
-  await attempt(openRun);
+  if (latest.name === newestShown) return;
+  const first = newestShown?.split("/")[0] !== state.current;
+  newestShown = latest.name;
+  if (!first && !following()) return;
+  byId("run").value = latest.choice;
+  await attempt(() => openChosen(true));
 }
 
-async function openRun() {
+/** Load what is chosen. While the newest is followed, limits stay and widen; the view and the field always stay. */
+async function openChosen(followed = false) {
   stop();
   arrays.clear();
-  const request = ++wanted;
-  const opened = await get(url("sessions", state.current, "results", byId("run").value));
-  if (request !== wanted) return;
+  const request = ++opening;
+  const choice = byId("run").value;
+  const place = choice === LIVE ? ["live", state.newest.capture_id] : ["results", choice];
+  const opened = { ...(await get(url("sessions", state.current, ...place))), place, followed: followed && choice === LIVE };
+  if (request !== opening) return;
+  const before = byId("field").value;
+  if (!followed || header?.session !== opened.session) limitsByHand = null;
   header = opened;
-  limitsByHand = null;
   viewer ??= import("./surface.js").then(({ Surface }) => {
     surface = new Surface(byId("surface"), drawAxes);
     wirePicking();
   });
-  await viewer;
   const options = header.fields.map(({ name, label, unit, group }) => ({
     value: name,
     label: unit ? `${label} (${unit})` : label,
     group,
   }));
-  const before = byId("field").value;
   setOptions(byId("field"), options, options.some(({ value }) => value === before) ? before : FIRST_FIELD);
   byId("step").max = String(header.steps.length - 1);
   byId("step").value = String(header.steps.length - 1);
-  byId("report").href = url("sessions", header.session, "results", header.run, "report");
-  byId("download").href = url("sessions", header.session, "results", header.run, "file");
-  const faces = await bytes("faces");
-  if (header !== opened) return; // another run was chosen meanwhile
+  byId("report").hidden = choice === LIVE;
+  byId("report").href = own("report");
+  byId("download").href = own("file");
+  const last = header.steps.length - 1;
+  const [faces] = await Promise.all([
+    bytes("faces"),
+    bytes("positions", last),
+    bytes("fields", chosenField().name, last),
+    viewer,
+  ]);
+  if (request !== opening) return; // another was chosen meanwhile
   surface.setFaces(new Uint32Array(faces));
   facesOf = opened;
   shownPoints = null;
@@ -103,7 +130,7 @@ async function show() {
   const [points, values] = await Promise.all([bytes("positions", step), bytes("fields", field.name, step)]);
   if (request !== wanted || facesOf !== header) return;
   const scale = SCALES[field.centre === null ? "sequential" : "diverging"];
-  const [low, high] = limitsByHand ?? automaticLimits(field);
+  const [low, high] = limitsByHand ?? (header.followed ? widened(field) : automaticLimits(field));
   if (points !== shownPoints) surface.setPositions(new Float32Array(points));
   shownPoints = points;
   surface.setField(new Float32Array(values), field.location, scale, low, high);
@@ -117,6 +144,8 @@ async function show() {
   byId("step").setAttribute("aria-valuetext", name);
   byId("rigid").title = field.rigid ? "" : "This field is the same with and without; the shape moves.";
   byId("surface").dataset.shown = `${field.name}/${step}/${removed()}`;
+  byId("surface").dataset.of = header.place.join("/");
+  if (header.capture_id) noteDrawn(header);
 }
 
 // Colours ----------------------------------------------------------------------------------------
@@ -130,6 +159,16 @@ function automaticLimits(field) {
     [low, high] = [field.centre - reach, field.centre + reach];
   }
   return high > low ? [low, high] : [low - 0.5, low + 0.5];
+}
+
+/** Limits of all live steps of the session so far: a scale that jumped from step to step could not be compared. */
+function widened(field) {
+  const name = `${header.session}/${field.name}/${removed()}`;
+  const [low, high] = automaticLimits(field);
+  if (header.steps.length < 2) return [low, high];
+  const [lowest, highest] = limitsSoFar.get(name) ?? [low, high];
+  limitsSoFar.set(name, [Math.min(low, lowest), Math.max(high, highest)]);
+  return limitsSoFar.get(name);
 }
 
 function showLegend(field, scale, low, high) {
@@ -258,7 +297,16 @@ async function attempt(action) {
 }
 
 export function wireResults() {
-  byId("run").addEventListener("change", () => attempt(openRun));
+  byId("run").addEventListener("change", () => {
+    byId("follow").checked = byId("run").value === LIVE;
+    attempt(openChosen);
+  });
+  byId("follow").addEventListener("change", () => {
+    const latest = newest();
+    if (!following() || !latest) return;
+    byId("run").value = latest.choice;
+    attempt(() => openChosen(true));
+  });
   byId("field").addEventListener("change", () => {
     limitsByHand = null;
     attempt(show);
@@ -276,6 +324,7 @@ export function wireResults() {
   }
   byId("auto").addEventListener("click", () => {
     limitsByHand = null;
+    limitsSoFar = new Map();
     attempt(show);
   });
   byId("reset-view").addEventListener("click", () => surface?.resetView());
