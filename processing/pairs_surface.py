@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,23 +16,44 @@ from processing.session import Capture, Session
 from processing.settings import Settings
 from processing.surface import PairSurface
 
+Merging = Callable[[Sequence[PairSurface], str], Merged]
+
 _MOST = 0.5  # a step at which fewer points of a pair were measured says nothing about single points
 
 
+def merge_surfaces(surfaces: Sequence[PairSurface], heuristic: str) -> Merged:
+    """One surface of the pairs' surfaces."""
+    return merge([_sheet(surface) for surface in surfaces], heuristic)
+
+
+def at_reference(surface: PairSurface) -> PairSurface:
+    """A pair's surface at the reference alone."""
+    vertices, correlation = surface.vertices[:1], surface.correlation[:1]
+    return replace(
+        surface, vertices=vertices, correlation=correlation, sigma=surface.sigma[:1], status=surface.status[:1]
+    )
+
+
 def pairs_surface(
-    session: Session, ring: Ring, surfaces: Sequence[PairSurface], steps: Sequence[Capture], settings: Settings
+    session: Session,
+    ring: Ring,
+    surfaces: Sequence[PairSurface],
+    steps: Sequence[Capture],
+    settings: Settings,
+    merging: Merging = merge_surfaces,
 ) -> tuple[Results, dict[str, Any]]:
     """The results of all pairs, and how well the pairs agree and how they were merged, as JSON values.
 
     With surface.merge "none" the surfaces stay side by side, one over the other where several pairs saw the body.
+    merging : what merges them otherwise, by that name.
     """
-    sheets = [_sheet(surface) for surface in surfaces]
     results = _side_by_side(session, ring, surfaces, steps, settings)
     heuristic = settings.surface.merge
     if heuristic == "none":
+        sheets = [_sheet(surface) for surface in surfaces]
         edge = Seam.mean_edge(sheets)
         return results, {"heuristic": heuristic, **_agreement(results, mismatches(sheets, Seam().layers * edge))}
-    merged = merge(sheets, heuristic)
+    merged = merging(surfaces, heuristic)
     figures = {"heuristic": heuristic, "removed": len(merged.removed), "added": merged.added}
     return _of_merged(results, merged), {**figures, **_agreement(results, merged.mismatch)}
 

@@ -26,18 +26,20 @@ from processing.correlation.correlate import load_kernels
 from processing.errors import ComputationError, InputError
 from processing.images import read_mask
 from processing.pair_tasks import PairJob, in_order, pair_jobs
-from processing.pairs_surface import pairs_surface
+from processing.pairs_surface import Merging, merge_surfaces, pairs_surface
 from processing.progress import Report, Stages, silent
 from processing.results import Results, write_results
 from processing.ring import Ring, calibrate_ring, control_points
 from processing.ring_surface import RingSurface, ring_surface
 from processing.session import Capture, Session, new_run, read_session
-from processing.settings import Settings
+from processing.settings import CalibrationGroup, Settings
 from processing.stated_uncertainty import camera_covariance, with_uncertainty
 from processing.step_images import step_image
 from processing.surface import PairSurface, pair_surface
 from processing.sweep import Search
 from processing.tasks import Executor, LocalExecutor, Ran, Task, tidy, work_folder
+
+Calibrate = Callable[[Session, CalibrationGroup, Callable[[float, str], None]], Ring]
 
 log = logging.getLogger(__name__)
 
@@ -85,25 +87,27 @@ def measure(
     stages: Stages | None = None,
     executor: Executor | None = None,
     steps: Sequence[Capture] | None = None,
+    calibrate: Calibrate = calibrate_ring,
+    merging: Merging = merge_surfaces,
 ) -> Measured:
     """Everything of a run but the writing of its files.
 
     steps : captures to measure, the reference first; None takes all of the specimen, and those at rest. executor : of
-    the tasks; None runs them in this process.
+    the tasks; None runs them in this process. calibrate, merging : what does these, where it is kept from before.
     """
     stages = stages or Stages(_WEIGHTS, silent)
     steps = tuple(steps) if steps is not None else _with_captures_at_rest(session)
     stages.at("prepare", 0.0, "loading the correlation kernels (compiled at the first use)")
     load_kernels()
     stages.at("calibrate", 0.0)
-    ring = calibrate_ring(session, settings.calibration, lambda done, who: stages.at("calibrate", done, who))
+    ring = calibrate(session, settings.calibration, lambda done, who: stages.at("calibrate", done, who))
     errors, warnings = _usable_pairs(session, ring, steps)
     if settings.surface.method == "global":
         whole = _whole_ring(session, ring, tuple(errors), steps, settings, stages)
         results, drift, agreement, more_warnings = whole.results, whole.drift, whole.agreement, whole.warnings
     else:
         surfaces, more_warnings = _surfaces(session, ring, tuple(errors), steps, settings, stages, executor)
-        results, agreement = pairs_surface(session, ring, surfaces, steps, settings)
+        results, agreement = pairs_surface(session, ring, surfaces, steps, settings, merging)
         drift = {"-".join(surface.matches.cameras): surface.drift for surface in surfaces}
     results = with_uncertainty(results, camera_covariance(ring.bundle))
     results, drift, floor = _noise_floor(results, drift, steps)

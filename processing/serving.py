@@ -20,12 +20,24 @@ from threading import Thread
 from typing import Any
 
 from processing.errors import RingdicError
+from processing.live import process_step
 from processing.pipeline import process_session
 from processing.progress import Progress, Report
 from processing.settings import load_settings
+from processing.tasks import kept
 
 Say = Callable[[dict[str, Any]], None]
+_MOST_KEPT = 4 << 30  # bytes
 _NICE = 10  # compiling must not slow a capture down
+
+
+def _memory() -> int:
+    """Bytes to keep between orders: all reference images of a ring of twelve, prepared, take 1.5 GB."""
+    try:
+        whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):  # not told on this system
+        return kept.limit
+    return int(min(_MOST_KEPT, max(kept.limit, whole // 4)))
 
 
 class StoppedError(Exception):
@@ -36,6 +48,7 @@ def serve(lines: Iterable[str], say: Say) -> None:
     """Carry out the orders of ``lines``, warmed up before the first."""
     orders = _Orders(lines)
     began = time.monotonic()
+    kept.limit = _memory()
     say({"worker": "warming"})
     warm_up()
     say({"worker": "ready", "seconds": round(time.monotonic() - began, 1)})
@@ -65,8 +78,16 @@ def compile_kernels(say: Say) -> None:
         load_kernels()
 
 
-def carry_out(session: Path, settings: Path | None, overrides: list[str], report: Report) -> dict[str, Any]:
-    """Process a session; the outcome as JSON values. Raises RingdicError for what an operator can mend."""
+def carry_out(
+    session: Path, settings: Path | None, overrides: list[str], report: Report, step: str | None = None
+) -> dict[str, Any]:
+    """Process a session, or a step of it at once; the outcome as JSON values.
+
+    Raises RingdicError for what an operator can mend.
+    """
+    if step is not None:
+        process_step(session, step, load_settings(settings, overrides), report)
+        return {"state": "done", "step": step}
     run = process_session(session, load_settings(settings, overrides), report)
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     return {"state": "done", "run": run.name, "summary": summary}
@@ -85,7 +106,8 @@ def _carried_out(order: dict[str, Any], say: Say, orders: _Orders) -> dict[str, 
 
     settings = order.get("settings")
     try:
-        return carry_out(Path(order["session"]), None if settings is None else Path(settings), [], report)
+        chosen = None if settings is None else Path(settings)
+        return carry_out(Path(order["session"]), chosen, [], report, order.get("step"))
     except StoppedError:
         return {"state": "stopped"}
     except RingdicError as error:

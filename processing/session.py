@@ -39,7 +39,7 @@ from processing.rig import Rig, read_rig
 
 KINDS = ("board", "target", "specimen", "static")
 _MEND = "copy it back, or import the session again"
-_LIVE_KEPT = 2
+_LIVE_KEPT = 5  # the operator may stay at one while newer ones come
 _CAPTURE_NAME = re.compile(r"(\d{4,})-(board|target|specimen|static)")
 
 
@@ -125,7 +125,7 @@ def live_results(path: Path) -> tuple[Path, ...]:
 def new_live(path: Path, capture_id: str) -> Iterator[Path]:
     """A folder to write a single step's results into; it takes its place when everything is written.
 
-    Older ones are taken away, but for the one before: it may be being read.
+    Older ones are taken away, but for the last few: one may be being looked at.
     """
     live = Path(path) / "live"
     live.mkdir(exist_ok=True)

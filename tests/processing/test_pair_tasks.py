@@ -8,10 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from controller.importing import import_folder
-from node_agent.virtual_rig.render import render
-from node_agent.virtual_rig.rig import VirtualRig, paper_rig
-from node_agent.virtual_rig.scenes import scene
 from processing.camera import Camera
 from processing.correlation import CorrelationSettings
 from processing.pair_tasks import PairJob, in_order, pair_jobs
@@ -23,7 +19,7 @@ from processing.settings import Settings, load_settings
 from processing.sweep import Search
 from processing.tasks import LocalExecutor, Ran, Task, Told, kept
 
-SCALE, STEPS = 0.2, 3
+SCALE, STEPS = 0.2, 3  # of the session
 SETTINGS = load_settings(None, ["correlation.radius_px=12", "correlation.step_px=8"])
 
 
@@ -43,33 +39,6 @@ class Counted:
             told(task, ran, count, total)
 
         LocalExecutor(1).run(tasks, tell)
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A session of two cameras and three captures of the specimen, calibrated."""
-    folder = tmp_path_factory.mktemp("rig")
-    rig = VirtualRig(paper_rig(12, SCALE).cameras[:2])
-    source = folder / "source"
-    source.mkdir()
-    (source / "rig.toml").write_text(rig.rig_toml(), encoding="utf-8")
-    for camera in rig.cameras:
-        shots = {f"board/{camera.id}/{pose}.png": ("board", pose) for pose in range(4)}
-        shots |= {f"specimen/{camera.id}/{step}.png": ("specimen", step) for step in range(STEPS)}
-        for name, (kind, number) in {**shots, f"target/{camera.id}.png": ("target", 0)}.items():
-            (source / name).parent.mkdir(parents=True, exist_ok=True)
-            assert cv2.imwrite(str(source / name), render(camera, scene(kind, number), number))
-    import_folder(source, folder / "session")
-    calibrate_ring(read_session(folder / "session"), SETTINGS.calibration)
-    return folder / "session"
-
-
-@pytest.fixture
-def session(made: Path, tmp_path: Path) -> Path:
-    """A copy to process."""
-    kept.clear()
-    shutil.copytree(made, tmp_path / "session", ignore=shutil.ignore_patterns("results", "work"))
-    return tmp_path / "session"
 
 
 def jobs(session: Path, settings: Settings = SETTINGS, steps: slice = slice(None), **changed: Camera) -> list[PairJob]:

@@ -1,0 +1,77 @@
+"""One step of a session at once, while the capturing goes on: what is shown until the whole session is processed.
+
+The step's matches are kept as those of a whole run are, so the run makes only what is missing. The surface that the
+steps are shown on is that of the reference, merged once and the same at every step. It is made by pairs of cameras,
+whatever the run is told: these alone need nothing of the steps between.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from processing.errors import InputError
+from processing.merging import Merged
+from processing.pairs_surface import at_reference, merge_surfaces
+from processing.pipeline import measure
+from processing.progress import Report, Stages, silent
+from processing.results import write_results
+from processing.ring import Ring, calibrate_ring
+from processing.session import Capture, Session, new_live, read_session
+from processing.settings import CalibrationGroup, Settings
+from processing.surface import PairSurface
+from processing.tasks import Executor, digest, kept
+
+_RING_BYTES = 1 << 20  # about what the cameras and their control points take
+_WEIGHTS = {"prepare": 0.01, "calibrate": 0.02, "correlate": 0.8, "triangulate": 0.1, "deform": 0.07}
+
+
+def process_step(
+    path: Path, capture_id: str, settings: Settings, report: Report = silent, executor: Executor | None = None
+) -> Path:
+    """Process the reference and one step of the specimen; the folder of what is shown of it.
+
+    The reference itself may be the step: then its shape is shown, and what every step needs of it is found. Nothing
+    becomes a run, and no matches in images are written. Raises InputError or ComputationError.
+    """
+    began = time.monotonic()
+    stages = Stages(_WEIGHTS, report)
+    session = read_session(path)
+    settings = settings.model_copy(update={"surface": settings.surface.model_copy(update={"method": "pairs"})})
+    steps = _reference_and(session, capture_id)
+
+    def merging(surfaces: Sequence[PairSurface], heuristic: str) -> Merged:
+        shape = [at_reference(surface) for surface in surfaces]
+        key = digest("live surface", heuristic, [(each.vertices, each.faces, each.correlation) for each in shape])
+        return kept.get(key, lambda: merge_surfaces(shape, heuristic), _bytes)
+
+    measured = measure(session, settings, stages, executor, steps, _calibrated, merging)
+    found = {**measured.found, "seconds": round(time.monotonic() - began, 2)}
+    stages.at("deform", 0.0)
+    with new_live(path, capture_id) as folder:
+        results = replace(measured.results, matches=(), summary=found)
+        write_results(folder / "results.h5", results, lambda done: stages.at("deform", done))
+    return session.path / "live" / capture_id
+
+
+def _calibrated(session: Session, settings: CalibrationGroup, told: Callable[[float, str], None]) -> Ring:
+    """The ring as calibrated, kept in memory while its images and settings stay."""
+    captures = [capture for capture in session.captures if capture.kind in ("board", "target")]
+    rig = (session.path / "rig.toml").read_text(encoding="utf-8")
+    key = digest("live calibration", str(session.path), rig, settings, [(each.id, each.record) for each in captures])
+    return kept.get(key, lambda: calibrate_ring(session, settings, told), lambda _: _RING_BYTES)
+
+
+def _reference_and(session: Session, capture_id: str) -> tuple[Capture, ...]:
+    specimen = session.of_kind("specimen")
+    chosen = [capture for capture in specimen if capture.id == capture_id]
+    if not chosen:
+        there = ", ".join(capture.id for capture in specimen) or "none"
+        raise InputError(f"{session.path}: no capture '{capture_id}' of the specimen; there are {there}")
+    return (specimen[0], *chosen) if chosen[0] is not specimen[0] else (specimen[0],)
+
+
+def _bytes(merged: Merged) -> int:
+    return int(merged.vertex.nbytes + merged.faces.nbytes + merged.pair.nbytes)
