@@ -88,7 +88,7 @@ def _measure(folder: Path, count: int, rounds: int, size: tuple[int, int]) -> di
         client = Client(running.address)
         client.wait_for_nodes(ids, _START, lambda: check_alive(processes, folder))
         client.post("/sessions", {"name": _SESSION})
-        worked, taken = _cpu_seconds(running.pid), []
+        worked, taken = processor_seconds(running.pid), []
         for _ in range(rounds):
             taken.append(_capture(client, folder, expected))
             check_alive(processes, folder)
@@ -139,7 +139,7 @@ def _figures(
     expected: dict[str, str], taken: list[dict[str, float]], images: Path, running: Running, worked: float | None
 ) -> dict[str, Any]:
     volume = sum((images / f"{id_}.pgm").stat().st_size for id_ in expected)
-    cpu = _cpu_seconds(running.pid)
+    cpu = processor_seconds(running.pid)
     acknowledged = _spread(one["acknowledged"] for one in taken)
     return {
         "nodes": len(expected),
@@ -188,7 +188,7 @@ def _limits(folder: Path, volume: int = 64 << 20) -> dict[str, float]:
     return {"sha256_mb_per_second": volume / _MB / hashed, "disk_mb_per_second": volume / _MB / written}
 
 
-def _cpu_seconds(pid: int) -> float | None:
+def processor_seconds(pid: int) -> float | None:
     """Processor time of a process so far; None where the system does not tell."""
     if not sys.platform.startswith("linux"):
         return None

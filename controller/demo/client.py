@@ -28,6 +28,10 @@ class Client:
         """The JSON answer to a request under /api/v1; ComputationError with the controller's sentence if refused."""
         return self._call("POST", path, body or {})
 
+    def put(self, path: str, body: dict[str, Any]) -> Any:
+        """The JSON answer to a change of a resource under /api/v1."""
+        return self._call("PUT", path, body)
+
     def wait_for_nodes(self, ids: list[str], timeout: float, alive: Callable[[], None]) -> None:
         """Until every node is there. ``alive`` may raise if waiting has become pointless."""
         deadline = time.monotonic() + timeout
@@ -52,25 +56,32 @@ class Client:
             time.sleep(_EVERY)
         raise ComputationError(f"the {kind} capture did not close within {timeout:.0f} s")
 
-    def cancel_jobs(self) -> None:
-        """Stop every job that has not ended."""
-        for job in self.get("/jobs"):
-            if job["state"] in ("queued", "running"):
-                self.post(f"/jobs/{job['id']}/cancel")
-
-    def follow_job(self, session: str, watch: Callable[[dict[str, Any]], None], timeout: float) -> dict[str, Any]:
-        """Wait for the newest job of a session to end, telling ``watch`` of its progress; the job."""
+    def follow_job(self, job_id: str, watch: Callable[[dict[str, Any]], None], timeout: float) -> dict[str, Any]:
+        """Wait for a job to end, telling ``watch`` of its progress; the job."""
         deadline = time.monotonic() + timeout
         while time.monotonic() < deadline:
-            jobs = [job for job in self.get("/jobs") if job["session"] == session]
-            if jobs:
-                watch(jobs[0])
-                if jobs[0]["state"] == "done":
-                    return dict(jobs[0])
-                if jobs[0]["state"] in ("failed", "cancelled"):
-                    raise ComputationError(f"the processing of {session} {jobs[0]['state']}: {jobs[0]['error']}")
+            job = self.get(f"/jobs/{job_id}")
+            watch(job)
+            if job["state"] == "done":
+                return dict(job)
+            if job["state"] not in ("queued", "running"):
+                raise ComputationError(f"the processing of {job['session']} {job['state']}: {job['error']}")
             time.sleep(_EVERY)
-        raise ComputationError(f"the processing of {session} did not end within {timeout:.0f} s")
+        raise ComputationError(f"job {job_id} did not end within {timeout:.0f} s")
+
+    def wait_for_step(self, session: str, capture_id: str, timeout: float) -> None:
+        """Wait until a step has been processed at once, or a newer one in its place."""
+        deadline = time.monotonic() + timeout
+        while time.monotonic() < deadline:
+            for job in self.get("/jobs"):
+                if job["session"] != session or not job["step"] or job["step"] < capture_id:
+                    continue
+                if job["state"] == "failed":
+                    raise ComputationError(f"{job['step']} of {session} was not processed: {job['error']}")
+                if job["state"] == "done":
+                    return
+            time.sleep(_EVERY)
+        raise ComputationError(f"{capture_id} of {session} was not processed within {timeout:.0f} s")
 
     def _call(self, method: str, path: str, body: dict[str, Any] | None) -> Any:
         request = urllib.request.Request(

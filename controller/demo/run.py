@@ -64,7 +64,7 @@ def _leave(signum: int, _: FrameType | None) -> None:
 
 
 def _capture_all(client: Client, steps: int, report: Report) -> None:
-    """Boards, target, the reference and the steps; a job that starts by itself before the last step is stopped."""
+    """Boards, target, the reference and the steps; each step is on the page while the next ones are captured."""
     kinds = ["board"] * BOARDS + ["target"] + ["specimen"] * (steps + 1)
     for k, kind in enumerate(kinds):
         report(Progress("capture", k / len(kinds), f"{kind}, capture {k + 1} of {len(kinds)}"))
@@ -72,8 +72,6 @@ def _capture_all(client: Client, steps: int, report: Report) -> None:
         failed = {id_: entry["reason"] for id_, entry in record["cameras"].items() if entry["status"] == "failed"}
         if failed:
             say(f"{record['capture_id']}: {', '.join(f'{id_} failed ({reason})' for id_, reason in failed.items())}")
-        if k < len(kinds) - 1:
-            client.cancel_jobs()
     report(Progress("capture", 1.0, f"{len(kinds)} captures archived"))
 
 
@@ -82,7 +80,7 @@ def _follow(client: Client, session: str, report: Report) -> None:
         if job["stage"]:
             report(Progress(job["stage"], job["done"], job["message"], job["rate"], job["left_s"]))
 
-    client.follow_job(session, watch, _JOB)
+    client.follow_job(client.post("/jobs", {"session": session})["id"], watch, _JOB)
 
 
 def _compare(setting: Setting, session: str, rig: VirtualRig, began: float) -> dict[str, Any]:

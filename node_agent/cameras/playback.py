@@ -1,4 +1,4 @@
-"""A camera that delivers one image from a file again and again: real bytes at full size, and nothing to compute."""
+"""A camera that delivers images from files: real bytes at full size, and nothing to compute."""
 
 from __future__ import annotations
 
@@ -17,25 +17,30 @@ _HEADER = re.compile(rb"P5\s+(\d+)\s+(\d+)\s+(\d+)\s")
 
 
 class PlaybackCamera:
-    """Every frame is the image of the file, read once.
+    """Every frame is the image of the file, read once; or each capture has a file of its own.
 
     Parameters
     ----------
     image : str
-        A binary PGM file (P5, no comments), 8 or 16 bit. Raises CameraError if it is none.
+        A binary PGM file (P5, no comments), 8 or 16 bit. Raises CameraError if it is none. With ``{kind}`` and
+        ``{scene}`` in its name, the capture's kind and how many of that kind came before it are put in their places.
     """
 
     def __init__(self, clock: Clock, *, image: str = "") -> None:
         self._clock = clock
-        self._pixels = read_pgm(Path(image))
+        self._image = image
+        self._pixels = None if "{" in image else read_pgm(Path(image))
 
     def lock(self, settings: Mapping[str, Any]) -> Lock:
         check_settings(settings)
         return Lock(metadata=dict(settings), sync="simulated")
 
     def capture(self, shot: Shot) -> Frame:
+        pixels = self._pixels
+        if pixels is None:
+            pixels = read_pgm(Path(self._image.replace("{kind}", shot.kind).replace("{scene}", str(shot.scene))))
         sleep_until(self._clock, shot.fire_at_ns)
-        return Frame(self._pixels, shot.fire_at_ns)
+        return Frame(pixels, shot.fire_at_ns)
 
     def versions(self) -> dict[str, str]:
         return {"camera": "playback"}
