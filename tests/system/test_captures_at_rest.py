@@ -19,11 +19,12 @@ from PIL import Image, ImageSequence
 from node_agent.virtual_rig.render import radiance
 from node_agent.virtual_rig.rig import paper_rig
 from node_agent.virtual_rig.scenes import Cylinder, Specimen, Target
-from node_agent.virtual_rig.sensor import expose
+from node_agent.virtual_rig.sensor import FULL_WELL, READ_NOISE, expose
 from processing.evaluation import Evaluated, evaluated
+from processing.report.hardware import camera_facts
 from processing.results import read_results
 from processing.rigid_motion import motion_to_reference
-from processing.session import newest_results
+from processing.session import newest_results, read_session
 
 SWOLLEN, WINDOW, AT_REST = 1.02, 20.0, 3
 RADIUS = 57.0
@@ -131,6 +132,37 @@ def test_the_noise_floor_is_that_of_the_noise(seen: Evaluated, figures) -> None:
         assert 0.7 < ratio < 1.4
     assert abs(floor["quantities"]["lambda1"]["mean"]) < 2e-3
     assert floor["quantities"]["displacement"]["rms"] < 0.02
+
+
+def known_noise(folder: Path, camera: str) -> tuple[float, float]:
+    """Grey levels that the sensor's noise makes about the middle of a camera's images, from its electrons alone; and
+    what it does to the height of a subset of radius 12, px: σ / √Σ gy²."""
+    shots = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted((folder / "static" / camera).iterdir())]
+    grey = np.mean(shots, axis=0)[310:510, 240:380]
+    light = ((grey / 255 + 0.055) / 1.055) ** 2.4
+    by_light = 255 * 1.055 / 2.4 * light ** (1 / 2.4 - 1)
+    variance = by_light**2 * (light * FULL_WELL + READ_NOISE**2) / FULL_WELL**2 + 1 / 12
+    slope = np.mean(np.gradient(grey, axis=0) ** 2) * np.pi * 12.5**2
+    return float(np.sqrt(variance.mean())), float(np.sqrt(variance.mean() / slope))
+
+
+def test_the_noise_floor_is_what_electrons_make_of_it(session: Path, seen: Evaluated, folder: Path, figures) -> None:
+    camera = seen.results.cameras[1]
+    noise, height = known_noise(folder, camera.id)
+    (facts,) = (each for each in camera_facts(read_session(session), seen.results) if each.camera == camera.id)
+    assert facts.at_rest
+    figures("swelling cylinder: image noise, from electrons, grey levels", f"{facts.noise:.2f}, {noise:.2f}", "± 15 %")
+    assert facts.noise == pytest.approx(noise, rel=0.15)
+    # Of two cameras, each with an image of the reference and one at rest, the mean height is as sure as one subset's;
+    # subsets that are turned away or cut by the rim are less sure than those of the middle.
+    found = seen.results.summary["noise_floor"]["quantities"]["displacement_z"]["std"]
+    wanted = height / seen.results.pixels_a_mm
+    figures(
+        "swelling cylinder: height at rest, from electrons, µm",
+        f"{1e3 * found:.2f}, {1e3 * wanted:.2f}",
+        "0.9 … 2 times",
+    )
+    assert 0.9 * wanted < found < 2.0 * wanted
 
 
 def test_the_window_is_true_on_homogeneous_strain_and_as_much_smoother_as_it_says(seen: Evaluated, figures) -> None:
