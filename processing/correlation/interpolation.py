@@ -1,11 +1,11 @@
-"""B-spline interpolation of sixteen pixels of a row at once.
+"""B-spline interpolation of LANES pixels of a row at once.
 
-While the fractional position t = t0 + s l + q l² of the lanes l = 0 … 15 stays inside one pixel interval, lane l needs
+While the fractional position t = t0 + s l + q l² of the lanes l = 0, 1 … stays inside one pixel interval, lane l needs
 the coefficients at base + l + tap: every tap is one contiguous load for all lanes, no gather. Where t crosses one
 whole number there is one tap more, and the weights move along by a select. The two axes are independent: four cases.
 
-With larger gradients the sixteen pixels lie within 32 coefficients of a row: every tap is picked from two loads by a
-permutation, in as many rows as the lanes reach. Beyond that (a stretch of 1.7) each pixel finds its own taps.
+With larger gradients the pixels lie within 2 LANES coefficients of a row: every tap is picked from two loads by a
+permutation, in as many rows as the lanes reach. Beyond that (a stretch of 1.4 or more) each pixel finds its own taps.
 
 Weights are those of the B-spline times 6 (cubic) or 120 (quintic), so g is 36 or 14400 times the grey level: the
 criterion does not mind a contrast.
@@ -22,9 +22,9 @@ import numpy as np
 from processing.correlation.lanes import LANES, floor, load, magnitude, number, picked, put, ramp, select, store
 
 FAST = {"contract", "reassoc", "arcp", "nsz"}
-# What sixteen pixels cross: nothing, one whole number along an axis or both; WIDE + n: n whole numbers in y, any in x.
+# What the pixels of a vector cross: nothing, a whole number along an axis or both; WIDE + n: n of them in y, any in x.
 ACROSS_X, ACROSS_Y, WIDE, SCATTERED = 1, 2, 4, -1
-REACH_OF_WINDOW = 31 - 5  # px that a window of 32 coefficients leaves the pixels for six taps
+REACH_OF_WINDOW = 2 * LANES - 1 - 5  # px that a window of 2 LANES coefficients leaves the pixels for six taps
 _F, _U = np.float32, np.uint64
 
 
@@ -157,9 +157,9 @@ _q66, _q76, _q67, _q77 = _make_sum(_row6, 6), _make_sum(_row7, 6), _make_sum(_ro
 
 @nb.njit(fastmath=FAST, nogil=True, cache=True)
 def _wide(c, p, stride, tx, sx, qx, ty, sy, qy, rows, quintic, g):  # type: ignore[no-untyped-def]
-    """Any gradients that 32 coefficients of a row cover: taps picked by permutation, ``rows`` more rows of them.
+    """Any gradients that 2 LANES coefficients of a row cover: taps picked by permutation, ``rows`` more rows of them.
 
-    g : where to put the sixteen grey levels.
+    g : where to put the grey levels.
     """
     e = ramp(c)
     x, y = e * (e * qx + sx) + tx + e, e * (e * qy + sy) + ty
@@ -221,9 +221,9 @@ def make_interpolation(quintic: bool) -> Any:
 
     @nb.njit(forceinline=True, fastmath=FAST)
     def interpolate(c, p, stride, case, tx, sx, qx, ty, sy, qy, spare):  # type: ignore[no-untyped-def]
-        """Sixteen grey levels of the current image, those whose taps begin at p + lane where t < 1.
+        """Grey levels of the current image, those whose taps begin at p + lane where t < 1.
 
-        c : pointer to the coefficients; case : what the lanes cross; spare : pointer to 16 numbers of scratch.
+        c : pointer to the coefficients; case : what the lanes cross; spare : pointer to LANES numbers of scratch.
         """
         e = ramp(c)
         x, y = e * (e * qx + sx) + tx, e * (e * qy + sy) + ty
@@ -245,7 +245,7 @@ def make_interpolation(quintic: bool) -> Any:
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def between_pixels(c, p, stride, tx, ty, quintic):  # type: ignore[no-untyped-def]
-    """f, ∂f/∂x and ∂f/∂y of sixteen pixels with the same fractions tx, ty; p : the pixel to the upper left."""
+    """f, ∂f/∂x and ∂f/∂y of LANES pixels with the same fractions tx, ty; p : the pixel to the upper left."""
     if quintic:
         p -= _U(2) * stride + _U(2)
         wx, wy, sx, sy = _quintic(tx), _quintic(ty), _quintic_slope(tx), _quintic_slope(ty)

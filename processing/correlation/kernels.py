@@ -5,7 +5,7 @@ Parameters of a subset, 12: u ux uy uxx uxy uyy v vx vy vxx vxy vyy, so that a p
 (Lu & Cary 2000). First order keeps the second derivatives as they come in (zero, or a known curvature): its free
 parameters are six. Criterion: zero-mean normalised sum of squared differences; scheme: Baker & Matthews (2004).
 
-Shape of the code. A subset is packed once into vectors of 16 pixels of one row (``subset``): weight (1, or 0 outside
+Shape of the code. A subset is packed once into vectors of LANES pixels of one row (``subset``): weight (1, or 0 outside
 the subset and the mask), f and its gradient, so a circle and a mask cost nothing. In an iteration every vector finds
 its place in the current image (``_place``); then one pass interpolates it (``interpolation``) and adds it to all the
 sums that a step needs (``_accumulate``), no value of a pixel is stored. The Hessian comes from moments
@@ -35,16 +35,41 @@ from processing.correlation.interpolation import (
     largest,
     make_interpolation,
 )
-from processing.correlation.lanes import LANES, chosen, floor, load, pointer, ramp, select, store, store_whole, total
+from processing.correlation.lanes import (
+    BITS,
+    LANES,
+    chosen,
+    floor,
+    load,
+    pointer,
+    ramp,
+    select,
+    store,
+    store_whole,
+    total,
+)
 from processing.correlation.spline import PAD
-from processing.correlation.subset import GX, GY, MOMENTS, REF, add, moments, normal_matrix, pack, template
-from processing.correlation.warps import cholesky, compose_inverse, compose_inverse_affine, solve
+from processing.correlation.subset import (
+    GX,
+    GY,
+    MOMENTS,
+    REF,
+    add,
+    level_at,
+    moments,
+    normal_matrix,
+    pack,
+    template,
+    well_inside,
+)
+from processing.correlation.warps import cholesky, compose_inverse, compose_inverse_affine, solve, variance
 
 GOOD, NO_CONVERGENCE, OUTSIDE, NO_TEXTURE = 0, 2, 5, 6
 N_PARAMETERS = 12
 _F, _U = np.float32, np.uint64
 _L = np.uint64(LANES)
 _LAST_DIGIT = 1e-5  # px; steps below it that shrink no more are the rounding of single precision
+_CAUTION = 4.0  # the steps may come to shrink half as fast as the last one did
 _CHUNK = 64  # points that share their scratch memory
 _SURE = 0.9  # ZNCC of a match that others may follow
 _PAD = PAD
@@ -52,9 +77,9 @@ _PAD = PAD
 
 @nb.njit(fastmath=FAST, nogil=True, cache=True)
 def _place(fx, fy, p, corner, n, place, cell):  # type: ignore[no-untyped-def]
-    """Where n vectors lie in the current image, sixteen of them at a time.
+    """Where n vectors lie in the current image, LANES of them at a time.
 
-    fx, fy : fraction of the centre's position; corner : (2, m), dx and dy of lane 0, m the multiple of 16 from n on.
+    fx, fy : fraction of the centre's position; corner : (2, m), dx and dy of lane 0, m the multiple of LANES from n on.
     place : (4, m) fraction and slope, tx sx ty sy, filled; cell : (3, m) int32, filled: column and row of the first
     tap but for the degree's offset, counted from the centre's pixel, and the case. A vector's own dx and dy are whole
     and added last, so the rest is small and exact enough in single precision.
@@ -143,7 +168,7 @@ def _make_pass(quintic: bool, second: bool) -> Any:
         """One pass over the subset in the current image, g taken about ``level``.
 
         coef : flat, origin : index of the centre's first tap; place, cell of the vectors; bend : (2,) their quadratic
-        terms; scratch : (17, 16). sums : (16,), Σg, Σg², Σfg, spare, then Σ g ∂f/∂x φ_k (6) and Σ g ∂f/∂y φ_k (6)
+        terms; scratch : (17, LANES). sums : (16,), Σg, Σg², Σfg, spare, then Σ g ∂f/∂x φ_k (6) and Σ g ∂f/∂y φ_k (6)
         with φ = 1 dx dy dx²/2 dxdy dy²/2.
         """
         ref, gx, gy = pointer(px[REF]), pointer(px[GX]), pointer(px[GY])
@@ -200,13 +225,20 @@ def _accumulate(quintic, second, *given):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _step(H, sums, sum_J, sum_fJ, mean_g, ratio, terms, b, d):  # type: ignore[no-untyped-def]
-    """The increment d (12,) of the parameters from one pass; b : (2 terms,) scratch."""
+    """The increment d (12,) of the parameters from one pass, and by how much it lowers the sum of squares.
+
+    b : (2 terms,) scratch.
+    """
     for k in range(terms):
         b[k] = ratio * (sums[4 + k] - mean_g * sum_J[k]) - sum_fJ[k]
         b[terms + k] = ratio * (sums[10 + k] - mean_g * sum_J[terms + k]) - sum_fJ[terms + k]
-    solve(H, b, 2 * terms)
-    for k in range(terms):
         d[k], d[6 + k] = b[k], b[terms + k]
+    solve(H, b, 2 * terms)
+    gain = 0.0
+    for k in range(terms):
+        gain += d[k] * b[k] + d[6 + k] * b[terms + k]
+        d[k], d[6 + k] = b[k], b[terms + k]
+    return gain
 
 
 @nb.njit(cache=True, nogil=True)
@@ -221,24 +253,33 @@ def _length(d, radius):  # type: ignore[no-untyped-def]
 @nb.njit(cache=True, nogil=True)
 def _refine_point(  # type: ignore[no-untyped-def]
     image, gx, gy, coef_ref, stride_ref, mask, shape_ref, coef, shape, x_ref, y_ref, x_cur, y_cur, p,
-    corner, corner_f, uncut, strips, radius, terms, quintic, tolerance, max_iterations, texture, noise,
+    corner, corner_f, offset, uncut, strips, radius, terms, quintic, tolerance, max_iterations, texture, noise,
     px, bits, place, cell, bend, lanes, H, moment, vectors, A, B,
 ):  # fmt: skip
     """IC-GN of one subset from the parameters p (12,), refined in place.
 
     (x_ref, y_ref) and (x_cur, y_cur) : the centre in the two images' own crops; corner, uncut, strips : the template,
-    corner_f the same as floats, filled up to a multiple of 16; the last line is scratch. Returns status, ZNCC,
+    corner_f the same as floats, filled up to a multiple of LANES; offset : (n,) of lane 0 from the centre in the
+    reference's crop; the last line is scratch. Returns status, ZNCC,
     iterations, sigma of u and of v (px).
     """
     n, size, second, kind = corner.shape[1], 2 * terms, terms == 6, px.dtype.type
     sums, sum_J, sum_fJ, b, d = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4]
     d[:] = 0.0
-    level, pixels = pack(
-        image, gx, gy, coef_ref, stride_ref, mask, shape_ref, x_ref, y_ref, radius, quintic, corner, uncut, px, bits
-    )
+    column, row = math.floor(x_ref), math.floor(y_ref)
+    level = level_at(image, shape_ref, x_ref, y_ref)
+    direct = x_ref == column and y_ref == row and well_inside(shape_ref, x_ref, y_ref, radius)
+    if not direct:
+        pack(
+            image, gx, gy, coef_ref, stride_ref, mask, shape_ref, x_ref, y_ref, radius, quintic, corner, uncut, px, bits
+        )
+    sum_f, sum_ff, pixels = moments(
+        direct, second,
+        image, gx, gy, mask, row * shape_ref[1] + column, offset, level, uncut, px, bits, corner_f, strips, lanes,
+        moment,
+    )  # fmt: skip
     if pixels < max(0.15 * (2 * radius + 1) ** 2, 6 * terms):
         return NO_TEXTURE, np.nan, 0, np.nan, np.nan
-    sum_f, sum_ff = moments(px, corner_f, strips, second, lanes, moment)
     mean_f = sum_f / pixels
     norm_f = math.sqrt(max(sum_ff - pixels * mean_f * mean_f, 0.0))
     normal_matrix(moment, mean_f, terms, H, sum_J, sum_fJ)
@@ -265,20 +306,24 @@ def _refine_point(  # type: ignore[no-untyped-def]
             coef, stride, origin, place, cell, bend, px, bits, corner_f, strips, kind(about), lanes, sums,
         )  # fmt: skip
         mean_g = sums[0] / pixels
-        variance = sums[1] - pixels * mean_g * mean_g
-        if not variance > 1e-9 * pixels:
+        sum_gg = sums[1] - pixels * mean_g * mean_g
+        if not sum_gg > 1e-9 * pixels:
             return NO_TEXTURE, np.nan, iterations, np.nan, np.nan
-        norm_g = math.sqrt(variance)
+        norm_g = math.sqrt(sum_gg)
         zncc = min((sums[2] - mean_f * sums[0]) / (norm_f * norm_g), 1.0)
-        _step(H, sums, sum_J, sum_fJ, mean_g, norm_f / norm_g, terms, b, d)
+        gain = _step(H, sums, sum_J, sum_fJ, mean_g, norm_f / norm_g, terms, b, d)
         about += mean_g
         moved = _length(d, radius)
         if not moved < 4.0 * radius * radius:
             break
         if not (compose_inverse(p, d, A, B) if second else compose_inverse_affine(p, d)):
             break
-        if moved < tolerance * tolerance or previous <= moved < last_digit * last_digit:
+        left = moved  # square of the next step, as the steps shrink
+        if iterations > 1:
+            left *= min(_CAUTION * moved / previous, 1.0)
+        if left < tolerance * tolerance or previous <= moved < last_digit * last_digit:
             status = GOOD
+            zncc = min(zncc + 0.5 * gain / (norm_f * norm_f), 1.0)  # where the last step leads
             break
         previous = moved
     if status != GOOD:
@@ -287,14 +332,8 @@ def _refine_point(  # type: ignore[no-untyped-def]
     scatter = math.sqrt(2.0) * noise
     if not noise > 0.0:
         scatter = norm_f * math.sqrt(max(2.0 * (1.0 - zncc), 0.0) / (pixels - size - 2))
-    b[:] = 0.0
-    b[0] = 1.0
-    solve(H, b, size)
-    sigma_u = scatter * math.sqrt(b[0])
-    b[:] = 0.0
-    b[terms] = 1.0
-    solve(H, b, size)
-    return status, zncc, iterations, sigma_u, scatter * math.sqrt(b[terms])
+    sigma_u = scatter * math.sqrt(variance(H, b, size, 0))
+    return status, zncc, iterations, sigma_u, scatter * math.sqrt(variance(H, b, size, terms))
 
 
 @nb.njit(cache=True, nogil=True)
@@ -341,10 +380,11 @@ def refine(  # type: ignore[no-untyped-def]
     m = (n + LANES - 1) // LANES * LANES
     corner_f = np.zeros((2, m), coef.dtype)
     corner_f[:, :n] = corner
+    offset = corner[1] * image.shape[1] + corner[0]
     image_, gx_, gy_, mask_ = image.ravel(), gx.ravel(), gy.ravel(), mask.ravel()
     for chunk in nb.prange((xy.shape[0] + _CHUNK - 1) // _CHUNK):
         px, place, lanes = _scratch(3, n * LANES, flat), _scratch(4, m, flat), _scratch(MOMENTS, LANES, flat)
-        bits, cell, bend = np.empty(n, np.uint16), np.empty((3, m), np.int32), np.empty(2, coef.dtype)
+        bits, cell, bend = np.empty(n, BITS), np.empty((3, m), np.int32), np.empty(2, coef.dtype)
         H, moment, vectors = np.empty((2 * terms, 2 * terms)), np.empty((7, 15)), np.empty((5, 16))
         A, B = np.empty((6, 6)), np.empty((6, 6))
         before = -1
@@ -355,7 +395,7 @@ def refine(  # type: ignore[no-untyped-def]
                 result = _refine_point(
                     image_, gx_, gy_, flat_ref, _U(coef_ref.shape[1]), mask_, image.shape, flat, coef.shape,
                     xy[k, 0] - origin_ref[0], xy[k, 1] - origin_ref[1], xy[k, 0] - origin_cur[0],
-                    xy[k, 1] - origin_cur[1], parameters[k], corner, corner_f, uncut, strips,
+                    xy[k, 1] - origin_cur[1], parameters[k], corner, corner_f, offset, uncut, strips,
                     radius, terms, quintic, tolerance, max_iterations, texture, noise,
                     px, bits, place, cell, bend, lanes, H, moment, vectors, A, B,
                 )  # fmt: skip

@@ -1,9 +1,10 @@
-"""Sixteen numbers at once, as a value of numba's: a LLVM vector with arithmetic, loads, selects and sums.
+"""LANES numbers at once, as a value of numba's: a LLVM vector with arithmetic, loads, selects and sums.
 
-A loop over sixteen pixels that numba is to vectorise keeps no sums in registers from one row to the next, and which of
+A loop over pixels that numba is to vectorise keeps no sums in registers from one row to the next, and which of
 its loads become gathers is the optimiser's choice. With the vector as a value nothing is left to it, and the code of
 an equation stays the code of the equation: + - * with vectors and scalars, ``>=``, ``select``, ``load``, ``total``.
-A processor without such wide registers computes the same in parts.
+There are sixteen of them where the processor works on 512 bits at once, else eight: AMD's Zen 4 takes 512 bits in two
+halves, so they gain nothing there, and narrower vectors waste fewer pixels at the rim of a subset.
 """
 
 from __future__ import annotations
@@ -13,20 +14,28 @@ from collections.abc import Callable
 from typing import Any
 
 import llvmlite.ir as ir
-from llvmlite.binding import get_host_cpu_features
+import numpy as np
+from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 from numba import extending
 from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import lower_builtin, models, register_model
 
-LANES = 16
+
+def _wide_registers() -> bool:
+    return bool(get_host_cpu_features().get("avx512f")) and get_host_cpu_name() != "znver4"
+
+
+LANES = 16 if _wide_registers() else 8
+BITS = np.uint16 if LANES == 16 else np.uint8  # one bit a lane
+_BITS = types.uint16 if LANES == 16 else types.uint8
 intrinsic: Any = extending.intrinsic  # its own type hides the arguments of what it makes
 _FLAGS = ("contract", "reassoc", "arcp", "nsz")  # no order of sums is promised, NaN is
 _INDEX = ir.VectorType(ir.IntType(32), LANES)
 
 
 class Lanes(types.Type):
-    """Sixteen numbers of one float type."""
+    """LANES numbers of one float type."""
 
     def __init__(self, dtype: types.Float) -> None:
         super().__init__(f"Lanes({dtype})")
@@ -34,7 +43,7 @@ class Lanes(types.Type):
 
 
 class Choice(types.Type):
-    """Sixteen truth values."""
+    """LANES truth values."""
 
     def __init__(self) -> None:
         super().__init__("Choice")
@@ -120,7 +129,7 @@ def _address(builder: Any, start: Any, index: Any, kind: ir.Type) -> Any:
 
 @intrinsic
 def load(typingctx, start, index):  # type: ignore[no-untyped-def]
-    """The sixteen numbers from start[index] on."""
+    """The numbers from start[index] on."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         return builder.load(_address(builder, args[0], args[1], _vector(sig.return_type.dtype)), align=_width(sig) // 8)
@@ -135,7 +144,7 @@ def _width(sig: Any) -> int:
 
 @intrinsic
 def store(typingctx, start, index, value):  # type: ignore[no-untyped-def]
-    """start[index] and the fifteen after it become the value's."""
+    """start[index] and those after it become the value's."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         builder.store(args[2], _address(builder, args[0], args[1], args[2].type), align=_width(sig) // 8)
@@ -167,7 +176,7 @@ def put(typingctx, start, index, value):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def store_whole(typingctx, start, index, value):  # type: ignore[no-untyped-def]
-    """start[index] and the fifteen after it, int32, become the value's whole numbers."""
+    """start[index] and those after it, int32, become the value's whole numbers."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         builder.store(builder.fptosi(args[2], _INDEX), _address(builder, args[0], args[1], _INDEX), align=4)
@@ -178,29 +187,39 @@ def store_whole(typingctx, start, index, value):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def chosen(typingctx, bits):  # type: ignore[no-untyped-def]
-    """The choice whose lane k is bit k of a uint16."""
+    """The choice whose lane k is bit k of a number of type BITS."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         return builder.bitcast(args[0], ir.VectorType(ir.IntType(1), LANES))
 
-    return _CHOICE(types.uint16), codegen
+    return _CHOICE(_BITS), codegen
 
 
 @intrinsic
 def marked(typingctx, start, index):  # type: ignore[no-untyped-def]
-    """Which of the sixteen bytes from start[index] on are not zero, as bits of a uint16."""
+    """Which of the bytes from start[index] on are not zero, as bits of a number of type BITS."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         kind = ir.VectorType(ir.IntType(8), LANES)
         bytes_ = builder.load(_address(builder, args[0], args[1], kind), align=1)
-        return builder.bitcast(builder.icmp_unsigned("!=", bytes_, ir.Constant(kind, [0] * LANES)), ir.IntType(16))
+        return builder.bitcast(builder.icmp_unsigned("!=", bytes_, ir.Constant(kind, [0] * LANES)), ir.IntType(LANES))
 
-    return types.uint16(start, index), codegen
+    return _BITS(start, index), codegen
+
+
+@intrinsic
+def population(typingctx, bits):  # type: ignore[no-untyped-def]
+    """How many bits of such a number are set."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.zext(_call(builder, f"ctpop.i{LANES}", args[0].type, args[0]), ir.IntType(64))
+
+    return types.int64(_BITS), codegen
 
 
 @intrinsic
 def ramp(typingctx, start):  # type: ignore[no-untyped-def]
-    """0, 1 … 15, of the pointer's type."""
+    """0, 1, 2 …, of the pointer's type."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         return ir.Constant(_vector(sig.return_type.dtype), [float(k) for k in range(LANES)])
@@ -267,16 +286,16 @@ def total(typingctx, value):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def picked(typingctx, start, index, which):  # type: ignore[no-untyped-def]
-    """start[index + which], ``which`` a whole number of 0 … 31 for each lane."""
+    """start[index + which], ``which`` a whole number below 2 LANES for each lane."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         lane = builder.fptosi(args[2], _INDEX)
         kind = _vector(sig.return_type.dtype)
         near = builder.load(_address(builder, args[0], args[1], kind), align=4)
-        if sig.return_type.dtype == types.float32 and get_host_cpu_features().get("avx512f"):
+        if sig.return_type.dtype == types.float32 and get_host_cpu_features().get("avx512vl"):
             beyond = builder.add(args[1], ir.Constant(args[1].type, LANES))
             far = builder.load(_address(builder, args[0], beyond, kind), align=4)
-            return _call(builder, "x86.avx512.vpermi2var.ps.512", kind, near, lane, far)
+            return _call(builder, f"x86.avx512.vpermi2var.ps.{32 * LANES}", kind, near, lane, far)
         out = near
         for k in range(LANES):
             at = ir.Constant(ir.IntType(32), k)

@@ -17,7 +17,7 @@ from processing.correlation.kernels import template
 from processing.correlation.lanes import LANES, load, pointer, store
 from processing.correlation.settings import CorrelationSettings
 
-# Vector operations of the passes over a subset, sixteen pixels each, counted in the kernels: to pack f and its gradient
+# Vector operations of the passes over a subset, LANES pixels each, counted in the kernels: to pack f and its gradient
 # and sum the moments (by order); to interpolate in one pixel interval (place, weights of both axes, rows of taps) and
 # to add to the sums of a step (by order), to find the place.
 _ONCE = {1: 4 + 31, 2: 4 + 48}
@@ -29,7 +29,7 @@ _BYTES = 4 * 4 + 1  # of a pixel: f, its gradient, a coefficient of the current 
 
 @dataclass(frozen=True)
 class Machine:
-    """One core: clock (GHz), fused multiply-adds of sixteen numbers a second, memory read (bytes a second)."""
+    """One core: clock (GHz), fused multiply-adds of LANES numbers a second, memory read (bytes a second)."""
 
     clock: float
     operations: float
@@ -38,7 +38,7 @@ class Machine:
 
 @dataclass(frozen=True)
 class Demand:
-    """What one point asks for: pixels, vectors of sixteen, vector operations and bytes that come from memory."""
+    """What one point asks for: pixels, vectors of LANES, vector operations and bytes that come from memory."""
 
     pixels: int
     vectors: int

@@ -9,39 +9,59 @@ from __future__ import annotations
 import math
 
 import numba as nb
+import numpy as np
+
+_U = np.uint64
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def cholesky(H, n):  # type: ignore[no-untyped-def]
-    """H (n, n) to its lower factor in place; False where it is not positive definite."""
-    for i in range(n):
-        for j in range(i + 1):
+    """H (n, n) to its lower factor in place, its diagonal inverted; False where it is not positive definite."""
+    for j in range(_U(n)):
+        least, total = 1e-14 * abs(H[j, j]), H[j, j]
+        for k in range(j):
+            total -= H[j, k] * H[j, k]
+        if not total > least:
+            return False
+        inverse = 1.0 / math.sqrt(total)
+        H[j, j] = inverse
+        for i in range(j + _U(1), _U(n)):
             total = H[i, j]
             for k in range(j):
                 total -= H[i, k] * H[j, k]
-            if i == j:
-                if not total > 1e-14 * abs(H[i, i]):
-                    return False
-                H[i, i] = math.sqrt(total)
-            else:
-                H[i, j] = total / H[j, j]
+            H[i, j] = total * inverse
     return True
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def solve(L, b, n):  # type: ignore[no-untyped-def]
-    """x of L Lᵀ x = b, in place of b."""
-    for i in range(n):
+    """x of L Lᵀ x = b, in place of b; L from ``cholesky``."""
+    for i in range(_U(n)):
+        total = b[i]
         for k in range(i):
-            b[i] -= L[i, k] * b[k]
-        b[i] /= L[i, i]
+            total -= L[i, k] * b[k]
+        b[i] = total * L[i, i]
     for i in range(n - 1, -1, -1):
+        total = b[i]
         for k in range(i + 1, n):
-            b[i] -= L[k, i] * b[k]
-        b[i] /= L[i, i]
+            total -= L[k, i] * b[k]
+        b[i] = total * L[i, i]
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
+def variance(L, y, n, which):  # type: ignore[no-untyped-def]
+    """Element (which, which) of (L Lᵀ)⁻¹; y : (n,) scratch."""
+    total = 0.0
+    for i in range(_U(which), _U(n)):
+        value = 1.0 if i == _U(which) else 0.0
+        for k in range(_U(which), i):
+            value -= L[i, k] * y[k]
+        y[i] = value * L[i, i]
+        total += y[i] * y[i]
+    return total
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def _warp_matrix(p, M):  # type: ignore[no-untyped-def]
     """The warp as a matrix (6, 6) acting on (x², xy, y², x, y, 1), third powers dropped (Gao et al. 2015)."""
     u, ux, uy, uxx, uxy, uyy = p[0], 1.0 + p[1], p[2], p[3], p[4], p[5]
@@ -58,7 +78,7 @@ def _warp_matrix(p, M):  # type: ignore[no-untyped-def]
     M[5, 0], M[5, 1], M[5, 2], M[5, 3], M[5, 4], M[5, 5] = 0.0, 0.0, 0.0, 0.0, 0.0, 1.0
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def compose_inverse(p, d, A, B):  # type: ignore[no-untyped-def]
     """p ← p ∘ d⁻¹ for small d; False where d cannot be inverted. A, B : (6, 6) scratch.
 
@@ -87,7 +107,7 @@ def compose_inverse(p, d, A, B):  # type: ignore[no-untyped-def]
     return True
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def compose_inverse_affine(p, d):  # type: ignore[no-untyped-def]
     """p ← p ∘ d⁻¹ of first order, exactly; second derivatives of p stay. False where d cannot be inverted."""
     a, b, c, e = 1.0 + d[1], d[2], d[7], 1.0 + d[8]

@@ -1,4 +1,4 @@
-"""Sixteen grey levels at once are those of the spline, whatever the slopes; and the lanes' arithmetic is arithmetic."""
+"""Grey levels of a vector of pixels are those of the spline, whatever the slopes; lanes compute as arrays do."""
 
 import numba as nb
 import numpy as np
@@ -8,6 +8,7 @@ from scipy import ndimage
 from processing.correlation.interpolation import SCATTERED, WIDE, make_interpolation
 from processing.correlation.kernels import _place
 from processing.correlation.lanes import (
+    BITS,
     LANES,
     chosen,
     floor,
@@ -16,6 +17,7 @@ from processing.correlation.lanes import (
     marked,
     picked,
     pointer,
+    population,
     select,
     store,
     total,
@@ -43,7 +45,7 @@ _SAMPLERS = {degree: _make_sampler(degree) for degree in _SPLINES}
 
 
 def levels(image, degree, x, y, slopes, bends):
-    """Grey levels of sixteen pixels from (x, y) on, and the case they are."""
+    """Grey levels of the pixels of a vector from (x, y) on, and the case they are."""
     coef = coefficients(image.astype(np.float32), degree)
     p = np.zeros(12)
     p[[1, 7]], p[[3, 9]] = slopes, 2.0 * np.array(bends)
@@ -82,8 +84,8 @@ def test_levels_are_those_of_the_spline_for_any_slope(degree):
 def _arithmetic(a, b, bits, out):
     x, y, at = load(pointer(a), _U(0)), load(pointer(b), _U(0)), pointer(out)
     store(at, _U(0), 2.0 * x - y * x + 1.0)
-    store(at, _U(16), select(x >= y, floor(x), magnitude(y)))
-    store(at, _U(32), select(chosen(bits), x, 0.0))
+    store(at, _U(LANES), select(x >= y, floor(x), magnitude(y)))
+    store(at, _U(2 * LANES), select(chosen(bits), x, 0.0))
     return total(x)
 
 
@@ -96,16 +98,16 @@ def _pick(a, which, out):
 def test_lanes_compute_as_arrays_do(kind):
     rng = np.random.default_rng(0)
     a, b = rng.normal(0.0, 3.0, (2, LANES)).astype(kind)
-    out, bits = np.zeros(48, kind), np.uint16(0b1010_0000_1111_0011)
+    out, bits = np.zeros(3 * LANES, kind), BITS(0b1010_0000_1011_0011 & (2**LANES - 1))
     summed = _arithmetic(a, b, bits, out)
     exact = np.finfo(kind).eps * 200
-    np.testing.assert_allclose(out[:16], 2 * a - b * a + 1, atol=exact)
-    np.testing.assert_array_equal(out[16:32], np.where(a >= b, np.floor(a), np.abs(b)))
-    np.testing.assert_array_equal(out[32:], np.where((int(bits) >> np.arange(LANES)) & 1, a, 0))
+    np.testing.assert_allclose(out[:LANES], 2 * a - b * a + 1, atol=exact)
+    np.testing.assert_array_equal(out[LANES : 2 * LANES], np.where(a >= b, np.floor(a), np.abs(b)))
+    np.testing.assert_array_equal(out[2 * LANES :], np.where((int(bits) >> np.arange(LANES)) & 1, a, 0))
     assert abs(summed - a.sum(dtype=np.float64)) < exact
-    numbers, which = np.arange(64).astype(kind), rng.integers(0, 32, LANES).astype(kind)
+    numbers, which = np.arange(64).astype(kind), rng.integers(0, 2 * LANES, LANES).astype(kind)
     _pick(numbers, which, out)
-    np.testing.assert_array_equal(out[:16], which + 3)
+    np.testing.assert_array_equal(out[:LANES], which + 3)
 
 
 @nb.njit
@@ -114,5 +116,15 @@ def _marks(mask):
 
 
 def test_marked_bytes_become_bits():
-    mask = np.array([7, 1, 0, 255, *[0] * 12, 3, 9], np.uint8)
-    assert _marks(mask) == 0b1000_0000_0000_0101
+    mask = np.array([7, 1, 0, 255, *[0] * (LANES - 4), 3, 9], np.uint8)
+    assert _marks(mask) == 0b101 | 1 << (LANES - 1)
+
+
+@nb.njit
+def _count(bits):
+    return population(bits)
+
+
+def test_bits_are_counted():
+    for bits in range(256):
+        assert _count(BITS(bits)) == bits.bit_count()
