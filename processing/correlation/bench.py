@@ -12,6 +12,8 @@ import platform
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +59,8 @@ def bench_correlation(
     start values 0.3 px off, those of the refine stage, the seconds prepare, start, refine and whole (in memory), the
     mean iterations, the share matched, cycles per pixel and iteration of the kernel, its share of what the core's
     arithmetic allows, and for the rig's pair the peer's points/s; ``stereo``, the pair 201_1 → 202_1 (None without);
-    ``double``, the largest difference from double precision, px; and peak_memory_mb of the process. InputError if the
+    ``double``, the largest difference from double precision, px; and peak_memory_mb of a process that only correlates
+    the pair, images in memory. InputError if the
     images are missing.
     """
     reference, current, mask = _rig_pair(data) if data is not None else synthetic_pair()
@@ -75,7 +78,7 @@ def bench_correlation(
                 run["peer_seconds"] = _PEER_WHOLE.get((radius, order))
             say(_told(run))
             runs.append(run)
-    peak = _peak_memory()
+    peak = _peak_memory(reference, current, mask, xy, CorrelationSettings(20, step, 1, interpolation=interpolation))
     stereo = _stereo(data, reference, mask, xy, step, interpolation) if data is not None else None
     if stereo is not None:
         say(
@@ -274,14 +277,27 @@ def _identity(run: dict[str, Any]) -> tuple[int, int, int]:
     return run["radius"], run["order"], run["threads"]
 
 
-def _peak_memory() -> float | None:
-    """Largest resident set of this process so far, MB; None where the system does not tell."""
+def _peak_memory(
+    reference: Image, current: Image, mask: NDArray[np.bool_], xy: NDArray[np.float64], settings: CorrelationSettings
+) -> float | None:
+    """Largest resident set, MB, of a process of its own that correlates the pair; None where the system tells none."""
     if sys.platform == "win32":
         return None
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as child:
+        return child.submit(_peak_of_pair, reference, current, mask, xy, settings).result()
+
+
+def _peak_of_pair(
+    reference: Image, current: Image, mask: NDArray[np.bool_], xy: NDArray[np.float64], settings: CorrelationSettings
+) -> float:
+    correlate(prepare_reference(reference, mask, settings), prepare_current(current, None, settings), xy, settings)
+    status = Path("/proc/self/status")
+    if status.is_file():  # a child's rusage on Linux would begin with its parent's size
+        peak = next(line for line in status.read_text(encoding="ascii").splitlines() if line.startswith("VmHWM"))
+        return float(peak.split()[1]) / 2**10
     import resource
 
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def _target() -> str:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 
 import numba
 import numpy as np
@@ -16,7 +17,7 @@ from processing.correlation import kernels
 from processing.correlation.features import feature_starts
 from processing.correlation.hypotheses import search_hypotheses
 from processing.correlation.prepared import Current, Reference, prepare_current, prepare_reference
-from processing.correlation.propagation import Field, Progress, refine
+from processing.correlation.propagation import Field, Progress
 from processing.correlation.seeds import flow_starts, search_starts, spread
 from processing.correlation.settings import CorrelationSettings
 from processing.correlation.status import Status
@@ -110,16 +111,14 @@ def correlate(
     return _result(points, seconds)
 
 
+@cache
 def load_kernels() -> None:
-    """Compile or load the kernels, so that no timing contains it."""
-    tiny = np.zeros((16, 16))
-    refine(
-        prepare_reference(tiny, None, _TINY), prepare_current(tiny, None, _TINY),
-        np.full((1, 2), 4.0), np.zeros((1, kernels.N_PARAMETERS)), _TINY,
-    )  # fmt: skip
-
-
-_TINY = CorrelationSettings(radius=2)
+    """Compile or load all that a correlation runs, once a process, so that no timing contains it."""
+    image = np.random.default_rng(0).normal(128.0, 30.0, (64, 64))
+    settings = CorrelationSettings(radius=6, step=6)
+    xy = np.stack(np.meshgrid(np.arange(16.0, 48.0, 6.0), np.arange(16.0, 48.0, 6.0)), axis=-1).reshape(-1, 2)
+    reference, current = prepare_reference(image, None, settings), prepare_current(image, None, settings)
+    _match_automatically(Field(reference, current, xy, settings), {"prepare": 0.0, "start": 0.0, "refine": 0.0})
 
 
 def _match_automatically(points: Field, seconds: dict[str, float]) -> None:

@@ -67,16 +67,15 @@ def _expected(xy, parameters, source, target, at):  # type: ignore[no-untyped-de
     return p[at] + p[at + 1] * dx + p[at + 2] * dy + curved
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, parallel=True)
 def _jumps(xy, parameters, good, near):  # type: ignore[no-untyped-def]
     """Distance (n,) px of each good point from the median of what its good neighbours expect; NaN without any."""
     n = len(xy)
     out = np.full(n, np.nan)
-    expected = np.empty((2, near.shape[1]))
-    for k in range(n):
+    for k in nb.prange(n):
         if not good[k]:
             continue
-        m = 0
+        expected, m = np.empty((2, near.shape[1])), 0
         for slot in range(near.shape[1]):
             source = near[k, slot]
             if source >= 0 and good[source]:
