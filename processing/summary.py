@@ -178,7 +178,7 @@ def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
         rows.append({"figure": "a strain averages over (virtual strain gauge)", "value": value})
     for part, figures_of in (("noise", "image noise"), ("calibration", "calibration")):
         known = figures["uncertainty"][part]
-        if known["displacement_mm"] is not None:
+        if None not in known.values():
             value = f"{known['position_mm']:.4f} mm, {known['displacement_mm']:.5f} mm, {known['stretch']:.1e}"
             rows.append({"figure": f"standard deviations by the {figures_of}: place, displacement, λ2", "value": value})
     for step in figures["steps"][1:]:
