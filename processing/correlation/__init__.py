@@ -13,7 +13,7 @@ them. The room knows images, masks and points only: no camera, no calibration, n
 ``command``      the same for two files
 """
 
-from processing.correlation.correlate import Correlation, correlate
+from processing.correlation.correlate import Correlation, correlate, in_order, refine_alone
 from processing.correlation.grid import grid
 from processing.correlation.hypotheses import search_hypotheses
 from processing.correlation.prepared import Current, Reference, prepare_current, prepare_reference
@@ -28,7 +28,9 @@ __all__ = [
     "Status",
     "correlate",
     "grid",
+    "in_order",
     "prepare_current",
     "prepare_reference",
+    "refine_alone",
     "search_hypotheses",
 ]

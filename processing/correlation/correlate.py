@@ -89,13 +89,7 @@ def correlate(
     threads : cores to use, all by default; the result does not depend on it. progress(done, total) is called after
     every wave. Call it from one thread at a time: it is parallel inside.
     """
-    xy = np.ascontiguousarray(xy, dtype=np.float64)
-    if current.degree != settings.degree:
-        raise InputError(f"the current image was prepared for degree {current.degree}, not {settings.interpolation}")
-    if {reference.precision, current.precision} != {settings.precision} or reference.degree != settings.degree:
-        raise InputError("the images were prepared for another tolerance or interpolation; prepare them again")
-    if xy.ndim != 2 or xy.shape[1] != 2 or not len(xy):
-        raise InputError("there is no point to correlate; check the mask and the step")
+    xy = _checked(reference, current, xy, settings)
     with on_threads(threads):
         load_kernels()
         began = time.perf_counter()
@@ -109,6 +103,36 @@ def correlate(
     seconds["prepare"] += points.filtering
     seconds["refine"] -= points.filtering
     return _result(points, seconds)
+
+
+def refine_alone(
+    reference: Reference, current: Current, xy: Array, settings: CorrelationSettings, start: Array
+) -> Correlation:
+    """Match points of the reference image each from its own start value alone: no neighbour leads to it or judges it.
+
+    xy, start : as for :func:`correlate`. current is filtered as it is: where a subset leaves its box, a point is lost.
+    """
+    xy = _checked(reference, current, xy, settings)
+    load_kernels()
+    points = Field(reference, current, xy, settings, region=current, bare=np.zeros(len(xy), bool), alone=True)
+    given = np.flatnonzero(np.isfinite(start).all(axis=1))
+    began = time.perf_counter()
+    if len(given):
+        points.attempt(given, _parameters(start, len(xy))[given])
+    seconds = {"prepare": points.filtering, "start": 0.0, "refine": time.perf_counter() - began - points.filtering}
+    return _result(points, seconds)
+
+
+def _checked(reference: Reference, current: Current, xy: Array, settings: CorrelationSettings) -> Array:
+    """The points (n, 2) as the kernels take them. InputError where they or the images do not fit the settings."""
+    xy = np.ascontiguousarray(xy, dtype=np.float64)
+    if current.degree != settings.degree:
+        raise InputError(f"the current image was prepared for degree {current.degree}, not {settings.interpolation}")
+    if {reference.precision, current.precision} != {settings.precision} or reference.degree != settings.degree:
+        raise InputError("the images were prepared for another tolerance or interpolation; prepare them again")
+    if xy.ndim != 2 or xy.shape[1] != 2 or not len(xy):
+        raise InputError("there is no point to correlate; check the mask and the step")
+    return xy
 
 
 @cache
@@ -211,6 +235,11 @@ def _parameters(start: Array, n: int) -> Array:
     out = np.zeros((n, kernels.N_PARAMETERS))
     out[:, _COLUMNS[: start.shape[1]]] = start
     return out
+
+
+def in_order(parameters: Array) -> Array:
+    """Parameters (n, 12) of the kernels in the order in which start values are given. (n, 12)."""
+    return np.asarray(parameters[:, _COLUMNS])
 
 
 def _result(points: Field, seconds: dict[str, float]) -> Correlation:

@@ -38,6 +38,7 @@ class Field:
     parameters (n, 12) as in ``kernels``; tried : (n, 8) bool, neighbours a start value was taken from.
     region : the part of the current image in use, chosen by the first start values, grown when a point lies beyond.
     filtering : seconds spent on filtering it. bare : (n,) bool, points without texture; None to look for them.
+    alone : points are refined from start values of their own; none has neighbours.
     """
 
     reference: Reference
@@ -48,6 +49,7 @@ class Field:
     region: Current | None = None
     filtering: float = 0.0
     bare: NDArray[np.bool_] | None = None
+    alone: bool = False
     near: NDArray[np.int64] = field(init=False)
     parameters: Array = field(init=False)
     status: NDArray[np.int64] = field(init=False)
@@ -58,7 +60,7 @@ class Field:
 
     def __post_init__(self) -> None:
         n = len(self.xy)
-        self.near = neighbours(self.xy, self.settings.step)
+        self.near = np.full((n, COUNT), -1) if self.alone else neighbours(self.xy, self.settings.step)
         self.parameters = np.full((n, kernels.N_PARAMETERS), np.nan)
         self.status = np.full(n, Status.NOT_REACHED, np.int64)
         self.zncc = np.full(n, np.nan)

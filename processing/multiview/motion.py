@@ -106,18 +106,28 @@ def measure_motion(
 
         x0 = camera.project(shape.xyz[vertex])
         found = track(reference, of_step, steps, x0, masks.get(camera.id), correlation, options, share)
-        with np.errstate(invalid="ignore"):
-            uncertain = (found.status == 0) & (found.sigma > sigma_max).any(axis=2)
-        status = np.where(uncertain, Lost.UNCERTAIN, found.status).astype(np.int8)
-        texture = shape.textures[k].part(vertex)
-        variance = camera_noise(float(shape.grey_noise[k]), found.c_ls[1:], texture.contrast)
-        noise, sigma = _parted(found, texture, variance)
-        cell = _CELL * correlation.step
-        weight = np.stack([smooth_sigma(x0, np.maximum(one, _LEAST_SIGMA), cell) for one in sigma])
-        used = np.zeros(status.shape, bool)
-        tracks.append(CameraTrack(k, vertex, found.px, sigma, noise, weight, variance, found.c_ls, status, used))
+        tracks.append(camera_track(k, x0, vertex, shape, found, correlation.step, sigma_max))
     progress(1.0, "")
-    return _triangulated(cameras, shape, tuple(tracks), steps, placed)
+    return motion_from(cameras, shape, tracks, steps, placed)
+
+
+def camera_track(
+    camera: int, x0: Array, vertex: Ints, shape: ReferenceShape, found: Track, step: int, sigma_max: float
+) -> CameraTrack:
+    """One camera's track with what its pixels are uncertain by.
+
+    camera : its index. x0 : (k, 2) px of the points ``vertex`` (k,) at the reference. found : at all F steps, the
+    reference first. step : px, of the correlation.
+    """
+    with np.errstate(invalid="ignore"):
+        uncertain = (found.status == 0) & (found.sigma > sigma_max).any(axis=2)
+    status = np.where(uncertain, Lost.UNCERTAIN, found.status).astype(np.int8)
+    texture = shape.textures[camera].part(vertex)
+    variance = camera_noise(float(shape.grey_noise[camera]), found.c_ls[1:], texture.contrast)
+    noise, sigma = _parted(found, texture, variance)
+    weight = np.stack([smooth_sigma(x0, np.maximum(one, _LEAST_SIGMA), _CELL * step) for one in sigma])
+    used = np.zeros(status.shape, bool)
+    return CameraTrack(camera, vertex, found.px, sigma, noise, weight, variance, found.c_ls, status, used)
 
 
 def _parted(found: Track, texture: Texture, variance: float) -> tuple[Array, Array]:
@@ -130,13 +140,14 @@ def _parted(found: Track, texture: Texture, variance: float) -> tuple[Array, Arr
     return noise, total
 
 
-def _triangulated(
+def motion_from(
     cameras: Sequence[Camera],
     shape: ReferenceShape,
-    tracks: tuple[CameraTrack, ...],
+    tracks: Sequence[CameraTrack],
     steps: int,
     placed: Placed | None = None,
 ) -> Motion:
+    """The points placed at every step from the tracks of the cameras; placed : see :func:`measure_motion`."""
     n, count = len(shape.xyz), len(cameras)
     motion = Motion(
         xyz=np.full((steps, n, 3), np.nan),
@@ -145,7 +156,7 @@ def _triangulated(
         degrees=np.zeros((steps, n), np.int64),
         c_ls=np.full((steps, n), np.nan),
         status=np.zeros((steps, n), np.int8),
-        tracks=tracks,
+        tracks=tuple(tracks),
         drift=np.full((steps, count), np.nan),
     )
     motion.xyz[0], motion.chi2[0], motion.degrees[0], motion.c_ls[0] = shape.xyz, shape.chi2, shape.degrees, shape.c_ls

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processing.correlation.quadratic import Neighbourhoods
+from processing.correlation.quadratic import LowerQuartiles, Neighbourhoods
 
 GRADIENT = np.array([[0.3, -0.2], [0.05, 0.4]])
 CURVATURE = np.array([[4e-3, -1e-3, 2e-3], [-3e-3, 5e-4, 1e-3]])
@@ -70,3 +70,23 @@ def test_points_on_one_line_claim_no_certainty_across_it():
 def test_too_few_neighbours_give_nothing():
     xy = scattered(8)
     assert np.isnan(Neighbourhoods(xy, 300.0).fit(quadratic(xy)).value).all()
+
+
+def test_the_lower_quartile_about_a_point_is_that_of_the_known_points_within_reach():
+    xy, centres = scattered(300), scattered(60, seed=4)
+    values = np.random.default_rng(1).normal(size=300)
+    values[::5] = np.nan
+    found = LowerQuartiles(centres, xy, 40.0)(values)
+    for centre, quartile in zip(centres, found, strict=True):
+        about = np.sort(values[(np.hypot(*(xy - centre).T) <= 40.0) & np.isfinite(values)])
+        assert len(about) > 2
+        assert quartile == about[len(about) // 4]
+    assert np.isnan(LowerQuartiles(centres + 1e4, xy, 25.0)(values)).all()
+
+
+def test_a_fit_carried_to_other_places_is_the_field_there():
+    xy = scattered()
+    fit = Neighbourhoods(xy, 40.0).fit(quadratic(xy))
+    inner = np.flatnonzero(((xy > 30) & (xy < 170)).all(axis=1))
+    away = np.random.default_rng(2).uniform(-12, 12, (len(inner), 2))
+    np.testing.assert_allclose(fit.carried(inner, away), quadratic(xy[inner] + away), atol=1e-5)

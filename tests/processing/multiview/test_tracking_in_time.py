@@ -5,7 +5,7 @@ import pytest
 
 from processing.correlation import CorrelationSettings, Status
 from processing.errors import InputError
-from processing.multiview.tracking import Track, Tracking, track
+from processing.multiview.tracking import Track, Tracking, TrackState, at_reference, track, track_block
 
 SIZE = 260
 SETTINGS = CorrelationSettings(radius=12, step=10)
@@ -137,8 +137,9 @@ def test_where_the_surface_has_changed_the_last_image_takes_the_references_place
     assert not result.updated[1].any()
     assert result.updated[3].mean() > 0.5
     scatter = [np.sqrt(np.nanmean(errors(result, k, forward(ways[k], x0)) ** 2)) for k in (1, 2, 3)]
-    # Each image adds a change of its own: errors add up like the steps of a random walk, or less.
-    assert (np.array(scatter) < 1.25 * scatter[0] * np.sqrt([1, 2, 3])).all()
+    # Each image adds a change of its own: errors add up like the steps of a random walk, or less. Subsets overlap: the
+    # hundred points are some ten independent ones, so a ratio of scatters is known to about a fifth.
+    assert (np.array(scatter) < 1.4 * scatter[0] * np.sqrt([1, 2, 3])).all()
     came = result.updated[3] & result.updated[2]
     assert (result.sigma[3, came] > result.sigma[2, came]).all()  # variances add up
     assert (result.c_ls[3, came] >= result.c_ls[2, came]).all()
@@ -190,3 +191,20 @@ def test_options_that_contradict_are_refused():
         Tracking(order=2)
     with pytest.raises(InputError, match="window"):
         Tracking(window=0.0)
+
+
+def test_blocks_of_steps_continue_as_one_series():
+    ways = [rest, *(back_of(SIZE / 2, 1.2 * k, -0.8 * k, 2e-5 * k) for k in (1, 2, 3))]
+    images, x0 = series(ways), points()
+    images[2][100:150, 90:160] = 128.0 + 0.5 * (pattern(*pixels(), seed=9)[100:150, 90:160] - 128.0)
+    whole = follow_all(images, x0)
+
+    def block(steps, state=None):
+        return track_block(images[0], lambda k: images[k], steps, x0, None, SETTINGS, state=state)
+
+    first, state = block(range(1, 3))
+    kept = TrackState(**{name: values.copy() for name, values in state.arrays().items()})  # as if from a file
+    second, _ = block(range(3, 4), kept)
+    joined = Track.joined([at_reference(x0, images[0].shape), first, second])
+    for name, values in whole.arrays().items():
+        np.testing.assert_array_equal(joined.arrays()[name], values, err_msg=name)
