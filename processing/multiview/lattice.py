@@ -106,12 +106,15 @@ class Pieces:
         return np.stack([self.radius * np.cos(theta), self.radius * np.sin(theta), z + 0 * self.radius], axis=-1)
 
 
-def fit_pieces(lattice: Lattice, radius: Array, reach: float, degree: int = 3, least: float = 0.2) -> Pieces:
+def fit_pieces(
+    lattice: Lattice, radius: Array, reach: float, degree: int = 3, *, least: float = 0.2, density: float = 1.0
+) -> Pieces:
     """Fit a piece about every node that has enough known nodes within reach.
 
     radius : (columns, rows) mm, NaN where unknown. reach : mm; weights fall from the node to zero there.
     degree : 2 or 3; where the known nodes lie to one side, at a rim, always 2. least : share of known nodes, by
-    weight, below which a node is left without a piece.
+    weight, below which a node is left without a piece. density : the share of the nodes that were to be measured; of
+    these are the other shares.
     """
     known = np.isfinite(radius)
     level = float(np.mean(radius[known])) if known.any() else 0.0
@@ -121,7 +124,7 @@ def fit_pieces(lattice: Lattice, radius: Array, reach: float, degree: int = 3, l
     for power in {(p + r, q + s) for p, q in POWERS for r, s in POWERS}:
         sums[power] = _correlate(known.astype(float), weight * a ** power[0] * b ** power[1])
     right = np.stack([_correlate(values, weight * a**p * b**q) for p, q in POWERS], axis=-1)
-    total = float(weight.sum())
+    total = density * float(weight.sum())
     support = sums[0, 0] / total
     off_centre = np.hypot(sums[1, 0], sums[0, 1]) / np.maximum(sums[0, 0], 1e-9)
     coefficients = np.full((*lattice.shape, len(POWERS)), np.nan)
@@ -143,21 +146,37 @@ def fit_pieces(lattice: Lattice, radius: Array, reach: float, degree: int = 3, l
 
 
 def robust_pieces(
-    lattice: Lattice, radius: Array, reach: float, degree: int = 3, *, least: float = 0.2, floor: float = 0.1
+    lattice: Lattice,
+    radius: Array,
+    reach: float,
+    degree: int = 3,
+    *,
+    least: float = 0.2,
+    floor: float = 0.1,
+    density: float = 1.0,
 ) -> tuple[Pieces, Mask]:
     """The same without the nodes that lie off; returns the pieces and which known nodes (columns, rows) were kept.
 
     A node lies off by more than ``floor`` mm and 6 standard deviations of the usual residual. The most distant ones
     go first, so that they do not drag good ones along.
     """
-    kept = np.isfinite(radius)
+    known = np.isfinite(radius)
+    kept = known
+
+    def fitted() -> Pieces:
+        return fit_pieces(lattice, np.where(kept, radius, np.nan), reach, degree, least=least, density=density)
+
+    pieces = fitted()
     for factor in (20.0, 10.0, 6.0, 6.0):
-        pieces = fit_pieces(lattice, np.where(kept, radius, np.nan), reach, degree, least)
         residual = np.abs(radius - pieces.radius)
         usual = 1.4826 * float(np.nanmedian(residual[kept])) if np.isfinite(residual[kept]).any() else 0.0
         with np.errstate(invalid="ignore"):
-            kept = np.isfinite(radius) & (residual <= max(factor * usual, floor))
-    return fit_pieces(lattice, np.where(kept, radius, np.nan), reach, degree, least), kept
+            now = known & (residual <= max(factor * usual, floor))
+        if (now == kept).all():
+            continue
+        kept = now
+        pieces = fitted()
+    return pieces, kept
 
 
 def evaluate(coefficients: Array, a: Array, b: Array) -> tuple[Array, Array, Array]:

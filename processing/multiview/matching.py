@@ -16,10 +16,11 @@ from processing.correlation import (
     Current,
     Reference,
     Status,
-    correlate,
     prepare_current,
     prepare_reference,
+    refine_alone,
 )
+from processing.correlation.prepared import Box
 from processing.errors import ComputationError
 from processing.multiview.lattice import Pieces
 from processing.multiview.warps import surface_stencil, warps_to
@@ -32,9 +33,11 @@ Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 
-_KEPT = 6  # filtered images held at a time: those of a camera's neighbours
+_KEPT = 16  # filtered images held at a time, the surface's part of each
+_MARGIN = 48.0  # px that are filtered about the subsets
 _FELT = 0.6  # share of the subset's radius over which the warp's differences are taken
-_HOP = 16  # px about the expected places that are filtered too
+_LOOSE = 5e-3  # px, tolerance of the second order
+_PATIENCE = 25  # iterations; steep and small subsets take some ten
 
 
 @dataclass
@@ -49,6 +52,7 @@ class Ring:
     masks: Mapping[str, Mask]
     settings: CorrelationSettings
     _filtered: OrderedDict[int, Current] = field(default_factory=OrderedDict)
+    _boxes: dict[int, Box] = field(default_factory=dict)
     _textures: dict[int, TextureMap] = field(default_factory=dict)
     _noise: dict[int, float] = field(default_factory=dict)
 
@@ -60,13 +64,25 @@ class Ring:
         return found
 
     def current(self, k: int) -> Current:
-        """The image of camera k, filtered to be searched in; the latest few are kept."""
+        """The image of camera k, filtered where the surface is looked for; the latest are kept."""
         if k not in self._filtered:
             while len(self._filtered) >= _KEPT:
                 self._filtered.popitem(last=False)
-            self._filtered[k] = prepare_current(self.grey(k), settings=self.settings)
+            self._filtered[k] = prepare_current(self.grey(k), self._boxes.get(k), self.settings)
         self._filtered.move_to_end(k)
         return self._filtered[k]
+
+    def look_at(self, k: int, px: Array) -> None:
+        """Camera k is searched about px (n, 2) from now on."""
+        box = self._boxes.get(k)
+        edge = np.array(self.cameras[k].size)
+        low, high = (np.clip(values, 0, edge) for values in (px.min(axis=0), px.max(axis=0)))
+        if box is not None and (low >= box[:2]).all() and (high <= box[2:]).all():
+            return
+        margin = 2.0 * self.settings.radius + _MARGIN
+        low, high = np.maximum(np.floor(low - margin), 0), np.minimum(np.ceil(high + margin), edge)
+        self._boxes[k] = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+        self._filtered.pop(k, None)
 
     def texture(self, k: int, px: Array) -> Texture:
         """What the image of camera k shows about px (n, 2)."""
@@ -129,7 +145,7 @@ def match_nodes(
     order : of the subsets. curved : second derivatives from the shape, as start of the second order and held by the
     first; otherwise zero.
     """
-    settings = replace(ring.settings, order=order)
+    settings = _of_order(ring.settings, order)
     count, n = len(ring.cameras), len(reference)
     px, sigma = np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan)
     parts = _Parts(np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan), np.zeros(n))
@@ -157,7 +173,7 @@ def match_nodes(
         chosen = np.flatnonzero(partners[b, own] & np.isfinite(start).all(axis=1))
         if not len(chosen):
             continue
-        found = _correlate(filtered, ring.current(b), at[chosen], settings, start[chosen])
+        found = refine_alone(filtered, ring.current(b), at[chosen], settings, start[chosen])
         made += len(chosen)
         seconds += found.seconds["refine"]
         who = own[chosen]
@@ -195,19 +211,8 @@ class _Parts:
         self.matches[nodes] += 1
 
 
-def _correlate(
-    reference: Reference, current: Current, xy: Array, settings: CorrelationSettings, start: Array
-) -> Correlation:
-    """Matches with every point's own curvature held: one reached from a neighbour is refined again with its own."""
-    found = correlate(reference, current, xy, settings, start=start)
-    if settings.order != 1:
-        return found
-    held = found.curvature.reshape(-1, 6)
-    foreign = np.flatnonzero(found.good & (np.abs(held - start[:, 6:]) > 1e-12).any(axis=1))
-    if not len(foreign):
-        return found
-    again = np.concatenate([found.uv[foreign], found.gradient[foreign].reshape(-1, 4), start[foreign, 6:]], axis=1)
-    once_more = correlate(reference, current, xy[foreign], settings, start=again)
-    for name in ("uv", "gradient", "curvature", "zncc", "c_ls", "iterations", "status", "sigma"):
-        getattr(found, name)[foreign] = getattr(once_more, name)
-    return found
+def _of_order(settings: CorrelationSettings, order: int) -> CorrelationSettings:
+    """Settings of the subsets of an order. Second order serves the shape's pieces, which need not the last digit."""
+    iterations = min(settings.max_iterations, _PATIENCE)
+    tolerance = settings.tolerance if order == 1 or settings.order == 2 else max(settings.tolerance, _LOOSE)
+    return replace(settings, order=order, max_iterations=iterations, tolerance=tolerance)

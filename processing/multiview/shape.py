@@ -1,15 +1,16 @@
 """The reference shape: all cameras' reference images to one set of points and the triangles between them.
 
-Sweeps of the camera pairs find the surface roughly. Then the nodes of a lattice over it are matched from the camera
-that faces them to two others, with second-order subsets; the radius so measured is fitted with smooth pieces, which
-give every subset the curvature of its warp and reach a little beyond the rim. With that curvature held, all cameras
-that see a node are matched once more to first order, which is free of the bias of flat subsets and of the noise of
-curved ones.
+Sweeps of the camera pairs find the surface roughly. Then the nodes of a lattice over it, or where it is close every
+second either way, are matched from the camera that faces them to two others, with second-order subsets; the radius so
+measured is fitted with smooth pieces, which give every subset its start value and the curvature of its warp and reach a
+little beyond the rim. With that curvature held, all cameras that see a node are matched to first order, which is free
+of the bias of flat subsets and of the noise of curved ones.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -37,6 +38,8 @@ Mask = NDArray[np.bool_]
 log = logging.getLogger(__name__)
 
 _RETRIES = 3
+_EVERY = 2  # of this many columns, and rows, one has the nodes that the pieces are first fitted to
+_IN_PIECE = 20  # nodes that a piece is fitted to at the least
 _PIECE = 6  # places of a sweep that hang together: an obstacle may part the surface in several
 _FEW = 1e-3  # share of the points below which another retry is not worth it
 _REFERENCES = 3  # cameras a node is matched from, one after the other, before it is lost
@@ -117,9 +120,11 @@ def reference_shape(
     samples = _samples(ring, pairs, search, lambda share: progress(0.3 * share, "searching for the surface"))
     lattice = lay_lattice(samples, settings.spacing or _spacing(cameras, samples, correlation))
     surface = _Surface(ring, settings, rough_surface(lattice, samples))
+    surface.thin = math.pi * settings.piece**2 >= _IN_PIECE * _EVERY**2 * math.prod(lattice.spacing)
     surface.measure(2, 2, lambda share: progress(0.3 + 0.2 * share, "first pass"))
     surface.fit()
-    surface.retry(1, 2, lambda share: progress(0.5 + 0.05 * share, "first pass, lost points"))
+    surface.retry(2, 2, lambda share: progress(0.5 + 0.05 * share, "first pass, lost points"))
+    surface.thin = False
     surface.measure(correlation.order, len(cameras), lambda share: progress(0.55 + 0.4 * share, "all views"))
     surface.fit()
     surface.retry(correlation.order, len(cameras), lambda share: progress(0.95 + 0.05 * share, "lost points"))
@@ -169,6 +174,7 @@ class _Surface:
         self.status = np.full((columns, rows), Status.NOT_REACHED, np.int8)
         self.tries, self.tried = np.zeros((columns, rows), np.int64), np.zeros((columns, rows), bool)
         self.made, self.seconds = 0, 0.0
+        self.thin = False  # some of the nodes alone
 
     @property
     def known(self) -> Mask:
@@ -186,7 +192,11 @@ class _Surface:
         for k, camera in enumerate(ring.cameras):
             if ring.image(camera.id) is None:
                 sight[k] = False
+            elif sight[k].any():
+                ring.look_at(k, camera.project(self.pieces.xyz[sight[k]]))
         wanted = (sight.sum(axis=0) >= 2) & np.isfinite(self.pieces.radius)
+        if self.thin:
+            wanted &= _some(self.pieces.lattice.shape)
         if only_lost:
             wanted &= ~self.known
             self.tries[wanted & self.tried] += 1
@@ -223,7 +233,8 @@ class _Surface:
         """Smooth pieces through the measured nodes; a node off its piece is lost."""
         lattice = self.pieces.lattice
         radius = self._node_radius()
-        self.pieces, kept = robust_pieces(lattice, radius, self.settings.piece)
+        density = 1.0 / _EVERY**2 if self.thin else 1.0
+        self.pieces, kept = robust_pieces(lattice, radius, self.settings.piece, density=density)
         off = self.known & ~kept
         self.status[off] = Lost.SURFACE
         self.xyz[off] = np.nan
@@ -289,6 +300,13 @@ class _Surface:
             made=self.made,
             seconds=self.seconds,
         )
+
+
+def _some(shape: tuple[int, int]) -> Mask:
+    """The nodes (columns, rows) that are measured first where the lattice is close."""
+    out = np.zeros(shape, bool)
+    out[::_EVERY, ::_EVERY] = True
+    return out
 
 
 def _indices(which: Mask) -> tuple[Ints, Ints]:
