@@ -200,6 +200,7 @@ class _Surface:
         if only_lost:
             wanted &= ~self.known
             self.tries[wanted & self.tried] += 1
+            wanted &= self.tries < _REFERENCES
         self.tried |= wanted
         nodes = _indices(wanted)
         if not len(nodes[0]):
@@ -225,12 +226,11 @@ class _Surface:
         for k in range(_RETRIES):
             progress(k / _RETRIES)
             gained = self.measure(order, views, lambda _: None, only_lost=True)
-            self.fit()
-            if gained < _FEW * self.known.sum():
+            if self.fit() == 0 and gained < _FEW * self.known.sum():
                 return
 
-    def fit(self) -> None:
-        """Smooth pieces through the measured nodes; a node off its piece is lost."""
+    def fit(self) -> int:
+        """Smooth pieces through the measured nodes; a node off its piece is lost. How many were."""
         lattice = self.pieces.lattice
         radius = self._node_radius()
         density = 1.0 / _EVERY**2 if self.thin else 1.0
@@ -238,6 +238,7 @@ class _Surface:
         off = self.known & ~kept
         self.status[off] = Lost.SURFACE
         self.xyz[off] = np.nan
+        return int(off.sum())
 
     def _node_radius(self) -> Array:
         """Radius at the nodes from points measured near them: what is left to the piece is the same at both."""

@@ -48,8 +48,8 @@ def lattice_faces(xyz: Array) -> tuple[Ints, tuple[Ints, Ints]]:
     first; NaN where not measured.
 
     Returns faces (M, 3), counter-clockwise seen from outside, and the columns and rows (n,) of the points they use.
-    A cell with four corners is divided along its shorter diagonal, one with three is one triangle; holes of up to
-    5 mm² are filled; where the sheet would hang together in a point alone, its smaller part goes.
+    A cell with four corners is divided along its shorter diagonal, one with three is one triangle; holes of one lost
+    node, or up to 5 mm², are filled; where the sheet would hang together in a point alone, its smaller part goes.
     """
     nodes = _Nodes(xyz)
     faces = _cells(nodes)
@@ -94,14 +94,15 @@ def _fillings(nodes: _Nodes, faces: Ints) -> Ints:
         return np.empty((0, 3), np.int64)
     small = small[np.argsort(hole[small], kind="stable")]
     first = np.flatnonzero(np.diff(hole[small], prepend=-1))
-    for loop_edges in np.split(edges[small], first[1:]):
+    for number, loop_edges in zip(hole[small[first]], np.split(edges[small], first[1:]), strict=True):
         loop = _loop(loop_edges)
         if loop is None:
             continue
         triangles = _clipped(loop, nodes.unrolled(loop))
         corners = nodes.xyz.reshape(-1, 3)[triangles]
         area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        if len(triangles) == len(loop) - 2 and area.sum() <= _LARGEST_HOLE:
+        closed = len(triangles) == len(loop) - 2
+        if closed and (area.sum() <= _LARGEST_HOLE or size[number] == 1):
             found += [(int(a), int(b), int(c)) for a, b, c in triangles]
     return np.array(found, np.int64).reshape(-1, 3)
 
