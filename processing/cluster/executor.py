@@ -109,6 +109,7 @@ class _Job:
         self._idle_s = idle_s
         self._running: dict[Any, Task] = {}
         self._unfit: set[str] = set()
+        self._submitted = 0
         self._seen_at = time.monotonic()  # when there was a worker
 
     def run(self) -> None:
@@ -144,10 +145,12 @@ class _Job:
             task,
             self._sign,
             max(1, sum(threads.values()) // len(self._agenda)),
-            key=f"{task.name} {uuid.uuid4().hex}",  # of this run: another's may be cancelled with it
+            key=f"{task.function.__name__}-{uuid.uuid4().hex}",  # of this run: another's may be cancelled with it
             retries=_RETRIES,
             workers=list(threads) if self._unfit else None,
+            priority=-self._submitted,  # in order: neighbours read the same images
         )
+        self._submitted += 1
         self._running[future] = task
 
     def _take(self, task: Task, future: Any, threads: dict[str, int]) -> None:
@@ -189,6 +192,8 @@ def _distributed() -> Any:
             f"a cluster needs a library that is not installed ({error}); "
             "install the extra: pip install 'ringdic[cluster]'"
         ) from error
+    for name in ("distributed", "distributed.client"):  # a lost scheduler is told in a sentence, not in tracebacks
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     return distributed
 
 
