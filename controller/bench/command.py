@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from processing.errors import InputError
+from processing.settings import load_settings
 
 Ratios = Callable[[dict[str, Any], dict[str, Any]], list[dict[str, Any]]]
 
@@ -22,22 +23,27 @@ def bench(
     interpolation: Annotated[str, typer.Option(help="cubic or quintic.")] = "cubic",
     job: Annotated[bool, typer.Option("--job", help="A whole job, from the specimen's images to the results.")] = False,
     capture: Annotated[bool, typer.Option("--capture", help="Captures of 12 and 30 nodes over loopback.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="Steps every 5 s until each is on the page.")] = False,
     all_: Annotated[bool, typer.Option("--all", help="Every part; alone, the correlation is measured.")] = False,
     steps: Annotated[str, typer.Option(help="Of the job: images of the specimen a camera, such as 2,5,10,20.")] = "5",
-    scale: Annotated[float, typer.Option(min=0.1, max=1.0, help="Of the job's images; 1 is 2464 x 3280 px.")] = 1.0,
-    cameras: Annotated[int, typer.Option(min=6, max=30, help="Of the job.")] = 12,
-    set_: Annotated[list[str] | None, typer.Option("--set", metavar="GROUP.NAME=VALUE", help="Of the job.")] = None,
-    out: Annotated[Path, typer.Option(help="Folder of the job's images, kept for the next time.")] = _FOLDER,
+    scale: Annotated[
+        float, typer.Option(min=0.1, max=1.0, help="Of the images of job and live; 1 is 2464 x 3280 px.")
+    ] = 1.0,
+    cameras: Annotated[int, typer.Option(min=6, max=30, help="Of job and live.")] = 12,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="GROUP.NAME=VALUE", help="Of job and live.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder of images that are rendered, kept for the next time.")] = _FOLDER,
     compare: Annotated[Path | None, typer.Option(help="An earlier result (JSON) to compare with.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
 ) -> None:
-    """How fast the correlation is on this machine, and, where asked for, a whole job and captures."""
+    """How fast the correlation is on this machine, and, where asked for, a whole job, captures and live steps."""
     from processing.correlation.bench import bench_correlation, read_result
 
     before = read_result(compare) if compare is not None else None
     counts = _counts(steps)
     result: dict[str, Any] = {}
-    if all_ or not (job or capture):
+    if all_ or not (job or capture or live):
         result["correlation"] = bench_correlation(data, repeats=repeats, interpolation=interpolation, say=_say)
     if all_ or job:
         from controller.bench.job import bench_job
@@ -47,6 +53,11 @@ def bench(
         from controller.bench.capture import bench_capture
 
         result["capture"] = bench_capture(say=_say)
+    if all_ or live:
+        from controller.bench.live import bench_live
+
+        chosen = load_settings(None, set_ or []).to_toml()
+        result["live"] = bench_live(out / "live", cameras=cameras, scale=scale, settings=chosen, say=_say)
     if before is not None:
         result["ratios"] = compared(result, before)
         for row in result["ratios"]:
@@ -62,12 +73,14 @@ def compared(new: dict[str, Any], old: dict[str, Any]) -> list[dict[str, Any]]:
     """
     from controller.bench.capture import capture_ratios
     from controller.bench.job import job_ratios
+    from controller.bench.live import live_ratios
     from processing.correlation.bench import ratios
 
     known: dict[str, Ratios] = {
         "correlation": lambda one, other: ratios({"correlation": one}, {"correlation": other}),
         "job": job_ratios,
         "capture": capture_ratios,
+        "live": live_ratios,
     }
     shared = {part: ratios_of for part, ratios_of in known.items() if part in new and part in old}
     if not shared:

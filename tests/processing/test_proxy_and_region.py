@@ -130,3 +130,17 @@ def test_contrast_is_the_rms_gradient() -> None:
     expected = 50 * np.sin(2 * np.pi / 20) / np.sqrt(2)
     assert contrast(image, np.array([[100.0, 50.0]]), 20)[0] == pytest.approx(expected, rel=0.02)
     assert contrast(np.full((50, 50), 7, np.uint8), np.array([[25.0, 25.0]]), 5)[0] == 0.0
+
+
+def test_a_long_row_of_radii_is_as_good_as_each_followed_exactly() -> None:
+    _, px = surface(57.0)
+    radii = sweep_radii(57.0, 20.0, 0.28)
+    together = stereo_hypotheses(FIRST, SECOND, px, radii, 20.0)
+    single = [stereo_hypotheses(FIRST, SECOND, px, radii[k : k + 1], 20.0) for k in range(len(radii))]
+    warps = np.concatenate([each.warps for each in single], axis=1)
+    both = np.isfinite(warps).all(axis=2) & np.isfinite(together.warps).all(axis=2)
+    assert both.mean() > 0.95 * np.isfinite(warps).all(axis=2).mean()
+    off = np.abs(together.warps - warps)[both]
+    assert off[:, :2].max() < 0.2  # px; the peak of the correlation is some px wide
+    assert np.quantile(off[:, 2:], 0.99) < 0.01
+    assert off[:, 2:].max() < 0.1  # where the surface turns away
