@@ -18,9 +18,9 @@ from node_agent.virtual_rig.rig import paper_rig
 from node_agent.virtual_rig.scenes import Limb, Specimen
 from node_agent.virtual_rig.sensor import expose
 from processing.camera import Camera, Intrinsics
-from processing.correlation import CorrelationSettings
+from processing.correlation import CorrelationSettings, prepare_reference
 from processing.deformation import deformation
-from processing.matching import match_pair
+from processing.matching import PairMatches, Stereo, collect, match_reference, match_step
 from processing.multiview.certainty import Certainty, certainty
 from processing.multiview.motion import Motion, measure_motion
 from processing.multiview.shape import ReferenceShape, reference_shape
@@ -145,7 +145,7 @@ def measure(cameras: list[Camera], image: Callable[[str, int], np.ndarray]) -> R
 
 def by_pair(cameras: list[Camera], image: Callable[[str, int], np.ndarray], search: Search) -> Results:
     pair = (cameras[0], cameras[1])
-    surface = pair_surface(pair, match_pair(pair, image, STEPS, None, search, CORRELATION), CORRELATION.step, 0.05)
+    surface = pair_surface(pair, matched(Stereo(pair, search, CORRELATION), image), CORRELATION.step, 0.05)
     calibrated = {camera.id: SimpleNamespace(camera=camera) for camera in cameras}
     results, _ = pairs_surface(
         SimpleNamespace(rig=SimpleNamespace(name="patch")),
@@ -155,6 +155,14 @@ def by_pair(cameras: list[Camera], image: Callable[[str, int], np.ndarray], sear
         Settings(),
     )
     return with_uncertainty(results, None)
+
+
+def matched(stereo: Stereo, image: Callable[[str, int], np.ndarray]) -> PairMatches:
+    first, second = stereo.ids
+    grid, found = match_reference(stereo, image(first, 0), image(second, 0), None)
+    reference = prepare_reference(image(first, 0), grid.region, CORRELATION)
+    later = [match_step(stereo, reference, grid.xy, image(first, k), image(second, k)) for k in range(1, STEPS)]
+    return collect(stereo.ids, grid, [found, *later])
 
 
 @pytest.fixture(scope="module")
