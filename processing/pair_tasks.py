@@ -19,9 +19,9 @@ from processing.correlation import CorrelationSettings, Reference, prepare_refer
 from processing.images import read_mask
 from processing.matching import Grid, PairMatches, StepMatches, Stereo, collect, match_reference, match_step
 from processing.session import Capture, Session
-from processing.step_images import step_image
+from processing.step_images import Digests, step_image
 from processing.sweep import Search
-from processing.tasks import Arrays, Task, code_stamp, digest, file_digest, kept, read_output, work_folder
+from processing.tasks import Arrays, Task, code_stamp, digest, kept, read_output, work_folder
 
 Array = NDArray[np.float64]
 _MATCH_COST = 0.6  # of a step's second correlation, in correlations of the reference
@@ -57,7 +57,7 @@ def pair_jobs(
     correlation: CorrelationSettings,
 ) -> list[PairJob]:
     """The tasks of all pairs over these steps, the reference first."""
-    plan = _Plan(session, work_folder(session.path), {}, {})
+    plan = _Plan(session, work_folder(session.path), Digests(session))
     return [plan.job(Stereo((cameras[first], cameras[second]), search, correlation), steps) for first, second in pairs]
 
 
@@ -69,12 +69,11 @@ def in_order(jobs: Sequence[PairJob]) -> list[Task]:
 
 @dataclass(frozen=True)
 class _Plan:
-    """What the keys of a session's tasks are made of. images, masks : digests of the files so far."""
+    """What the tasks of a session's pairs are made of."""
 
     session: Session
     folder: Path
-    images: dict[Path, str]
-    masks: dict[Path, str]
+    digests: Digests
 
     def job(self, stereo: Stereo, steps: Sequence[Capture]) -> PairJob:
         first, second = stereo.ids
@@ -82,7 +81,7 @@ class _Plan:
         reference = Task(
             digest(
                 code_stamp(), "pair reference", stereo.cameras, stereo.search, stereo.settings,
-                [self._image(steps[0], id_) for id_ in stereo.ids], None if mask is None else self._mask(mask),
+                [self.digests.image(steps[0], id_) for id_ in stereo.ids], self.digests.mask(first),
             ),
             f"pair {first}-{second}",
             reference_task,
@@ -96,7 +95,7 @@ class _Plan:
         first, second = stereo.ids
         seen = tuple(steps[k].images.get(id_) for id_ in stereo.ids)
         return Task(
-            digest("pair step", reference.key, [self._image(steps[k], id_) for id_ in stereo.ids]),
+            digest("pair step", reference.key, [self.digests.image(steps[k], id_) for id_ in stereo.ids]),
             f"pair {first}-{second}, {steps[k].id}",
             step_task,
             (stereo, steps[0].images[first], seen),
@@ -104,19 +103,6 @@ class _Plan:
             (reference.key,),
             cost=1.0 + _MATCH_COST,
         )
-
-    def _image(self, capture: Capture, id_: str) -> str | None:
-        path = capture.images.get(id_)
-        if path is None:
-            return None
-        if path not in self.images:
-            self.images[path] = file_digest(path, capture.record.get("cameras", {}).get(id_))
-        return self.images[path]
-
-    def _mask(self, path: Path) -> str:
-        if path not in self.masks:
-            self.masks[path] = file_digest(path)
-        return self.masks[path]
 
 
 def reference_task(stereo: Stereo, images: tuple[Path, Path], mask: Path | None, *, inputs: tuple[Path, ...]) -> Arrays:

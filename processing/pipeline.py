@@ -20,21 +20,19 @@ from numpy.typing import NDArray
 
 from processing import noise_floor, summary
 from processing.calibration.quality import ReconstructionError
-from processing.camera import Camera
 from processing.correlation import CorrelationSettings
 from processing.correlation.correlate import load_kernels
 from processing.errors import ComputationError, InputError
-from processing.images import read_mask
 from processing.pair_tasks import PairJob, in_order, pair_jobs
 from processing.pairs_surface import Merging, merge_surfaces, pairs_surface
 from processing.progress import Report, Stages, silent
 from processing.results import Results, write_results
 from processing.ring import Ring, calibrate_ring, control_points
-from processing.ring_surface import RingSurface, ring_surface
+from processing.ring_surface import RingSurface, surface_of_tracks
+from processing.ring_tasks import ring_job
 from processing.session import Capture, Session, new_run, read_session
 from processing.settings import CalibrationGroup, Settings
 from processing.stated_uncertainty import camera_covariance, with_uncertainty
-from processing.step_images import step_image
 from processing.surface import PairSurface, pair_surface
 from processing.sweep import Search
 from processing.tasks import Executor, LocalExecutor, Ran, Task, tidy, work_folder
@@ -103,7 +101,7 @@ def measure(
     ring = calibrate(session, settings.calibration, lambda done, who: stages.at("calibrate", done, who))
     errors, warnings = _usable_pairs(session, ring, steps)
     if settings.surface.method == "global":
-        whole = _whole_ring(session, ring, tuple(errors), steps, settings, stages)
+        whole = _whole_ring(session, ring, tuple(errors), steps, settings, stages, executor)
         results, drift, agreement, more_warnings = whole.results, whole.drift, whole.agreement, whole.warnings
     else:
         surfaces, more_warnings = _surfaces(session, ring, tuple(errors), steps, settings, stages, executor)
@@ -227,21 +225,16 @@ def _whole_ring(
     steps: tuple[Capture, ...],
     settings: Settings,
     stages: Stages,
+    executor: Executor | None,
 ) -> RingSurface:
-    """One surface from all cameras that have a reference image."""
+    """One surface from all cameras that have a reference image, as tasks."""
     cameras = [each.camera for each in ring.cameras.values() if each.camera.id in steps[0].images]
-    masks = {camera.id: mask for camera in cameras if (mask := _mask(session, camera)) is not None}
-    return ring_surface(
-        session.rig.name,
-        cameras,
-        pairs,
-        _image_source(ring, steps),
-        masks,
-        tuple(step.id for step in steps),
-        _search(session, settings),
-        settings,
-        lambda share, what, rate: stages.at("correlate", share, what, rate),
-    )
+    job = ring_job(session, cameras, pairs, steps, _search(session, settings), settings)
+    _run(job.tasks, executor, stages, session)
+    shape, tracks = job.found()
+    stages.at("triangulate", 0.0)
+    names = [step.id for step in steps]
+    return surface_of_tracks(session.rig.name, cameras, pairs, names, shape, tracks, settings)
 
 
 def _search(session: Session, settings: Settings) -> Search:
@@ -250,19 +243,6 @@ def _search(session: Session, settings: Settings) -> Search:
         reach=settings.surface.reach_mm,
         incidence=settings.surface.incidence_deg,
     )
-
-
-def _image_source(ring: Ring, steps: tuple[Capture, ...]) -> Callable[[str, int], NDArray | None]:
-    def image(camera_id: str, step: int) -> NDArray | None:
-        path = steps[step].images.get(camera_id)
-        return None if path is None else step_image(path, ring.cameras[camera_id].camera)
-
-    return image
-
-
-def _mask(session: Session, camera: Camera) -> NDArray[np.bool_] | None:
-    path = session.mask(camera.id)
-    return None if path is None else read_mask(path, (camera.size[1], camera.size[0]))
 
 
 def _keep(session: Session, measured: Measured, settings: Settings, stages: Stages, began: float) -> Path:

@@ -17,9 +17,9 @@ from processing.camera import Camera
 from processing.correlation import CorrelationSettings, Status
 from processing.errors import ComputationError
 from processing.multiview.certainty import certainty
-from processing.multiview.motion import CameraTrack, Motion, measure_motion
+from processing.multiview.motion import CameraTrack, Motion, camera_track, measure_motion, motion_from
 from processing.multiview.shape import ReferenceShape, ShapeSettings, reference_shape
-from processing.multiview.tracking import Tracking
+from processing.multiview.tracking import Track, Tracking
 from processing.multiview.views import incidence
 from processing.outliers import Lost
 from processing.results import Matches, Results
@@ -69,26 +69,19 @@ def ring_surface(
     masks : drawn regions by camera id. steps : names, the reference first. tell(share, what, rate) is told progress.
     Raises ComputationError where no two cameras share a textured surface.
     """
-    ids = [camera.id for camera in cameras]
     correlation = CorrelationSettings(**settings.correlation.keywords)
     shape_share = _SHAPE_SHARE if len(steps) > 1 else 1.0
     shape = reference_shape(
         cameras,
         lambda id_: image(id_, 0),
         masks,
-        [(ids.index(first), ids.index(second)) for first, second in pairs],
+        numbers_of(cameras, pairs),
         search,
         correlation,
-        ShapeSettings(
-            incidence=settings.surface.incidence_deg,
-            spacing=settings.surface.spacing_mm,
-            curvature=settings.surface.curvature,
-            sigma_max=settings.surface.sigma_max_px,
-        ),
+        shape_settings(settings),
         lambda share, what: tell(shape_share * share, what, ""),
     )
-    if not len(shape.faces):
-        raise ComputationError("too few neighbouring points of the surface were measured to make a triangle")
+    _require_faces(shape)
     rate = f"{shape.made / shape.seconds:,.0f} points/s" if shape.seconds else ""
     steadied = SteadiedCameras(cameras)
     motion = measure_motion(
@@ -98,11 +91,73 @@ def ring_surface(
         len(steps),
         masks,
         correlation,
-        _tracking(settings),
+        tracking_of(settings),
         settings.surface.sigma_max_px,
         lambda share, what: tell(shape_share + (1 - shape_share) * share, what, rate),
         steadied if settings.calibration.refine_poses else None,
     )
+    return _found(rig, cameras, pairs, steps, shape, motion, steadied, settings)
+
+
+def surface_of_tracks(
+    rig: str,
+    cameras: Sequence[Camera],
+    pairs: Sequence[tuple[str, str]],
+    steps: Sequence[str],
+    shape: ReferenceShape,
+    tracks: Mapping[int, Track],
+    settings: Settings,
+) -> RingSurface:
+    """The same from the reference shape and each camera's track through all steps, by its index."""
+    _require_faces(shape)
+    step, sigma_max = settings.correlation.step_px, settings.surface.sigma_max_px
+    followed = []
+    for k, found in tracks.items():
+        vertex, x0 = reference_places(cameras[k], shape, k)
+        followed.append(camera_track(k, x0, vertex, shape, found, step, sigma_max))
+    steadied = SteadiedCameras(cameras)
+    placed = steadied if settings.calibration.refine_poses else None
+    motion = motion_from(cameras, shape, followed, len(steps), placed)
+    return _found(rig, cameras, pairs, steps, shape, motion, steadied, settings)
+
+
+def reference_places(camera: Camera, shape: ReferenceShape, k: int) -> tuple[Ints, Array]:
+    """The points (n,) that camera k saw at the reference, and the pixels (n, 2) from which it follows them."""
+    vertex = np.flatnonzero(np.isfinite(shape.px[k, :, 0]))
+    return vertex, camera.project(shape.xyz[vertex])
+
+
+def numbers_of(cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
+    """The pairs by the cameras' indices."""
+    ids = [camera.id for camera in cameras]
+    return [(ids.index(first), ids.index(second)) for first, second in pairs]
+
+
+def shape_settings(settings: Settings) -> ShapeSettings:
+    """How the reference shape is measured."""
+    return ShapeSettings(
+        incidence=settings.surface.incidence_deg,
+        spacing=settings.surface.spacing_mm,
+        curvature=settings.surface.curvature,
+        sigma_max=settings.surface.sigma_max_px,
+    )
+
+
+def _require_faces(shape: ReferenceShape) -> None:
+    if not len(shape.faces):
+        raise ComputationError("too few neighbouring points of the surface were measured to make a triangle")
+
+
+def _found(
+    rig: str,
+    cameras: Sequence[Camera],
+    pairs: Sequence[tuple[str, str]],
+    steps: Sequence[str],
+    shape: ReferenceShape,
+    motion: Motion,
+    steadied: SteadiedCameras,
+    settings: Settings,
+) -> RingSurface:
     residuals = reprojection_residuals(cameras, shape.xyz, shape.px)
     return RingSurface(
         _results(rig, cameras, pairs, steps, shape, motion, settings),
@@ -153,7 +208,8 @@ def _idle(cameras: Sequence[Camera], shape: ReferenceShape) -> list[str]:
     ]
 
 
-def _tracking(settings: Settings) -> Tracking:
+def tracking_of(settings: Settings) -> Tracking:
+    """How points are followed."""
     order = settings.correlation.order
     return Tracking(
         two_pass=settings.tracking.two_pass and order == 1,

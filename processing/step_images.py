@@ -1,7 +1,8 @@
-"""The images of a session's steps as the tasks read them, kept in memory between tasks."""
+"""The images of a session's steps as the tasks read them, kept in memory between tasks, and what tells them apart."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ from numpy.typing import NDArray
 
 from processing.camera import Camera
 from processing.errors import InputError
-from processing.tasks import kept
+from processing.session import Capture, Session
+from processing.tasks import file_digest, kept
 
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 
@@ -24,3 +26,29 @@ def step_image(path: Path, camera: Camera) -> Image:
             f"{width} x {height} px; capture board, target and specimen at one size"
         )
     return grey
+
+
+@dataclass(frozen=True)
+class Digests:
+    """Digests of a session's images and masks, each taken once."""
+
+    session: Session
+    known: dict[Path, str] = field(default_factory=dict)
+
+    def image(self, capture: Capture, id_: str) -> str | None:
+        """Of a camera's image in a capture; None where it has none."""
+        path = capture.images.get(id_)
+        if path is None:
+            return None
+        if path not in self.known:
+            self.known[path] = file_digest(path, capture.record.get("cameras", {}).get(id_))
+        return self.known[path]
+
+    def mask(self, id_: str) -> str | None:
+        """Of the region drawn for a camera; None where there is none."""
+        path = self.session.mask(id_)
+        if path is None:
+            return None
+        if path not in self.known:
+            self.known[path] = file_digest(path)
+        return self.known[path]

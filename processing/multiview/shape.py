@@ -12,7 +12,8 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from processing.correlation import CorrelationSettings, Status
 from processing.errors import ComputationError
 from processing.multiview.agreement import triangulate_agreeing
 from processing.multiview.depth import lay_lattice, px_per_mm, rough_surface
-from processing.multiview.lattice import Pieces, evaluate, robust_pieces
+from processing.multiview.lattice import Lattice, Pieces, evaluate, robust_pieces
 from processing.multiview.matching import Image, NodeMatches, Ring, match_nodes
 from processing.multiview.tube import lattice_faces
 from processing.multiview.views import seen
@@ -97,6 +98,33 @@ class ReferenceShape:
     status: NDArray[np.int8]
     made: int
     seconds: float
+
+    def arrays(self) -> dict[str, NDArray]:
+        """All of it by name."""
+        lattice = self.pieces.lattice
+        parts = {
+            "lattice": np.array([lattice.radius, lattice.columns, *lattice.z]),
+            "coefficients": self.pieces.coefficients,
+            "support": self.pieces.support,
+        }
+        for k, texture in enumerate(self.textures):
+            parts |= {f"texture_{k}_{each.name}": getattr(texture, each.name) for each in fields(texture)}
+        plain = {each.name for each in fields(self)} - {"pieces", "textures"}
+        return {**parts, **{name: np.asarray(getattr(self, name)) for name in plain}}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray]) -> ReferenceShape:
+        """From what ``arrays`` gave."""
+        radius, columns, *z = arrays["lattice"].tolist()
+        lattice = Lattice(radius, int(columns), np.array(z))
+        textures = tuple(
+            Texture(**{each.name: arrays[f"texture_{k}_{each.name}"] for each in fields(Texture)})
+            for k in range(len(arrays["px"]))
+        )
+        plain: dict[str, Any] = {each.name: arrays[each.name] for each in fields(cls) if each.name in arrays}
+        pieces = Pieces(lattice, arrays["coefficients"], arrays["support"])
+        plain |= {"made": int(arrays["made"]), "seconds": float(arrays["seconds"])}
+        return cls(**plain, pieces=pieces, textures=textures)
 
 
 def reference_shape(

@@ -20,7 +20,9 @@ from processing.sweep import Search
 from processing.tasks import LocalExecutor, Ran, Task, Told, kept
 
 SCALE, STEPS = 0.2, 3  # of the session
-SETTINGS = load_settings(None, ["correlation.radius_px=12", "correlation.step_px=8"])
+SMALL = ["correlation.radius_px=12", "correlation.step_px=8"]
+SETTINGS = load_settings(None, SMALL)
+GLOBAL = load_settings(None, [*SMALL, "surface.method=global"])
 
 
 class Counted:
@@ -64,22 +66,24 @@ def same(first: Results, second: Results) -> None:
         np.testing.assert_array_equal(one.sigma, other.sigma)
 
 
-def test_an_interrupted_job_makes_only_what_is_missing_and_the_same_results(session: Path) -> None:
+@pytest.mark.parametrize("settings", [SETTINGS, GLOBAL], ids=["pairs", "global"])
+def test_an_interrupted_job_makes_only_what_is_missing_and_the_same_results(session: Path, settings: Settings) -> None:
+    # Pairs: the reference and each step. All cameras together: the shape, and each camera's block of steps.
     interrupted, resumed, whole = Counted(stop_after=2), Counted(), Counted()
     with pytest.raises(KeyboardInterrupt):
-        process_session(session, SETTINGS, executor=interrupted)
+        process_session(session, settings, executor=interrupted)
     assert not (session / "results").exists()
     kept.clear()
-    second = read_results(process_session(session, SETTINGS, executor=resumed) / "results.h5")
+    second = read_results(process_session(session, settings, executor=resumed) / "results.h5")
     assert len(interrupted.made) == 2
     assert sorted([*interrupted.made, *resumed.made]) == sorted({*interrupted.made, *resumed.made})
-    assert len(interrupted.made) + len(resumed.made) == STEPS
+    assert len(interrupted.made) + len(resumed.made) == 3
     shutil.rmtree(session / "work")
-    fresh = read_results(process_session(session, SETTINGS, executor=whole) / "results.h5")
-    assert len(whole.made) == STEPS
+    fresh = read_results(process_session(session, settings, executor=whole) / "results.h5")
+    assert len(whole.made) == 3
     same(second, fresh)
     again = Counted()
-    same(read_results(process_session(session, SETTINGS, executor=again) / "results.h5"), fresh)
+    same(read_results(process_session(session, settings, executor=again) / "results.h5"), fresh)
     assert again.made == []
 
 
@@ -128,7 +132,7 @@ def test_another_image_or_mask_is_matched_anew(session: Path, change: Callable[[
     ],
 )
 def test_settings_that_matches_rest_on_make_them_anew(session: Path, setting: str, anew: bool) -> None:
-    told = ["correlation.radius_px=12", "correlation.step_px=8", setting]
+    told = [*SMALL, setting]
     assert (set(keys(session)).isdisjoint(keys(session, load_settings(None, told)))) is anew
 
 

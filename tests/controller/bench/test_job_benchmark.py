@@ -15,7 +15,7 @@ SMALL = ["correlation.radius_px=12", "correlation.step_px=10"]
 
 
 def measured(folder: Path, capsys: pytest.CaptureFixture[str], **changed: Any) -> dict[str, Any]:
-    arguments = {"job": True, "steps": "2,7", "scale": 0.1, "cameras": 6, "set_": SMALL, "out": folder, "as_json": True}
+    arguments = {"job": True, "steps": "2,7", "scale": 0.2, "cameras": 6, "set_": SMALL, "out": folder, "as_json": True}
     bench(data=None, repeats=1, interpolation="cubic", capture=False, live=False, all_=False, compare=None,
           **{**arguments, **changed})  # fmt: skip
     result: dict[str, Any] = json.loads(capsys.readouterr().out)
