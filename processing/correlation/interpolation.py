@@ -4,8 +4,8 @@ While the fractional position t = t0 + s l + q l² of the lanes l = 0, 1 … sta
 the coefficients at base + l + tap: every tap is one contiguous load for all lanes, no gather. Where t crosses one
 whole number there is one tap more, and the weights move along by a select. The two axes are independent: four cases.
 
-With larger gradients the pixels lie within 2 LANES coefficients of a row: every tap is picked from two loads by a
-permutation, in as many rows as the lanes reach. Beyond that (a stretch of 1.4 or more) each pixel finds its own taps.
+With larger gradients the pixels lie within 32 coefficients of a row: every tap is picked from two loads by a
+permutation, in as many rows as the lanes reach. Beyond that (a stretch of 1.7 or more) each pixel finds its own taps.
 
 Weights are those of the B-spline times 6 (cubic) or 120 (quintic), so g is 36 or 14400 times the grey level: the
 criterion does not mind a contrast.
@@ -19,12 +19,12 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from processing.correlation.lanes import LANES, floor, load, magnitude, number, picked, put, ramp, select, store
+from processing.correlation.lanes import LANES, WINDOW, floor, load, magnitude, number, picked, put, ramp, select, store
 
 FAST = {"contract", "reassoc", "arcp", "nsz"}
 # What the pixels of a vector cross: nothing, a whole number along an axis or both; WIDE + n: n of them in y, any in x.
 ACROSS_X, ACROSS_Y, WIDE, SCATTERED = 1, 2, 4, -1
-REACH_OF_WINDOW = 2 * LANES - 1 - 5  # px that a window of 2 LANES coefficients leaves the pixels for six taps
+REACH_OF_WINDOW = WINDOW - 1 - 5  # px that the window leaves the pixels for six taps
 _F, _U = np.float32, np.uint64
 
 
@@ -157,7 +157,7 @@ _q66, _q76, _q67, _q77 = _make_sum(_row6, 6), _make_sum(_row7, 6), _make_sum(_ro
 
 @nb.njit(fastmath=FAST, nogil=True, cache=True)
 def _wide(c, p, stride, tx, sx, qx, ty, sy, qy, rows, quintic, g):  # type: ignore[no-untyped-def]
-    """Any gradients that 2 LANES coefficients of a row cover: taps picked by permutation, ``rows`` more rows of them.
+    """Any gradients that 32 coefficients of a row cover: taps picked by permutation, ``rows`` more rows of them.
 
     g : where to put the grey levels.
     """

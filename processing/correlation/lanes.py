@@ -27,6 +27,7 @@ def _wide_registers() -> bool:
 
 
 LANES = 16 if _wide_registers() else 8
+WINDOW = 32  # numbers that ``picked`` picks from
 BITS = np.uint16 if LANES == 16 else np.uint8  # one bit a lane
 _BITS = types.uint16 if LANES == 16 else types.uint8
 intrinsic: Any = extending.intrinsic  # its own type hides the arguments of what it makes
@@ -286,17 +287,21 @@ def total(typingctx, value):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def picked(typingctx, start, index, which):  # type: ignore[no-untyped-def]
-    """start[index + which], ``which`` a whole number below 2 LANES for each lane."""
+    """start[index + which], ``which`` a whole number below WINDOW for each lane."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         lane = builder.fptosi(args[2], _INDEX)
-        kind = _vector(sig.return_type.dtype)
-        near = builder.load(_address(builder, args[0], args[1], kind), align=4)
-        if sig.return_type.dtype == types.float32 and get_host_cpu_features().get("avx512vl"):
-            beyond = builder.add(args[1], ir.Constant(args[1].type, LANES))
-            far = builder.load(_address(builder, args[0], beyond, kind), align=4)
-            return _call(builder, f"x86.avx512.vpermi2var.ps.{32 * LANES}", kind, near, lane, far)
-        out = near
+        if sig.return_type.dtype == types.float32 and get_host_cpu_features().get("avx512f"):
+            half, whole = ir.VectorType(ir.FloatType(), WINDOW // 2), ir.Constant(args[1].type, WINDOW // 2)
+            near = builder.load(_address(builder, args[0], args[1], half), align=4)
+            far = builder.load(_address(builder, args[0], builder.add(args[1], whole), half), align=4)
+            all_lanes = [min(k, LANES - 1) for k in range(WINDOW // 2)]
+            lane = builder.shuffle_vector(
+                lane, lane, ir.Constant(ir.VectorType(ir.IntType(32), WINDOW // 2), all_lanes)
+            )
+            out = _call(builder, "x86.avx512.vpermi2var.ps.512", half, near, lane, far)
+            return builder.shuffle_vector(out, out, ir.Constant(_INDEX, list(range(LANES))))
+        out = ir.Constant(_vector(sig.return_type.dtype), ir.Undefined)
         for k in range(LANES):
             at = ir.Constant(ir.IntType(32), k)
             index = builder.add(args[1], builder.zext(builder.extract_element(lane, at), args[1].type))

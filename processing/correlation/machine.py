@@ -20,7 +20,7 @@ from processing.correlation.settings import CorrelationSettings
 # Vector operations of the passes over a subset, LANES pixels each, counted in the kernels: to pack f and its gradient
 # and sum the moments (by order); to interpolate in one pixel interval (place, weights of both axes, rows of taps) and
 # to add to the sums of a step (by order), to find the place.
-_ONCE = {1: 4 + 31, 2: 4 + 48}
+_ONCE = {1: 4 + 21, 2: 4 + 31}
 _INTERPOLATE = {3: 4 + 2 * 9 + 4 * 4 + 4, 5: 4 + 2 * 26 + 6 * 6 + 6}
 _STEP = {1: 10, 2: 14}
 _PLACE = 3

@@ -8,7 +8,7 @@ from processing.correlation import CorrelationSettings
 from processing.correlation.command import correlate_files
 from processing.errors import ComputationError, InputError
 
-SETTINGS = CorrelationSettings(radius=8, step=8)
+SETTINGS = CorrelationSettings(radius=8, step=8, tolerance=1e-5)
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import importlib.util
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -91,6 +92,29 @@ def test_single_precision_gives_the_matches_of_double(speckle, gradient, interpo
     assert difference[:, [1, 2, 7, 8]].max() < 1e-6
     np.testing.assert_allclose(zncc[good], truth[1][good], atol=1e-6)
     np.testing.assert_allclose(sigma[good], truth[3][good], rtol=1e-3)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_default_tolerance_leaves_a_tenth_of_itself(speckle, order, figures):
+    """The end of an iteration is foretold from its last two steps; start values are 0.3 px off."""
+    settings = CorrelationSettings(14, 9, order)
+    reference, current = np.rint(speckle), warped(speckle, GENTLE, (3.3, -1.7))
+    mask = np.zeros((SIZE, SIZE), bool)
+    mask[40:160, 40:160] = True
+    xy = grid(mask, settings.step)[0]
+    start = np.zeros((len(xy), 12))
+    start[:, [0, 6]] = (xy - (SIZE - 1) / 2) @ GENTLE.T + [3.5, -1.5]
+    found = []
+    for tolerance in (settings.tolerance, 1e-6):
+        finer = replace(settings, tolerance=tolerance)
+        prepared = prepare_reference(reference, None, finer), prepare_current(current, None, finer)
+        status, _, _, _, parameters = refine(*prepared, xy, start, finer)
+        assert (status == 0).all()
+        found.append(parameters[:, [0, 6]])
+    left = found[0] - found[1]
+    figures(f"left by the default tolerance, order {order}: 1e-3 px", f"{1e3 * left.std():.3f}", "0.1")
+    assert np.abs(left).max() < settings.tolerance
+    assert np.sqrt(np.mean(left**2)) < 0.1 * settings.tolerance
 
 
 @pytest.mark.parametrize("interpolation", ["cubic", "quintic"])
