@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from controller.demo.client import Client
-from controller.demo.rig import Running, check_alive, running_controller, running_nodes
+from controller.demo.rig import check_alive, running_controller, running_nodes
 from node_agent.virtual_rig.rig import paper_rig
 from processing.errors import ComputationError, InputError
 from processing.rig import parse_rig
@@ -62,8 +62,7 @@ def capture_ratios(new: dict[str, Any], old: dict[str, Any]) -> list[dict[str, A
             "nodes": run["nodes"],
             "archived": earlier["archived_s"]["median"] / run["archived_s"]["median"],
             "acknowledged": earlier["acknowledged_s"]["median"] / run["acknowledged_s"]["median"],
-            "controller_cpu": _ratio(earlier["controller_cpu_s"], run["controller_cpu_s"]),
-            "controller_memory": _ratio(earlier["controller_memory_mb"], run["controller_memory_mb"]),
+            **_ratios_told(earlier, run),
         }
         for run in new["runs"]
         if (earlier := before.get((run["nodes"], run["bytes"]))) is not None
@@ -88,11 +87,14 @@ def _measure(folder: Path, count: int, rounds: int, size: tuple[int, int]) -> di
         client = Client(running.address)
         client.wait_for_nodes(ids, _START, lambda: check_alive(processes, folder))
         client.post("/sessions", {"name": _SESSION})
-        worked, taken = processor_seconds(running.pid), []
+        parts = {"controller_cpu_s": [running.pid], "nodes_cpu_s": [process.pid for process in processes]}
+        before = {name: _worked(pids) for name, pids in parts.items()}
+        taken = []
         for _ in range(rounds):
             taken.append(_capture(client, folder, expected))
             check_alive(processes, folder)
-        return _figures(expected, taken, images, running, worked)
+        worked = {name: (_worked(pids) - before[name]) / rounds for name, pids in parts.items()}
+        return {**_figures(expected, taken, images), **worked, "controller_memory_mb": _peak_memory(running.pid)}
 
 
 def _prepare(path: Path, seed: int, size: tuple[int, int]) -> str:
@@ -135,11 +137,8 @@ def _freed_ns(tombstone: Path, id_: str) -> int:
     return tombstone.stat().st_mtime_ns
 
 
-def _figures(
-    expected: dict[str, str], taken: list[dict[str, float]], images: Path, running: Running, worked: float | None
-) -> dict[str, Any]:
+def _figures(expected: dict[str, str], taken: list[dict[str, float]], images: Path) -> dict[str, Any]:
     volume = sum((images / f"{id_}.pgm").stat().st_size for id_ in expected)
-    cpu = processor_seconds(running.pid)
     acknowledged = _spread(one["acknowledged"] for one in taken)
     return {
         "nodes": len(expected),
@@ -150,8 +149,6 @@ def _figures(
         "acknowledged_s": acknowledged,
         "pressed_s": _spread(one["pressed"] for one in taken),
         "mb_per_second": volume / _MB / acknowledged["median"],
-        "controller_cpu_s": None if cpu is None or worked is None else (cpu - worked) / len(taken),
-        "controller_memory_mb": _peak_memory(running.pid),
     }
 
 
@@ -162,13 +159,13 @@ def _spread(values: Iterable[float]) -> dict[str, float]:
 
 def _told(run: dict[str, Any]) -> str:
     """One line about a rig."""
-    cpu, memory = run["controller_cpu_s"], run["controller_memory_mb"]
+    cpu, nodes, memory = run["controller_cpu_s"], run["nodes_cpu_s"], run["controller_memory_mb"]
     return (
         f"{run['nodes']} nodes, {run['bytes'] / _MB:.0f} MB a capture: from the moment to archived "
         f"{run['archived_s']['median']:.2f} s (largest {run['archived_s']['largest']:.2f}), to acknowledged "
         f"{run['acknowledged_s']['median']:.2f} s (largest {run['acknowledged_s']['largest']:.2f}), "
         f"{run['mb_per_second']:.0f} MB/s; {run['verified']} checksums match"
-        + (f"; controller {cpu:.2f} CPU-s a capture" if cpu is not None else "")
+        + (f"; processor time {cpu:.2f} s of the controller, {nodes:.2f} s of the nodes" if cpu else "")
         + (f", peak memory {memory:.0f} MB" if memory is not None else "")
     )
 
@@ -186,6 +183,11 @@ def _limits(folder: Path, volume: int = 64 << 20) -> dict[str, float]:
         os.fsync(file.fileno())
     written = time.perf_counter() - began
     return {"sha256_mb_per_second": volume / _MB / hashed, "disk_mb_per_second": volume / _MB / written}
+
+
+def _worked(pids: Sequence[int]) -> float:
+    """Processor time of processes so far, s; 0 where the system does not tell."""
+    return sum(processor_seconds(pid) or 0.0 for pid in pids)
 
 
 def processor_seconds(pid: int) -> float | None:
@@ -206,5 +208,7 @@ def _peak_memory(pid: int) -> float | None:
     return None
 
 
-def _ratio(old: float | None, new: float | None) -> float | None:
-    return None if not old or not new else old / new
+def _ratios_told(old: dict[str, Any], new: dict[str, Any]) -> dict[str, float]:
+    """Ratios of what only some systems tell, where both results have it."""
+    names = {"controller_cpu": "controller_cpu_s", "nodes_cpu": "nodes_cpu_s", "memory": "controller_memory_mb"}
+    return {name: old[key] / new[key] for name, key in names.items() if old.get(key) and new.get(key)}

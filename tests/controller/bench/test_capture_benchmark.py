@@ -26,18 +26,12 @@ def test_three_nodes_deliver_what_they_played_back():
 
 
 def test_ratios_tell_how_much_better_the_new_result_is():
-    def result(seconds: float, cpu: float | None) -> dict:
+    def result(seconds: float, **told: float) -> dict:
         times = {"median": seconds, "largest": seconds}
         run = {"nodes": 12, "bytes": 100, "archived_s": times, "acknowledged_s": times}
-        return {"runs": [{**run, "controller_cpu_s": cpu, "controller_memory_mb": 200.0}]}
+        return {"runs": [{**run, "controller_memory_mb": 200.0, **told}]}
 
-    (row,) = capture_ratios(result(1.0, None), result(2.0, 3.0))
-    assert row == {
-        "nodes": 12,
-        "archived": 2.0,
-        "acknowledged": 2.0,
-        "controller_cpu": None,
-        "controller_memory": 1.0,
-    }
+    (row,) = capture_ratios(result(1.0, nodes_cpu_s=2.0), result(2.0, nodes_cpu_s=3.0, controller_cpu_s=1.0))
+    assert row == {"nodes": 12, "archived": 2.0, "acknowledged": 2.0, "nodes_cpu": 1.5, "memory": 1.0}
     with pytest.raises(InputError, match="no capture run in common"):
-        capture_ratios(result(1.0, 1.0), {"runs": []})
+        capture_ratios(result(1.0), {"runs": []})
