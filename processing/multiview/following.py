@@ -38,6 +38,7 @@ _LOOSE = 5e-3  # px, tolerance of the first of two passes
 _PATIENCE = 10  # iterations of the first of two passes
 _MARGIN = 32.0  # px about the subsets in which a current image is filtered
 _ENOUGH = 0.5  # share of the start values that must hold before the images are searched for others
+_SPARE = 0.05  # share of the knots whose neighbours tell enough without them
 _LEAST_EXCESS = 0.1  # of a second-order subset's variance, beyond that of the same subset of first order
 _OVERLAP = 1.2  # subsets share pixels: a mean of several is this much less certain than of independent ones
 _BIASED = 4.0  # Σ(b/σ)² of a bias below which it may be noise, of 2 numbers
@@ -145,7 +146,7 @@ def _at_knots(
         searched = correlate(reference, whole, xy, settings)
         return searched if searched.good.sum() > found.good.sum() else found
     lost = np.flatnonzero(~found.good)
-    if not len(lost) or not found.good.any():
+    if len(lost) <= _SPARE * len(xy) or not found.good.any():
         return found
     again = _smooth(found, points)[lost]
     if not np.isfinite(again).all(axis=1).any():

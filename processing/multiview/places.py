@@ -25,7 +25,7 @@ _APART = 0.8  # subset radii, side of the squares with a knot each
 _REACH = 3.0  # subset radii about a knot in which its neighbours tell its curvature and its bias
 _SCATTERS = 8.0  # a point this many times off its neighbours' quadratic contradicts it
 _LEAST_OFF = 0.1  # px, and never less than this
-_STRICTER = (4.0, 2.0, 1.0)  # the most distant knots go first, so that they do not drag good ones along
+_STRICTER = (4.0, 1.0)  # the most distant knots go first, so that they do not drag good ones along
 _UNLIKE = 3.0  # a mean square difference this many times the usual one is not noise, which stays below 2
 
 
