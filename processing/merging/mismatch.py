@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Protocol
 
 import numpy as np
@@ -44,15 +47,17 @@ class Mismatch:
 
 def mismatches(sheets: Sequence[Surface], reach: float, fewest: int = 20) -> tuple[Mismatch, ...]:
     """The mismatch of every two sheets that share at least ``fewest`` vertices; reach : mm, of one to the other."""
-    curved = [Curved(Mesh(sheet.vertices, sheet.faces).without_lost(), reach) for sheet in sheets]
-    found = []
-    for i, first in enumerate(curved):
-        for j in range(i + 1, len(curved)):
-            signed = np.concatenate([first.outside(curved[j]), -curved[j].outside(first)])
-            signed = signed[np.isfinite(signed)]
-            if len(signed) >= fewest:
-                found.append(_summary(i, j, signed))
-    return tuple(found)
+
+    def between(pair: tuple[int, int]) -> Mismatch | None:
+        i, j = pair
+        signed = np.concatenate([curved[i].outside(curved[j]), -curved[j].outside(curved[i])])
+        signed = signed[np.isfinite(signed)]
+        return _summary(i, j, signed) if len(signed) >= fewest else None
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        curved = list(pool.map(lambda s: Curved(Mesh(s.vertices, s.faces).without_lost(), reach), sheets))
+        found = pool.map(between, combinations(range(len(curved)), 2))
+        return tuple(one for one in found if one is not None)
 
 
 class Curved:

@@ -7,7 +7,9 @@ compete (Solav et al. 2018, overlap removal; there for two surfaces, here for an
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,12 +52,18 @@ def cover(mesh: Mesh, owner: Indices, reach: float) -> Cover:
     centroids, normals = mesh.centroids, mesh.normals
     parts = [np.flatnonzero(owner == k) for k in range(owner.max(initial=-1) + 1)]
     surfaces = [Projector(Mesh(mesh.vertices, mesh.faces[part]), reach, _SAME_SIDE) for part in parts]
-    found = []
-    for k, part in enumerate(parts):
+
+    def over(k: int) -> list[tuple[Indices, Indices, Array]]:
+        """What the other surfaces cover of surface k."""
+        part, found = parts[k], []
         for j, surface in enumerate(surfaces):
             if j != k:
                 hits = surface.hits(centroids[part], normals[part])
                 found.append((part[hits.point], parts[j][hits.face], hits.height))
+        return found
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        found = [row for rows in pool.map(over, range(len(parts))) for row in rows]
     own, other = (np.concatenate([row[i] for row in found] or [np.zeros(0)]).astype(np.int64) for i in (0, 1))
     height = np.concatenate([row[2] for row in found] or [np.zeros(0)])
     cosine = np.einsum("ni,ni->n", normals[own], normals[other])
