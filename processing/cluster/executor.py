@@ -117,8 +117,9 @@ class _Job:
         try:
             while self._agenda:
                 threads = self._workers()
+                share = max(1, sum(threads.values()) // max(1, len(self._running) + self._agenda.ready))
                 while (task := self._agenda.start()) is not None:
-                    self._submit(task, threads)
+                    self._submit(task, threads, share)
                 for future in _wait(list(self._running), _LOOK_S, "FIRST_COMPLETED"):
                     self._take(self._running.pop(future), future, threads)
         finally:
@@ -139,12 +140,12 @@ class _Job:
             )
         return threads
 
-    def _submit(self, task: Task, threads: dict[str, int]) -> None:
+    def _submit(self, task: Task, threads: dict[str, int], share: int = 1) -> None:
         future = self._client.submit(
             run_task,
             task,
             self._sign,
-            max(1, sum(threads.values()) // len(self._agenda)),
+            share,
             key=f"{task.function.__name__}-{uuid.uuid4().hex}",  # of this run: another's may be cancelled with it
             retries=_RETRIES,
             workers=list(threads) if self._unfit else None,

@@ -32,13 +32,21 @@ class Agenda:
         """How many have not ended."""
         return len(self._left)
 
+    @property
+    def ready(self) -> int:
+        """How many may start now."""
+        return sum(self._may_start(task) for task in self._waiting)
+
     def start(self) -> Task | None:
         """The first task whose needs are all met, as one that has started; None if there is none now."""
         for task in self._waiting:
-            if not self._left.intersection(task.needs):
+            if self._may_start(task):
                 self._waiting.remove(task)
                 return task
         return None
+
+    def _may_start(self, task: Task) -> bool:
+        return not self._left.intersection(task.needs)
 
     def ended(self, task: Task, ran: Ran) -> None:
         """A started task has its output."""

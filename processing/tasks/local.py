@@ -19,7 +19,8 @@ _TOGETHER = ("omp", "tbb")  # layers of numba whose kernels may be started from 
 class LocalExecutor:
     """Runs tasks in threads of this process.
 
-    workers : tasks at a time; None for one a core. Each task's kernels get an equal share of the cores.
+    workers : tasks at a time; None for one a core. A task's kernels share the cores with those it starts beside: one
+    that all others wait for has all of them.
     """
 
     def __init__(self, workers: int | None = None) -> None:
@@ -33,11 +34,11 @@ class LocalExecutor:
         cores = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
         workers = min(self._workers or (os.cpu_count() or 1), len(agenda)) if kernels_side_by_side() else 1
         running: dict[Future[Ran], Task] = {}
-        share = max(1, cores // workers)
         with _single_threaded_filters(workers > 1), ThreadPoolExecutor(workers, "task") as pool:
             while agenda:
-                while len(running) < workers and (ready := agenda.start()) is not None:
-                    running[pool.submit(_run, ready, share)] = ready
+                while len(running) < workers and (task := agenda.start()) is not None:
+                    together = min(workers, len(running) + 1 + agenda.ready)
+                    running[pool.submit(_run, task, max(1, cores // together))] = task
                 ended, _ = wait(running, return_when=FIRST_COMPLETED)
                 for future in ended:
                     agenda.ended(running.pop(future), future.result())

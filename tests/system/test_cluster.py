@@ -134,8 +134,8 @@ def source(ringdic: Callable, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "session"
 
 
-def settings():
-    return load_settings(None, SETTINGS)
+def settings(*more: str):
+    return load_settings(None, [*SETTINGS, *more])
 
 
 @pytest.fixture(scope="module")
@@ -212,6 +212,15 @@ def test_a_cluster_finds_what_one_machine_finds(session: Path, local: Results, c
     same(Path(json.loads(done.stdout)["run"]), local)
     assert re.search(rf"correlate  pair .* of {TASKS}\)", done.stderr), "the progress tells of the tasks"
     assert [path.name for path in (session / "work").iterdir() if path.suffix != ".npz"] == [], "no sign is left"
+
+
+def test_one_surface_from_all_cameras_is_the_same_on_a_cluster(session: Path, crew: str, tmp_path: Path) -> None:
+    alone = Path(shutil.copytree(session, tmp_path / "alone"))
+    whole = settings("surface.method=global")
+    counted = Counted(ClusterExecutor(crew))
+    expected = read_results(process_session(alone, whole) / "results.h5")
+    same(process_session(session, whole, executor=counted), expected)
+    assert counted.made == 1 + 3, "the shape, and the steps of three cameras"
 
 
 def test_a_worker_killed_in_the_middle_costs_only_its_tasks(

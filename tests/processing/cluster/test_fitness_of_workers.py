@@ -9,12 +9,14 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numba
+import numpy as np
 import pytest
 
-from processing.cluster import ClusterExecutor
-from processing.cluster.worker import Sign, inspect, visible
+from processing.cluster import ClusterExecutor, worker
+from processing.cluster.worker import Outcome, Sign, inspect, run_task, visible
 from processing.errors import InputError
-from processing.tasks import code_stamp
+from processing.tasks import Task, code_stamp, read_output
 
 
 @pytest.fixture
@@ -42,6 +44,40 @@ def test_a_file_that_another_machine_shows_late_is_waited_for(tmp_path: Path):
     began = time.monotonic()
     assert not visible((tmp_path / "never").is_file, tmp_path, limit=0.1)
     assert time.monotonic() - began < 10.0
+
+
+def threads_seen(*, inputs: tuple[Path, ...]) -> dict[str, np.ndarray]:
+    del inputs
+    return {"threads": np.array(numba.get_num_threads())}
+
+
+@pytest.mark.parametrize(("share", "threads"), [(8, 1), (1, 2)])
+def test_a_tasks_kernels_take_their_share_and_no_more_than_the_worker_has(
+    sign: Sign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: int, threads: int
+):
+    monkeypatch.setattr(worker, "_worker", lambda: ("tcp://here", threads))
+    monkeypatch.setattr(worker, "kernels_side_by_side", lambda: True)
+    task = Task("k", "a task", threads_seen, (), tmp_path)
+    outcome: list[Outcome] = []
+    thread = threading.Thread(
+        target=lambda: outcome.append(run_task(task, sign, share))
+    )  # numba's number is a thread's
+    thread.start()
+    thread.join(60)
+    assert outcome[0].ran is not None
+    assert read_output(task.output)["threads"] == 1
+
+
+def test_an_input_that_cannot_be_used_is_no_fault_of_the_worker(
+    sign: Sign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(worker, "_worker", lambda: ("tcp://here", 1))
+
+    def refuse(*, inputs: tuple[Path, ...]) -> dict[str, np.ndarray]:
+        raise InputError("board.png: cut off")
+
+    outcome = run_task(Task("k", "a task", refuse, (), tmp_path), sign, 1)
+    assert (outcome.wrong, outcome.unfit, outcome.ran) == ("board.png: cut off", None, None)
 
 
 def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch):

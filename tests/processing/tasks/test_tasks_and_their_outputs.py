@@ -6,12 +6,25 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
+from processing.correlation.correlate import load_kernels
 from processing.errors import ComputationError, InputError
 from processing.settings import CorrelationGroup
-from processing.tasks import Arrays, LocalExecutor, Memory, Ran, Task, digest, file_digest, read_output, tidy
+from processing.tasks import (
+    Arrays,
+    LocalExecutor,
+    Memory,
+    Ran,
+    Task,
+    digest,
+    file_digest,
+    kernels_side_by_side,
+    read_output,
+    tidy,
+)
 
 CALLS: list[str] = []
 
@@ -187,3 +200,19 @@ def test_the_folder_of_outputs_stays_within_its_size_and_keeps_the_jobs_own(tmp_
     assert len(list(tmp_path.glob("*.npz"))) <= 3
     tidy(tmp_path, [new], limit=0)
     assert [path.name for path in tmp_path.glob("*.npz")] == [new.output.name]
+
+
+def _threads(*, inputs: tuple[Path, ...]) -> dict[str, np.ndarray]:
+    del inputs
+    return {"threads": np.array(numba.get_num_threads())}
+
+
+def test_a_task_that_all_others_wait_for_has_all_cores(tmp_path: Path) -> None:
+    load_kernels()
+    first = Task("first", "first", _threads, (), tmp_path)
+    later = [Task(f"later{k}", f"later {k}", _threads, (), tmp_path, ("first",)) for k in range(4)]
+    LocalExecutor(workers=2).run([first, *later], lambda *told: None)
+    cores = numba.config.NUMBA_NUM_THREADS
+    assert read_output(first.output)["threads"] == cores
+    side_by_side = kernels_side_by_side()
+    assert read_output(later[0].output)["threads"] == (max(1, cores // 2) if side_by_side else cores)
