@@ -7,6 +7,7 @@ whatever the run is told: these alone need nothing of the steps between.
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -15,7 +16,7 @@ from pathlib import Path
 from processing.errors import InputError
 from processing.merging import Merged
 from processing.pairs_surface import at_reference, merge_surfaces
-from processing.pipeline import measure
+from processing.pipeline import track
 from processing.progress import Report, Stages, silent
 from processing.results import write_results
 from processing.ring import Ring, calibrate_ring
@@ -34,7 +35,8 @@ def process_step(
     """Process the reference and one step of the specimen; the folder of what is shown of it.
 
     The reference itself may be the step: then its shape is shown, and what every step needs of it is found. Nothing
-    becomes a run, and no matches in images are written. Raises InputError or ComputationError.
+    becomes a run; matches in images, what calibration and scatter add to uncertainty, and the summary are left to it.
+    Raises InputError or ComputationError.
     """
     began = time.monotonic()
     stages = Stages(_WEIGHTS, report)
@@ -47,11 +49,11 @@ def process_step(
         key = digest("live surface", heuristic, [(each.vertices, each.faces, each.correlation) for each in shape])
         return kept.get(key, lambda: merge_surfaces(shape, heuristic), _bytes)
 
-    measured = measure(session, settings, stages, executor, steps, _calibrated, merging)
-    found = {**measured.found, "seconds": round(time.monotonic() - began, 2)}
+    tracked = track(session, settings, steps, stages, executor, _calibrated, merging)
+    found = {"warnings": list(tracked.warnings), "seconds": round(time.monotonic() - began, 2)}
     stages.at("deform", 0.0)
     with new_live(path, capture_id) as folder:
-        results = replace(measured.results, matches=(), summary=found)
+        results = replace(tracked.results, matches=(), summary=found)
         write_results(folder / "results.h5", results, lambda done: stages.at("deform", done))
     return session.path / "live" / capture_id
 
@@ -60,7 +62,8 @@ def _calibrated(session: Session, settings: CalibrationGroup, told: Callable[[fl
     """The ring as calibrated, kept in memory while its images and settings stay."""
     captures = [capture for capture in session.captures if capture.kind in ("board", "target")]
     rig = (session.path / "rig.toml").read_text(encoding="utf-8")
-    key = digest("live calibration", str(session.path), rig, settings, [(each.id, each.record) for each in captures])
+    records = json.dumps([(each.id, each.record) for each in captures])
+    key = digest("live calibration", str(session.path), rig, settings, records)
     return kept.get(key, lambda: calibrate_ring(session, settings, told), lambda _: _RING_BYTES)
 
 

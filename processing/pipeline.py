@@ -45,6 +45,18 @@ _WEIGHTS = {"prepare": 0.03, "calibrate": 0.25, "correlate": 0.62, "triangulate"
 
 
 @dataclass(frozen=True)
+class Tracked:
+    """A surface at some steps, and what is told of it. errors : of the pairs' reconstruction of the control points."""
+
+    results: Results
+    ring: Ring
+    errors: dict[tuple[str, str], ReconstructionError]
+    drift: dict[str, NDArray[np.float64]]
+    agreement: dict[str, Any]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Measured:
     """What a run found before anything is written. errors : of the pairs' reconstruction of the control points."""
 
@@ -80,21 +92,36 @@ def process_session(path: Path, settings: Settings, report: Report = silent, exe
 
 
 def measure(
+    session: Session, settings: Settings, stages: Stages | None = None, executor: Executor | None = None
+) -> Measured:
+    """Everything of a run but the writing of its files. executor : of the tasks; None runs them in this process."""
+    steps = _with_captures_at_rest(session)
+    tracked = track(session, settings, steps, stages, executor)
+    ring = tracked.ring
+    results = with_uncertainty(tracked.results, camera_covariance(ring.bundle))
+    results, drift, floor = _noise_floor(results, tracked.drift, steps)
+    found = summary.summarise(results, ring, tracked.errors, drift, tracked.agreement, tracked.warnings)
+    found["noise_floor"] = floor
+    for warning in found["warnings"]:
+        log.warning("%s", warning)
+    return Measured(results, ring, tracked.errors, found)
+
+
+def track(
     session: Session,
     settings: Settings,
+    steps: Sequence[Capture],
     stages: Stages | None = None,
     executor: Executor | None = None,
-    steps: Sequence[Capture] | None = None,
     calibrate: Calibrate = calibrate_ring,
     merging: Merging = merge_surfaces,
-) -> Measured:
-    """Everything of a run but the writing of its files.
+) -> Tracked:
+    """The surface at the steps, the reference first.
 
-    steps : captures to measure, the reference first; None takes all of the specimen, and those at rest. executor : of
-    the tasks; None runs them in this process. calibrate, merging : what does these, where it is kept from before.
+    executor : of the tasks; None runs them in this process. calibrate, merging : what does these, where it is kept
+    from before.
     """
-    stages = stages or Stages(_WEIGHTS, silent)
-    steps = tuple(steps) if steps is not None else _with_captures_at_rest(session)
+    stages, steps = stages or Stages(_WEIGHTS, silent), tuple(steps)
     stages.at("prepare", 0.0, "loading the correlation kernels (compiled at the first use)")
     load_kernels()
     stages.at("calibrate", 0.0)
@@ -107,13 +134,7 @@ def measure(
         surfaces, more_warnings = _surfaces(session, ring, tuple(errors), steps, settings, stages, executor)
         results, agreement = pairs_surface(session, ring, surfaces, steps, settings, merging)
         drift = {"-".join(surface.matches.cameras): surface.drift for surface in surfaces}
-    results = with_uncertainty(results, camera_covariance(ring.bundle))
-    results, drift, floor = _noise_floor(results, drift, steps)
-    found = summary.summarise(results, ring, errors, drift, agreement, (*ring.warnings, *warnings, *more_warnings))
-    found["noise_floor"] = floor
-    for warning in found["warnings"]:
-        log.warning("%s", warning)
-    return Measured(results, ring, errors, found)
+    return Tracked(results, ring, errors, drift, agreement, (*ring.warnings, *warnings, *more_warnings))
 
 
 def _specimen_steps(session: Session) -> tuple[Capture, ...]:
