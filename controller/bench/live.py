@@ -41,15 +41,17 @@ def bench_live(
     scale: float = 1.0,
     steps: int = 5,
     interval: float = 5.0,
+    boards: int = 12,
     settings: str = "",
     say: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """The figures of `steps` steps, one every `interval` seconds, after the reference. JSON values, times in seconds.
 
-    folder : where images and calibration are kept for the next time. settings : TOML for the processing.
+    folder : where images and calibration are kept for the next time. boards : views of the checkerboard.
+    settings : TOML for the processing.
     Raises ComputationError if a step could not be processed.
     """
-    scenery = Scenery(scale, cameras, limb=steps)
+    scenery = Scenery(scale, cameras, boards, limb=steps)
     darkroom = Darkroom(folder / "images")
     work = folder / f"live-{time.strftime('%Y-%m-%d-%H%M%S')}"
     shots = [shot for name in ("boards", "target", "limb") for each in scenery.shots(name) for shot in each.values()]
