@@ -31,8 +31,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from shutil import rmtree
-from tempfile import mkdtemp
 from typing import Any
+from uuid import uuid4
 
 from processing.errors import InputError
 from processing.rig import Rig, read_rig
@@ -129,12 +129,13 @@ def new_live(path: Path, capture_id: str) -> Iterator[Path]:
     """
     live = Path(path) / "live"
     live.mkdir(exist_ok=True)
-    partial = Path(mkdtemp(prefix=f".{capture_id}-", dir=live))
+    partial = live / f".{capture_id}-{uuid4().hex}"
+    partial.mkdir()
     try:
         yield partial
         final = live / capture_id
         if final.exists():
-            final.rename(Path(mkdtemp(prefix=".old-", dir=live)) / capture_id)
+            final.rename(live / f".old-{uuid4().hex}")
         partial.rename(final)
     except BaseException:
         rmtree(partial, ignore_errors=True)

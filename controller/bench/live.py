@@ -138,7 +138,7 @@ def _steps(client: Client, count: int, interval: float) -> tuple[list[dict[str, 
         while time.monotonic() < due:
             look()
             time.sleep(_LOOK)
-    client.wait_for_step(_SESSION, taken[-1], _START)
+    client.wait_for_step(_SESSION, taken[-1], _START, look)
     look()
     return list(shown.values()), taken
 

@@ -69,10 +69,13 @@ class Client:
             time.sleep(_EVERY)
         raise ComputationError(f"job {job_id} did not end within {timeout:.0f} s")
 
-    def wait_for_step(self, session: str, capture_id: str, timeout: float) -> None:
-        """Wait until a step has been processed at once, or a newer one in its place."""
+    def wait_for_step(
+        self, session: str, capture_id: str, timeout: float, meanwhile: Callable[[], None] = lambda: None
+    ) -> None:
+        """Wait until a step has been processed at once, or a newer one in its place; ``meanwhile`` is called often."""
         deadline = time.monotonic() + timeout
         while time.monotonic() < deadline:
+            meanwhile()
             for job in self.get("/jobs"):
                 if job["session"] != session or not job["step"] or job["step"] < capture_id:
                     continue
