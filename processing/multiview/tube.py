@@ -17,6 +17,7 @@ Ints = NDArray[np.int64]
 
 _LARGEST_HOLE = 5.0  # mm², filled
 _MOST_NODES = 16  # lost side by side in a hole worth a look
+_LEAST_PIECE = 32  # triangles of a piece by itself, about those of a subset: fewer have no neighbours to be judged by
 
 
 @dataclass(frozen=True)
@@ -49,14 +50,16 @@ def lattice_faces(xyz: Array) -> tuple[Ints, tuple[Ints, Ints]]:
 
     Returns faces (M, 3), counter-clockwise seen from outside, and the columns and rows (n,) of the points they use.
     A cell with four corners is divided along its shorter diagonal, one with three is one triangle; holes of one lost
-    node, or up to 5 mm², are filled; where the sheet would hang together in a point alone, its smaller part goes.
+    node, or up to 5 mm², are filled; where the sheet would hang together in a point alone, its smaller part goes, and
+    so does a loose scrap of it.
     """
     nodes = _Nodes(xyz)
     faces = _cells(nodes)
     faces = np.concatenate([faces, _fillings(nodes, faces)])
-    faces = _without_pinches(faces, xyz.shape[0] * xyz.shape[1])
+    count = xyz.shape[0] * xyz.shape[1]
+    faces = _without_scraps(_without_pinches(faces, count), count)
     used = np.unique(faces)
-    renumber = np.full(xyz.shape[0] * xyz.shape[1], -1, np.int64)
+    renumber = np.full(count, -1, np.int64)
     renumber[used] = np.arange(len(used))
     column, row = nodes.place(used).T
     return renumber[faces], (column, row)
@@ -221,6 +224,18 @@ def _without_pinches(faces: Ints, count: int) -> Ints:
         best[vertex[keep]] = each[keep]
         faces = faces[(fan == best[faces]).all(axis=1)]
     return faces
+
+
+def _without_scraps(faces: Ints, count: int) -> Ints:
+    """The triangles of the largest piece, and of all others that are no scraps."""
+    if not len(faces):
+        return faces
+    ends = faces[:, [0, 1, 0, 2]].reshape(-1, 2)
+    links = coo_matrix((np.ones(len(ends)), tuple(ends.T)), shape=(count, count))
+    _, label = connected_components(links, directed=False)
+    piece = label[faces[:, 0]]
+    triangles = np.bincount(piece)
+    return faces[triangles[piece] >= min(_LEAST_PIECE, triangles.max())]
 
 
 def _fans(faces: Ints) -> Ints:

@@ -135,6 +135,18 @@ def test_a_lattice_with_lost_nodes_is_still_one_sheet() -> None:
     assert np.einsum("mi,mi->m", mesh.area_vectors[:, :2], mesh.centroids[:, :2]).min() > 0
 
 
+def test_loose_nodes_at_the_rim_are_no_part_of_the_sheet_and_a_patch_is() -> None:
+    xyz = cylinder().xyz
+    xyz[:, :4] = np.nan
+    xyz[100:102, :2] = cylinder().xyz[100:102, :2]
+    faces, used = lattice_faces(xyz)
+    assert used[1].min() == 4
+    assert is_closed_tube(Mesh(xyz[used], faces))
+    xyz[50:80, :3] = cylinder().xyz[50:80, :3]
+    _, (column, row) = lattice_faces(xyz)
+    assert set(column[row < 4]) == set(range(50, 80))
+
+
 def test_a_view_that_contradicts_the_others_is_dropped_and_two_that_do_are_no_point() -> None:
     rng = np.random.default_rng(3)
     xyz = np.column_stack([rng.uniform(40, 55, 300), rng.uniform(-20, 20, 300), rng.uniform(60, 180, 300)])
