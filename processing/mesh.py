@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.half_edges import alike, half_edges
+
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
@@ -67,15 +69,13 @@ class Mesh:
 
     def boundary_edges(self) -> Indices:
         """Edges with one triangle, (K, 2), in the direction in which that triangle runs along them."""
-        _, inverse, count = np.unique(self._edge_numbers(), return_inverse=True, return_counts=True)
-        return self._half_edges()[count[inverse.reshape(-1)] == 1]
-
-    def _half_edges(self) -> Indices:
-        return self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        half = half_edges(self.faces)
+        _, alone = alike(half)
+        return half[alone]
 
     def _edge_numbers(self) -> Indices:
         """One number for each edge of each triangle, (3M,), the same in both directions; ordered as the edges are."""
-        half = self._half_edges()
+        half = half_edges(self.faces)
         return half.min(axis=1) * len(self.vertices) + half.max(axis=1)
 
     def whole_faces(self) -> NDArray[np.bool_]:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from processing.mesh import Mesh
+from processing.nearest import cubes, near
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _CANDIDATES = 8  # nearest triangles that are tried: the one that is hit has its middle among the nearest
+_INSIDE = 1e-6  # least weight of a corner inside a triangle
 
 
 @dataclass(frozen=True)
@@ -42,9 +44,9 @@ class Projector:
         self.reach = reach
         self.same_side = same_side
         self._corners, self._normals, centroids = mesh.vertices[mesh.faces], mesh.normals, mesh.centroids
-        self._tree = cKDTree(centroids)
-        radius = np.linalg.norm(self._corners - centroids[:, None], axis=2).max(axis=1)
-        self._within = float(np.hypot(np.quantile(radius, 0.99), reach)) if len(radius) else 0.0
+        self._radius = np.linalg.norm(self._corners - centroids[:, None], axis=2).max(axis=1)
+        self._within = float(np.hypot(np.quantile(self._radius, 0.99), reach)) if len(centroids) else 0.0
+        self._centroids = cubes(centroids, self._within)
         at = mesh.vertices[mesh.faces.ravel()]
         self._low = at.min(axis=0, initial=np.inf) - reach
         self._high = at.max(axis=0, initial=-np.inf) + reach
@@ -52,17 +54,79 @@ class Projector:
     def hits(self, points: Array, directions: Array) -> Hits:
         """Where lines through points (n, 3) mm along unit directions (n, 3), outwards, pass the surface."""
         there = np.flatnonzero(((points > self._low) & (points < self._high)).all(axis=1))
-        n, count = len(there), min(_CANDIDATES, len(self._corners))
-        if not count or not n:
-            return Hits(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
-        near, candidate = self._tree.query(points[there], k=count, distance_upper_bound=self._within)
-        near, candidate = near.reshape(n, count), candidate.reshape(n, count)
-        row, column = np.nonzero(np.isfinite(near))
-        point, face = there[row], candidate[row, column]
-        weights, along = line_hits(points[point], directions[point], self._corners[face])
-        hit = (weights > 1e-6).all(axis=1) & (np.abs(along) < self.reach)
-        hit &= np.einsum("ni,ni->n", directions[point], self._normals[face]) > self.same_side
-        return Hits(point[hit], face[hit], weights[hit], -along[hit])
+        if not len(self._corners):
+            there = there[:0]
+        point, face, weights, along = _hits(
+            self._centroids, self._corners, self._normals, self._radius, points[there], directions[there],
+            self._within, self.reach, self.same_side,
+        )  # fmt: skip
+        return Hits(there[point], face, weights, -along)
+
+
+@nb.njit(cache=True, nogil=True)
+def _hits(centroids, corners, normals, radius, points, directions, within, reach, same_side):  # type: ignore[no-untyped-def]
+    """Hits of lines through points along directions (n, 3): point, face (P,), weights (P, 3), place on the line (P,).
+
+    centroids : of the triangles, in cubes. corners : (M, 3, 3). radius : (M,) from centroid to farthest corner.
+    within : mm, of a centroid that is tried. Those hit by one line come in the order of their centroids' distances.
+    """
+    found, apart = np.empty(len(corners), np.int64), np.empty(len(corners))
+    point, face = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
+    place = np.empty((len(points), 4))  # weights and place on the line
+    far = np.empty(len(points))
+    count = 0
+    for i in range(len(points)):
+        first = count
+        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
+        beside = near(centroids, points[i, 0], points[i, 1], points[i, 2], within, found, apart)
+        for k in range(beside):
+            at = centroids.at[found[k]]
+            along = (at[0] - points[i, 0]) * dx + (at[1] - points[i, 1]) * dy + (at[2] - points[i, 2]) * dz
+            f = centroids.order[found[k]]
+            if apart[k] - along * along > radius[f] * radius[f]:
+                continue
+            if not dx * normals[f, 0] + dy * normals[f, 1] + dz * normals[f, 2] > same_side:
+                continue
+            u, v, along = _line_hit(points[i], dx, dy, dz, corners[f])
+            if not (u > _INSIDE and v > _INSIDE and 1 - u - v > _INSIDE and abs(along) < reach):
+                continue
+            closer = 0
+            for m in range(beside):
+                closer += apart[m] < apart[k]
+            if closer >= _CANDIDATES:
+                continue
+            if count == len(point):
+                point, face, far, place = _longer(point), _longer(face), _longer(far), _longer(place)
+            to = count
+            while to > first and far[to - 1] > apart[k]:
+                face[to], far[to], place[to] = face[to - 1], far[to - 1], place[to - 1]
+                to -= 1
+            point[count], face[to], far[to] = i, f, apart[k]
+            place[to, 0], place[to, 1], place[to, 2], place[to, 3] = 1 - u - v, u, v, along
+            count += 1
+    return point[:count], face[:count], place[:count, :3].copy(), place[:count, 3].copy()
+
+
+@nb.njit(cache=True, nogil=True)
+def _longer(row):  # type: ignore[no-untyped-def]
+    """A row with room for twice as much."""
+    return np.concatenate((row, np.empty_like(row)))
+
+
+@nb.njit(cache=True, nogil=True)
+def _line_hit(point, dx, dy, dz, corner):  # type: ignore[no-untyped-def]
+    """Weights of the second and third corner, and the place on the line, mm: ``line_hits`` of one line."""
+    ex, ey, ez = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
+    gx, gy, gz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
+    ax, ay, az = dy * gz - dz * gy, dz * gx - dx * gz, dx * gy - dy * gx
+    determinant = ex * ax + ey * ay + ez * az
+    if determinant == 0:
+        return np.nan, np.nan, np.nan
+    px, py, pz = point[0] - corner[0, 0], point[1] - corner[0, 1], point[2] - corner[0, 2]
+    bx, by, bz = py * ez - pz * ey, pz * ex - px * ez, px * ey - py * ex
+    u = (px * ax + py * ay + pz * az) / determinant
+    v = (dx * bx + dy * by + dz * bz) / determinant
+    return u, v, (gx * bx + gy * by + gz * bz) / determinant
 
 
 def line_hits(points: Array, directions: Array, corners: Array) -> tuple[Array, Array]:

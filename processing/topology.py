@@ -11,10 +11,9 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from processing.half_edges import fan_numbers, half_edges, piece_numbers, twins, vertices_of_several_fans
 from processing.mesh import Mesh
 from processing.projection import line_hits
 
@@ -61,33 +60,20 @@ def non_manifold_edges(mesh: Mesh) -> Indices:
 
 def inconsistent_edges(mesh: Mesh) -> Indices:
     """Edges (K, 2) along which two triangles run in the same direction: one of them is turned over."""
-    half = _half_edges(mesh.faces)
+    half = half_edges(mesh.faces)
     unique, count = np.unique(half[:, 0] * len(mesh.vertices) + half[:, 1], return_counts=True)
     return np.stack(np.divmod(unique[count > 1], len(mesh.vertices)), axis=1)
 
 
 def non_manifold_vertices(mesh: Mesh) -> Indices:
     """Vertices (K,) where triangles meet in more than one fan: two pieces or two borders touch in a point."""
-    _, corner = np.unique(fans(mesh), return_index=True)
-    vertices, count = np.unique(mesh.faces.ravel()[corner], return_counts=True)
-    return vertices[count > 1]
+    corners = mesh.faces.ravel()
+    return np.unique(corners[vertices_of_several_fans(corners, fans(mesh))])
 
 
 def fans(mesh: Mesh) -> Indices:
     """Number of the fan of each corner, (3M,): the corners at a vertex whose triangles hang together round it."""
-    # Corners of triangles are joined across the edges they share.
-    half = _half_edges(mesh.faces)
-    corner = np.arange(len(half))
-    start, end = corner, corner - corner % 3 + (corner + 1) % 3
-    edge = _edge_numbers(half)
-    order = np.argsort(edge, kind="stable")
-    same = np.flatnonzero(edge[order][1:] == edge[order][:-1])
-    first, second = order[same], order[same + 1]
-    turned = half[first, 0] == half[second, 1]
-    a = np.concatenate([start[first], end[first]])
-    b = np.concatenate([np.where(turned, end[second], start[second]), np.where(turned, start[second], end[second])])
-    joined = coo_array((np.ones(len(a), bool), (a, b)), shape=(len(half), len(half)))
-    return np.asarray(connected_components(joined, directed=False)[1], dtype=np.int64)
+    return np.asarray(fan_numbers(half_edges(mesh.faces)))
 
 
 def without_pinches(mesh: Mesh) -> NDArray[np.bool_]:
@@ -96,10 +82,10 @@ def without_pinches(mesh: Mesh) -> NDArray[np.bool_]:
     while True:
         left = np.flatnonzero(kept)
         part = Mesh(mesh.vertices, mesh.faces[left])
-        pinched = np.isin(part.faces.ravel(), non_manifold_vertices(part))
+        fan = fans(part)
+        pinched = vertices_of_several_fans(part.faces.ravel(), fan)
         if not pinched.any():
             return kept
-        fan = fans(part)
         area = np.bincount(fan, np.repeat(np.nan_to_num(part.areas), 3))
         corners = np.flatnonzero(pinched)
         # The largest fan of each vertex: the last of its corners in order of the fan's area.
@@ -113,12 +99,7 @@ def without_pinches(mesh: Mesh) -> NDArray[np.bool_]:
 
 def pieces(mesh: Mesh) -> Indices:
     """Number of the connected piece of each triangle, (M,): triangles hang together by shared edges."""
-    edge = _edge_numbers(_half_edges(mesh.faces))
-    order = np.argsort(edge, kind="stable")
-    same = np.flatnonzero(edge[order][1:] == edge[order][:-1])
-    a, b = order[same] // 3, order[same + 1] // 3
-    joined = coo_array((np.ones(len(a), bool), (a, b)), shape=(len(mesh.faces), len(mesh.faces)))
-    return np.asarray(connected_components(joined, directed=False)[1], dtype=np.int64)
+    return np.asarray(piece_numbers(half_edges(mesh.faces)))
 
 
 def borders(mesh: Mesh) -> tuple[Border, ...]:
@@ -128,8 +109,8 @@ def borders(mesh: Mesh) -> tuple[Border, ...]:
     """
     if len(non_manifold_edges(mesh)) or len(inconsistent_edges(mesh)):
         raise ValueError("a surface with non-manifold edges or triangles turned over has no borders in order")
-    half = _half_edges(mesh.faces)
-    twin = _twins(half)
+    half = half_edges(mesh.faces)
+    twin = twins(half)
     following = np.arange(len(half)) // 3 * 3 + (np.arange(len(half)) + 1) % 3
     angle = _corner_angles(mesh).ravel()
     border = np.flatnonzero(twin < 0)
@@ -225,25 +206,5 @@ def neighbours(faces: Indices) -> Indices:
 
     Where more than two triangles share an edge, one of the others.
     """
-    twin = _twins(_half_edges(faces))
+    twin = twins(half_edges(faces))
     return np.where(twin >= 0, twin // 3, -1).reshape(-1, 3)
-
-
-def _half_edges(faces: Indices) -> Indices:
-    """Directed edges (3M, 2); number 3f + k runs from corner k of triangle f to the next."""
-    return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-
-
-def _edge_numbers(half: Indices) -> Indices:
-    """One number for both directions of an edge, (3M,)."""
-    return half.min(axis=1) * (half.max(initial=0) + 1) + half.max(axis=1)
-
-
-def _twins(half: Indices) -> Indices:
-    """The half-edge that runs along the same edge the other way, (3M,), -1 at a border."""
-    size = half.max(initial=0) + 1
-    forward, backward = half[:, 0] * size + half[:, 1], half[:, 1] * size + half[:, 0]
-    order = np.argsort(forward)
-    place = np.minimum(np.searchsorted(forward[order], backward), max(len(half) - 1, 0))
-    found = order[place] if len(half) else np.zeros(0, np.int64)
-    return np.where(forward[found] == backward, found, -1)
