@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.half_edges import alike, half_edges
-
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
@@ -69,6 +67,8 @@ class Mesh:
 
     def boundary_edges(self) -> Indices:
         """Edges with one triangle, (K, 2), in the direction in which that triangle runs along them."""
+        from processing.adjacency import alike  # compiled, and loaded only where it is asked for
+
         half = half_edges(self.faces)
         _, alone = alike(half)
         return half[alone]
@@ -107,3 +107,8 @@ class Mesh:
         towards = np.asarray(viewpoints, dtype=float) - self.centroids
         with np.errstate(invalid="ignore"):
             return self.flipped(np.einsum("mi,mi->m", self.area_vectors, towards) < 0)
+
+
+def half_edges(faces: Indices) -> Indices:
+    """Directed edges (3M, 2) of triangles (M, 3): number 3f + k runs from corner k of triangle f to the next."""
+    return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)

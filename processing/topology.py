@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from processing.half_edges import fan_numbers, half_edges, piece_numbers, twins, vertices_of_several_fans
-from processing.mesh import Mesh
+from processing.adjacency import fan_numbers, piece_numbers, twins, vertices_of_several_fans
+from processing.mesh import Mesh, half_edges
 from processing.projection import line_hits
 
 Array = NDArray[np.float64]

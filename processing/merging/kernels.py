@@ -8,6 +8,8 @@ import math
 import numba as nb
 import numpy as np
 
+from processing.nearest import near
+
 
 @nb.njit(cache=True, nogil=True)
 def peel(start, rival, beside, living, bad):  # type: ignore[no-untyped-def]
@@ -81,30 +83,47 @@ def _count(beside, living, f):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def closer(pairs, owner, centroids, normals, corners, radius, gap, reach, same_side):  # type: ignore[no-untyped-def]
-    """Pairs (P, 2) of triangles of different surfaces that lie over one another or within ``gap`` beside. (P,) bool."""
-    found = np.zeros(len(pairs), np.bool_)
-    for p in range(len(pairs)):
-        a, b = pairs[p, 0], pairs[p, 1]
-        if owner[a] == owner[b]:
-            continue
-        cosine = normals[a, 0] * normals[b, 0] + normals[a, 1] * normals[b, 1] + normals[a, 2] * normals[b, 2]
-        if not cosine > same_side:
-            continue
-        nx, ny, nz = normals[a, 0] + normals[b, 0], normals[a, 1] + normals[b, 1], normals[a, 2] + normals[b, 2]
-        length = max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-9)
-        nx, ny, nz = nx / length, ny / length, nz / length
-        dx, dy, dz = (
-            centroids[b, 0] - centroids[a, 0], centroids[b, 1] - centroids[a, 1], centroids[b, 2] - centroids[a, 2],
-        )  # fmt: skip
-        height = dx * nx + dy * ny + dz * nz
-        beside = math.sqrt(max(dx * dx + dy * dy + dz * dz - height * height, 0.0))
-        if not (abs(height) < reach and beside < radius[a] + radius[b] + gap):
-            continue
-        found[p] = (
-            max(_separation(corners[a], corners[b], nx, ny, nz), _separation(corners[b], corners[a], nx, ny, nz)) < gap
-        )
-    return found
+def closer(middles, owner, normals, corners, radius, usual, gap, reach, same_side):  # type: ignore[no-untyped-def]
+    """Pairs (P, 2) of triangles of different surfaces that lie over one another or within ``gap`` mm beside.
+
+    middles : centroids (M, 3) in cubes. radius : (M,) mm, from centroid to farthest corner; usual : mm, of most.
+    """
+    M, widest = len(radius), radius.max()
+    found, apart = np.empty(M, np.int64), np.empty(M)
+    pairs, count = np.empty((M, 2), np.int64), 0
+    for k in range(M):
+        a, x = middles.order[k], middles.at[k]
+        large = radius[a] > usual
+        within = math.hypot((radius[a] + widest if large else 2 * usual) + gap, reach)
+        for m in range(near(middles, x[0], x[1], x[2], within, found, apart)):
+            b = middles.order[found[m]]
+            if owner[a] == owner[b]:
+                continue
+            if b < a if (radius[b] > usual) == large else not large:  # every pair once, from the larger triangle
+                continue
+            if not _close(a, b, middles.at[found[m]] - x, normals, corners, radius, gap, reach, same_side):
+                continue
+            if count == len(pairs):
+                pairs = np.concatenate((pairs, np.empty_like(pairs)))
+            pairs[count, 0], pairs[count, 1] = a, b
+            count += 1
+    return pairs[:count]
+
+
+@nb.njit(cache=True, nogil=True)
+def _close(a, b, d, normals, corners, radius, gap, reach, same_side):  # type: ignore[no-untyped-def]
+    """Whether two triangles lie over one another or within ``gap`` beside. d : (3,) mm, from middle to middle."""
+    cosine = normals[a, 0] * normals[b, 0] + normals[a, 1] * normals[b, 1] + normals[a, 2] * normals[b, 2]
+    if not cosine > same_side:
+        return False
+    nx, ny, nz = normals[a, 0] + normals[b, 0], normals[a, 1] + normals[b, 1], normals[a, 2] + normals[b, 2]
+    length = max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-9)
+    nx, ny, nz = nx / length, ny / length, nz / length
+    height = d[0] * nx + d[1] * ny + d[2] * nz
+    beside = math.sqrt(max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2] - height * height, 0.0))
+    if not (abs(height) < reach and beside < radius[a] + radius[b] + gap):
+        return False
+    return max(_separation(corners[a], corners[b], nx, ny, nz), _separation(corners[b], corners[a], nx, ny, nz)) < gap
 
 
 @nb.njit(cache=True, nogil=True)
@@ -122,3 +141,37 @@ def _separation(one, two, nx, ny, nz):  # type: ignore[no-untyped-def]
             nearest = min(nearest, away / length)
         widest = max(widest, nearest)
     return widest
+
+
+@nb.njit(cache=True, nogil=True)
+def rivals(M, competing):  # type: ignore[no-untyped-def]
+    """For each of M triangles, where its competitors begin (M + 1) in a row of all of them. competing : (P, 2)."""
+    start = np.zeros(M + 1, np.int64)
+    for first, second in competing:
+        start[first + 1] += 1
+        start[second + 1] += 1
+    for f in range(1, M + 1):
+        start[f] += start[f - 1]
+    free, row = start[:-1].copy(), np.empty(2 * len(competing), np.int64)
+    for first, second in competing:
+        row[free[first]], row[free[second]] = second, first
+        free[first] += 1
+        free[second] += 1
+    return start, row
+
+
+@nb.njit(cache=True, nogil=True)
+def smoothed(values, known, beside, rounds):  # type: ignore[no-untyped-def]
+    """Values (M,) averaged with those of the neighbours that are known, round by round; 0 where nothing is."""
+    total, weight = np.where(known, values, 0.0), known.astype(np.float64)
+    for _ in range(rounds):
+        old_total, old_weight = total.copy(), weight.copy()
+        for f in range(len(values)):
+            more, heavier = 0.0, 0.0
+            for g in beside[f]:
+                if g >= 0:
+                    more += old_total[g]
+                    heavier += old_weight[g]
+            total[f] += more
+            weight[f] += heavier
+    return np.where(weight > 0, total / np.maximum(weight, 1e-300), 0.0)

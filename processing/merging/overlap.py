@@ -14,11 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
 from processing.merging import kernels
 from processing.mesh import Mesh
+from processing.nearest import cubes
 from processing.projection import Projector
 from processing.topology import neighbours
 
@@ -77,14 +77,11 @@ def closer_than(mesh: Mesh, owner: Indices, gap: float, reach: float) -> Indices
     """
     centroids, normals, corners = mesh.centroids, mesh.normals, mesh.vertices[mesh.faces]
     radius = np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
+    if not len(radius):
+        return np.zeros((0, 2), np.int64)
     usual = 1.5 * float(np.median(radius))
-    tree = cKDTree(centroids)
-    pairs = tree.query_pairs(float(np.hypot(2 * usual + gap, reach)), output_type="ndarray").astype(np.int64)
-    large = np.flatnonzero(radius > usual)
-    around = tree.query_ball_point(centroids[large], np.hypot(radius[large] + radius.max() + gap, reach))
-    more = np.array([(a, b) for a, row in zip(large, around, strict=True) for b in row if a != b], np.int64)
-    pairs = np.concatenate([pairs, more.reshape(-1, 2)])
-    return pairs[kernels.closer(pairs, owner, centroids, normals, corners, radius, gap, reach, _SAME_SIDE)]
+    middles = cubes(centroids, float(np.hypot(2 * usual + gap, reach)) / 2)
+    return np.asarray(kernels.closer(middles, owner, normals, corners, radius, usual, gap, reach, _SAME_SIDE))
 
 
 def badness(mesh: Mesh, owner: Indices, covered: Cover, correlation: Array, weights: Mapping[str, float]) -> Array:
@@ -102,11 +99,11 @@ def badness(mesh: Mesh, owner: Indices, covered: Cover, correlation: Array, weig
         "distance": np.bincount(covered.own, np.abs(covered.height), M) / np.maximum(hits, 1),
         "orientation": np.bincount(covered.own, covered.angle, M) / np.maximum(hits, 1),
     }
-    beside = neighbours(mesh.faces)
+    beside, everywhere = neighbours(mesh.faces), np.ones(M, bool)
     total = np.zeros(M)
     for name, values in measures.items():
         if weights.get(name, 0.0):
-            smooth = _smoothed(values, np.ones(M, bool) if name == "correlation" else hidden, beside)
+            smooth = kernels.smoothed(values, everywhere if name == "correlation" else hidden, beside, _SMOOTHING)
             usual = float(np.median(smooth[hidden])) if hidden.any() else 0.0
             total += weights[name] * smooth / (usual or 1.0)
     if weights.get("margin", 0.0):
@@ -114,17 +111,6 @@ def badness(mesh: Mesh, owner: Indices, covered: Cover, correlation: Array, weig
         usual = float(np.median(depth[hidden])) if hidden.any() else 0.0
         total -= weights["margin"] * depth / (usual or 1.0)
     return total
-
-
-def _smoothed(values: Array, known: Mask, beside: Indices) -> Array:
-    """Values averaged with those of the neighbours that are known; 0 where nothing is."""
-    weight = known.astype(float)
-    total = np.where(known, values, 0.0)
-    for _ in range(_SMOOTHING):
-        inner = beside >= 0
-        total = total + np.where(inner, total[beside], 0.0).sum(axis=1)
-        weight = weight + np.where(inner, weight[beside], 0.0).sum(axis=1)
-    return np.asarray(total / np.maximum(weight, 1e-300) * (weight > 0))
 
 
 def _from_border(mesh: Mesh, owner: Indices) -> Array:
@@ -144,7 +130,7 @@ def peel(faces: Indices, alive: Mask, competing: Indices, bad: Array) -> Mask:
     alive : (M,) to begin with. competing : (P, 2). bad : (M,).
     """
     competing = competing[alive[competing].all(axis=1)]
-    start, rival = _rivals(len(faces), competing)
+    start, rival = kernels.rivals(len(faces), competing)
     kept = alive.copy()
     kernels.peel(start, rival, neighbours(faces), kept, bad)
     for first, second in competing[kept[competing].all(axis=1)].tolist():  # what no border reached
@@ -159,14 +145,7 @@ def regrow(faces: Indices, alive: Mask, candidate: Mask, competing: Indices, bad
     candidate : (M,) that may come back. competing : (P, 2) among those alive and the candidates. The ones with most
     neighbours there come first, of these the best.
     """
-    start, rival = _rivals(len(faces), competing)
+    start, rival = kernels.rivals(len(faces), competing)
     living = alive.copy()
     kernels.regrow(start, rival, neighbours(faces), living, candidate & ~alive, bad)
     return living
-
-
-def _rivals(M: int, competing: Indices) -> tuple[Indices, Indices]:
-    """For each triangle, where its competitors begin (M + 1) in a row of all of them."""
-    both = np.concatenate([competing, competing[:, ::-1]])
-    matrix = coo_array((np.ones(len(both), bool), (both[:, 0], both[:, 1])), shape=(M, M)).tocsr()
-    return matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64)

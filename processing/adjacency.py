@@ -1,20 +1,12 @@
-"""Which triangles share an edge: half-edges sorted by their vertices, and what hangs together, compiled.
+"""Which triangles share an edge, and what hangs together: loops over half-edges sorted by their vertices, compiled.
 
-Half-edge 3f + k runs from corner k of triangle f to the next corner.
+``half`` is everywhere what ``processing.mesh.half_edges`` gives of the triangles (M, 3): directed edges (3M, 2).
 """
 
 from __future__ import annotations
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
-
-Indices = NDArray[np.int64]
-
-
-def half_edges(faces: Indices) -> Indices:
-    """Directed edges (3M, 2) of triangles (M, 3)."""
-    return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
 
 
 @nb.njit(cache=True, nogil=True)
