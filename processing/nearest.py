@@ -65,6 +65,43 @@ def _sorted(points, low, size, shape):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
+def among_alike(sorted_points, label, reach):  # type: ignore[no-untyped-def]
+    """Which points (n,) have none of another label nearer than ``reach`` mm for certain: by whole cubes.
+
+    label : (n,), not negative, of each point.
+    """
+    shape, start, order = sorted_points.shape, sorted_points.start, sorted_points.order
+    sole = np.full(len(start) - 1, -1)  # of a cube: no point, -2 several labels
+    for c in range(len(sole)):
+        for k in range(start[c], start[c + 1]):
+            mine = label[order[k]]
+            sole[c] = mine if sole[c] in (-1, mine) else -2
+    alike, steps = np.zeros(len(order), np.bool_), int(np.ceil(reach / sorted_points.size))
+    for x in range(shape[0]):
+        for y in range(shape[1]):
+            for z in range(shape[2]):
+                c = (x * shape[1] + y) * shape[2] + z
+                if sole[c] >= 0:
+                    same = _all_alike(sole, shape, x, y, z, steps)
+                    for k in range(start[c], start[c + 1]):
+                        alike[order[k]] = same
+    return alike
+
+
+@nb.njit(cache=True, nogil=True)
+def _all_alike(sole, shape, x, y, z, steps):  # type: ignore[no-untyped-def]
+    """Whether all points in the cubes up to some steps beside one have its label."""
+    mine = sole[(x * shape[1] + y) * shape[2] + z]
+    for i in range(max(x - steps, 0), min(x + steps + 1, shape[0])):
+        for j in range(max(y - steps, 0), min(y + steps + 1, shape[1])):
+            row = (i * shape[1] + j) * shape[2]
+            for k in range(max(z - steps, 0), min(z + steps + 1, shape[2])):
+                if sole[row + k] not in (-1, mine):
+                    return False
+    return True
+
+
+@nb.njit(cache=True, nogil=True)
 def near(sorted_points, x, y, z, radius, found, apart):  # type: ignore[no-untyped-def]
     """Number of points no farther than ``radius`` mm from a place.
 

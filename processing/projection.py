@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _CANDIDATES = 8  # nearest triangles that are tried: the one that is hit has its middle among the nearest
+_NARROW = 2.5  # usual radii of triangles: about as far off as the eighth centroid
 _INSIDE = 1e-6  # least weight of a corner inside a triangle
 
 
@@ -43,11 +44,13 @@ class Projector:
         self.mesh = mesh
         self.reach = reach
         self.same_side = same_side
-        self._corners, self._normals, centroids = mesh.vertices[mesh.faces], mesh.normals, mesh.centroids
-        self._radius = np.linalg.norm(self._corners - centroids[:, None], axis=2).max(axis=1)
+        self._corners = mesh.vertices[mesh.faces]
+        centroids, self._normals, self._radius = _sized(self._corners)
+        usual = float(np.median(self._radius)) if len(centroids) else 0.0
         self._within = float(np.hypot(np.quantile(self._radius, 0.99), reach)) if len(centroids) else 0.0
-        self._centroids = cubes(centroids, self._within)
-        at = mesh.vertices[mesh.faces.ravel()]
+        self._narrow = min(_NARROW * usual, self._within)
+        self._centroids = cubes(centroids, self._narrow)
+        at = self._corners.reshape(-1, 3)
         self._low = at.min(axis=0, initial=np.inf) - reach
         self._high = at.max(axis=0, initial=-np.inf) + reach
 
@@ -58,17 +61,40 @@ class Projector:
             there = there[:0]
         point, face, weights, along = _hits(
             self._centroids, self._corners, self._normals, self._radius, points[there], directions[there],
-            self._within, self.reach, self.same_side,
+            self._narrow, self._within, self.reach, self.same_side,
         )  # fmt: skip
         return Hits(there[point], face, weights, -along)
 
 
 @nb.njit(cache=True, nogil=True)
-def _hits(centroids, corners, normals, radius, points, directions, within, reach, same_side):  # type: ignore[no-untyped-def]
+def _sized(corners):  # type: ignore[no-untyped-def]
+    """Centroids (M, 3), unit normals (M, 3), NaN without an area, and distances (M,) to the farthest corner."""
+    M = len(corners)
+    centroids, normals, radius = np.empty((M, 3)), np.empty((M, 3)), np.empty(M)
+    for f in range(M):
+        a, b, c = corners[f]
+        for k in range(3):
+            centroids[f, k] = (a[k] + b[k] + c[k]) / 3
+            m, n = (k + 1) % 3, (k + 2) % 3
+            normals[f, k] = (b[m] - a[m]) * (c[n] - a[n]) - (b[n] - a[n]) * (c[m] - a[m])
+        length = np.sqrt(normals[f, 0] ** 2 + normals[f, 1] ** 2 + normals[f, 2] ** 2)
+        square = 0.0
+        for corner in (a, b, c):
+            dx, dy, dz = corner[0] - centroids[f, 0], corner[1] - centroids[f, 1], corner[2] - centroids[f, 2]
+            square = max(square, dx * dx + dy * dy + dz * dz)
+        for k in range(3):
+            normals[f, k] = normals[f, k] / length if length > 0 else np.nan
+        radius[f] = np.sqrt(square)
+    return centroids, normals, radius
+
+
+@nb.njit(cache=True, nogil=True)
+def _hits(centroids, corners, normals, radius, points, directions, narrow, within, reach, same_side):  # type: ignore[no-untyped-def]
     """Hits of lines through points along directions (n, 3): point, face (P,), weights (P, 3), place on the line (P,).
 
     centroids : of the triangles, in cubes. corners : (M, 3, 3). radius : (M,) from centroid to farthest corner.
-    within : mm, of a centroid that is tried. Those hit by one line come in the order of their centroids' distances.
+    within : mm, of a centroid that is tried; narrow : where enough of them are sought first. Those hit by one line
+    come in the order of their centroids' distances.
     """
     found, apart = np.empty(len(corners), np.int64), np.empty(len(corners))
     point, face = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
@@ -78,7 +104,9 @@ def _hits(centroids, corners, normals, radius, points, directions, within, reach
     for i in range(len(points)):
         first = count
         dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
-        beside = near(centroids, points[i, 0], points[i, 1], points[i, 2], within, found, apart)
+        beside = near(centroids, points[i, 0], points[i, 1], points[i, 2], narrow, found, apart)
+        if beside < _CANDIDATES and narrow < within:
+            beside = near(centroids, points[i, 0], points[i, 1], points[i, 2], within, found, apart)
         for k in range(beside):
             at = centroids.at[found[k]]
             along = (at[0] - points[i, 0]) * dx + (at[1] - points[i, 1]) * dy + (at[2] - points[i, 2]) * dz

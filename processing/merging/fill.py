@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.mesh import Mesh
-from processing.topology import Kind, borders
+from processing.mesh import Mesh, half_edges
+from processing.topology import Border, Kind, borders
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -24,10 +26,10 @@ def fill(mesh: Mesh, area: float, bridge: float, seam: NDArray[np.bool_], seam_a
     an edge that the mesh has already, stays open.
     """
     normals = np.nan_to_num(mesh.vertex_normals)
-    edges, _ = mesh.edges()
-    known = {(int(a), int(b)) for a, b in edges}
     found = [np.zeros((0, 3), np.int64)]
-    for border in borders(mesh):
+    around = borders(mesh)
+    known = _edges_between(mesh, around)
+    for border in around:
         if border.kind is not Kind.HOLE and len(border.loop) == len(set(border.loop.tolist())):
             continue
         for loop in simple_loops(border.loop.tolist()):
@@ -61,6 +63,16 @@ def simple_loops(loop: list[int]) -> list[list[int]]:
             path = path[:first]
         path.append(v)
     return [*parts, path]
+
+
+def _edges_between(mesh: Mesh, around: Sequence[Border]) -> set[tuple[int, int]]:
+    """Edges of a mesh that have both ends on borders, smaller vertex first."""
+    on_border = np.zeros(len(mesh.vertices), bool)
+    for border in around:
+        on_border[border.loop] = True
+    half = half_edges(mesh.faces)
+    half = np.sort(half[on_border[half].all(axis=1)], axis=1)
+    return set(map(tuple, half.tolist()))
 
 
 def _edges_of(faces: Indices) -> set[tuple[int, int]]:

@@ -8,7 +8,7 @@ import math
 import numba as nb
 import numpy as np
 
-from processing.nearest import near
+from processing.nearest import among_alike, near
 
 
 @nb.njit(cache=True, nogil=True)
@@ -91,17 +91,21 @@ def closer(middles, owner, normals, corners, radius, usual, gap, reach, same_sid
     M, widest = len(radius), radius.max()
     found, apart = np.empty(M, np.int64), np.empty(M)
     pairs, count = np.empty((M, 2), np.int64), 0
+    common = math.hypot(2 * usual + gap, reach)
+    inside = among_alike(middles, owner, common)
     for k in range(M):
         a, x = middles.order[k], middles.at[k]
         large = radius[a] > usual
-        within = math.hypot((radius[a] + widest if large else 2 * usual) + gap, reach)
+        if inside[a] and not large:
+            continue
+        within = math.hypot(radius[a] + widest + gap, reach) if large else common
         for m in range(near(middles, x[0], x[1], x[2], within, found, apart)):
             b = middles.order[found[m]]
             if owner[a] == owner[b]:
                 continue
             if b < a if (radius[b] > usual) == large else not large:  # every pair once, from the larger triangle
                 continue
-            if not _close(a, b, middles.at[found[m]] - x, normals, corners, radius, gap, reach, same_side):
+            if not _close(a, b, middles.at[k], middles.at[found[m]], normals, corners, radius, gap, reach, same_side):
                 continue
             if count == len(pairs):
                 pairs = np.concatenate((pairs, np.empty_like(pairs)))
@@ -111,16 +115,17 @@ def closer(middles, owner, normals, corners, radius, usual, gap, reach, same_sid
 
 
 @nb.njit(cache=True, nogil=True)
-def _close(a, b, d, normals, corners, radius, gap, reach, same_side):  # type: ignore[no-untyped-def]
-    """Whether two triangles lie over one another or within ``gap`` beside. d : (3,) mm, from middle to middle."""
+def _close(a, b, at_a, at_b, normals, corners, radius, gap, reach, same_side):  # type: ignore[no-untyped-def]
+    """Whether two triangles lie over one another or within ``gap`` beside. at_a, at_b : (3,) mm, their middles."""
     cosine = normals[a, 0] * normals[b, 0] + normals[a, 1] * normals[b, 1] + normals[a, 2] * normals[b, 2]
     if not cosine > same_side:
         return False
     nx, ny, nz = normals[a, 0] + normals[b, 0], normals[a, 1] + normals[b, 1], normals[a, 2] + normals[b, 2]
     length = max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-9)
     nx, ny, nz = nx / length, ny / length, nz / length
-    height = d[0] * nx + d[1] * ny + d[2] * nz
-    beside = math.sqrt(max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2] - height * height, 0.0))
+    dx, dy, dz = at_b[0] - at_a[0], at_b[1] - at_a[1], at_b[2] - at_a[2]
+    height = dx * nx + dy * ny + dz * nz
+    beside = math.sqrt(max(dx * dx + dy * dy + dz * dz - height * height, 0.0))
     if not (abs(height) < reach and beside < radius[a] + radius[b] + gap):
         return False
     return max(_separation(corners[a], corners[b], nx, ny, nz), _separation(corners[b], corners[a], nx, ny, nz)) < gap
