@@ -9,10 +9,12 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import Protocol
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.mesh import Mesh
+from processing.adjacency import alike
+from processing.mesh import Mesh, half_edges
 from processing.projection import Projector
 
 Array = NDArray[np.float64]
@@ -68,12 +70,14 @@ class Curved:
     """
 
     def __init__(self, mesh: Mesh, reach: float) -> None:
+        half = half_edges(mesh.faces)
+        before, alone = alike(half)
         self.mesh = mesh
         self.used = np.unique(mesh.faces)
-        self.normals = _averaged_normals(mesh)
+        self.normals = _averaged(np.nan_to_num(mesh.vertex_normals), half, before)
         self._projector = Projector(mesh, reach)
         on_border = np.zeros(len(mesh.vertices), bool)
-        on_border[mesh.boundary_edges()] = True
+        on_border[half[alone]] = True
         self._inner: NDArray[np.bool_] = ~np.asarray(on_border[mesh.faces].any(axis=1))
 
     def outside(self, other: Curved) -> Array:
@@ -96,14 +100,24 @@ class Curved:
         return result
 
 
-def _averaged_normals(mesh: Mesh) -> Array:
-    """Unit normals of the vertices, averaged with those of their neighbours: measured slopes are noisy."""
-    normals = np.nan_to_num(mesh.vertex_normals)
+@nb.njit(cache=True, nogil=True)
+def _averaged(normals, half, before):  # type: ignore[no-untyped-def]
+    """Unit normals (N, 3) averaged with those of the neighbours: measured slopes are noisy.
+
+    half, before : directed edges (3M, 2) and what ``alike`` tells of them.
+    """
     total = normals.copy()
-    edges, _ = mesh.edges()
-    np.add.at(total, edges[:, 0], normals[edges[:, 1]])
-    np.add.at(total, edges[:, 1], normals[edges[:, 0]])
-    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12))
+    for h in range(len(half)):
+        if before[h] < 0:  # every edge once
+            a, b = half[h]
+            for k in range(3):
+                total[a, k] += normals[b, k]
+                total[b, k] += normals[a, k]
+    for v in range(len(total)):
+        length = max(np.sqrt(total[v, 0] ** 2 + total[v, 1] ** 2 + total[v, 2] ** 2), 1e-12)
+        for k in range(3):
+            total[v, k] /= length
+    return total
 
 
 def _summary(first: int, second: int, signed: Array) -> Mismatch:
