@@ -45,7 +45,7 @@ class Projector:
         self.reach = reach
         self.same_side = same_side
         self._corners = mesh.vertices[mesh.faces]
-        centroids, self._normals, self._radius = _sized(self._corners)
+        centroids, self._normals, self._radius = sized(self._corners)
         usual = float(np.median(self._radius)) if len(centroids) else 0.0
         self._within = float(np.hypot(np.quantile(self._radius, 0.99), reach)) if len(centroids) else 0.0
         self._narrow = min(_NARROW * usual, self._within)
@@ -56,18 +56,17 @@ class Projector:
 
     def hits(self, points: Array, directions: Array) -> Hits:
         """Where lines through points (n, 3) mm along unit directions (n, 3), outwards, pass the surface."""
-        there = np.flatnonzero(((points > self._low) & (points < self._high)).all(axis=1))
         if not len(self._corners):
-            there = there[:0]
+            return Hits(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
         point, face, weights, along = _hits(
-            self._centroids, self._corners, self._normals, self._radius, points[there], directions[there],
-            self._narrow, self._within, self.reach, self.same_side,
+            self._centroids, self._corners, self._normals, self._radius, points, directions,
+            self._low, self._high, self._narrow, self._within, self.reach, self.same_side,
         )  # fmt: skip
-        return Hits(there[point], face, weights, -along)
+        return Hits(point, face, weights, -along)
 
 
 @nb.njit(cache=True, nogil=True)
-def _sized(corners):  # type: ignore[no-untyped-def]
+def sized(corners):  # type: ignore[no-untyped-def]
     """Centroids (M, 3), unit normals (M, 3), NaN without an area, and distances (M,) to the farthest corner."""
     M = len(corners)
     centroids, normals, radius = np.empty((M, 3)), np.empty((M, 3)), np.empty(M)
@@ -89,12 +88,14 @@ def _sized(corners):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def _hits(centroids, corners, normals, radius, points, directions, narrow, within, reach, same_side):  # type: ignore[no-untyped-def]
+def _hits(  # type: ignore[no-untyped-def]
+    centroids, corners, normals, radius, points, directions, low, high, narrow, within, reach, same_side
+):
     """Hits of lines through points along directions (n, 3): point, face (P,), weights (P, 3), place on the line (P,).
 
     centroids : of the triangles, in cubes. corners : (M, 3, 3). radius : (M,) from centroid to farthest corner.
-    within : mm, of a centroid that is tried; narrow : where enough of them are sought first. Those hit by one line
-    come in the order of their centroids' distances.
+    low, high : (3,) mm, between which points can be hit. within : mm, of a centroid that is tried; narrow : where
+    enough of them are sought first. Those hit by one line come in the order of their centroids' distances.
     """
     found, apart = np.empty(len(corners), np.int64), np.empty(len(corners))
     point, face = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
@@ -102,14 +103,17 @@ def _hits(centroids, corners, normals, radius, points, directions, narrow, withi
     far = np.empty(len(points))
     count = 0
     for i in range(len(points)):
+        x, y, z = points[i]
+        if not (low[0] < x < high[0] and low[1] < y < high[1] and low[2] < z < high[2]):
+            continue
         first = count
         dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
-        beside = near(centroids, points[i, 0], points[i, 1], points[i, 2], narrow, found, apart)
+        beside = near(centroids, x, y, z, narrow, found, apart)
         if beside < _CANDIDATES and narrow < within:
-            beside = near(centroids, points[i, 0], points[i, 1], points[i, 2], within, found, apart)
+            beside = near(centroids, x, y, z, within, found, apart)
         for k in range(beside):
             at = centroids.at[found[k]]
-            along = (at[0] - points[i, 0]) * dx + (at[1] - points[i, 1]) * dy + (at[2] - points[i, 2]) * dz
+            along = (at[0] - x) * dx + (at[1] - y) * dy + (at[2] - z) * dz
             f = centroids.order[found[k]]
             if apart[k] - along * along > radius[f] * radius[f]:
                 continue

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from processing.merging import kernels
 from processing.mesh import Mesh
 from processing.nearest import cubes
-from processing.projection import Projector
+from processing.projection import Projector, sized
 from processing.topology import neighbours
 
 Array = NDArray[np.float64]
@@ -75,8 +75,8 @@ def closer_than(mesh: Mesh, owner: Indices, gap: float, reach: float) -> Indices
 
     Seen along the mean of the two normals; ``reach`` mm is how far apart along it two layers may lie.
     """
-    centroids, normals, corners = mesh.centroids, mesh.normals, mesh.vertices[mesh.faces]
-    radius = np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
+    corners = mesh.vertices[mesh.faces]
+    centroids, normals, radius = sized(corners)
     if not len(radius):
         return np.zeros((0, 2), np.int64)
     usual = 1.5 * float(np.median(radius))

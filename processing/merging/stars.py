@@ -38,7 +38,7 @@ def stars(middles, vertices, at, normals, group, start, onward, back, bridge, sa
         begin, opening = _gap(across, at, v, back[v], onward[start[v]])
         for i in range(len(names)):
             place[names[i]] = i
-        ring = _ring(inverse[: len(names)])
+        ring = delaunay_ring(inverse[: len(names)])
         for k in range(len(ring)):
             i, j = ring[k], ring[(k + 1) % len(ring)]
             b, c = names[i], names[j]
@@ -109,11 +109,11 @@ def _spread(across, at, v, names, flat, inverse):  # type: ignore[no-untyped-def
 
 
 @nb.njit(cache=True, nogil=True)
-def _ring(inverse):  # type: ignore[no-untyped-def]
+def delaunay_ring(inverse):  # type: ignore[no-untyped-def]
     """Delaunay neighbours of the origin, counter-clockwise: the convex hull of the points' inversions (n, 2).
 
     A circle through the origin becomes a line: it is empty where all inversions lie on the origin's side of it. Of
-    several neighbours on one circle none is left out.
+    neighbours on one circle the two outermost.
     """
     n = len(inverse)
     first, farthest = -1, 0.0
@@ -131,7 +131,7 @@ def _ring(inverse):  # type: ignore[no-untyped-def]
             if not step > 0:
                 continue
             side = -1.0 if ahead < 0 else _beside(inverse, here, ahead, j)
-            if side < 0 or (side == 0 and step < reach):
+            if side < 0 or (side == 0 and step > reach):
                 ahead, reach = j, step
         here = -1 if ahead == first else ahead
     return ring[:count]
