@@ -86,6 +86,7 @@ class StepMatches:
     """The n points of a pair in both cameras' images of one step; NaN where a camera has no match.
 
     px : (2, n, 2). sigma : (2, n, 2) px. c_ls : (n,), the larger. status : (n,), 0 good in both. seconds : by stage.
+    gradient : (n, 2, 2) of the second camera's displacements; (0, 2, 2) where a step was read from its file.
     """
 
     px: Array
@@ -93,6 +94,12 @@ class StepMatches:
     c_ls: NDArray[np.float32]
     status: NDArray[np.int8]
     seconds: dict[str, float]
+    gradient: NDArray[np.float32]
+
+    @property
+    def good(self) -> Mask:
+        """Points (n,) matched in both images."""
+        return np.asarray(self.status == Status.GOOD)
 
 
 def match_reference(
@@ -112,27 +119,44 @@ def match_reference(
     found = match_from_lattice(
         reference, current, xy, settings, _start_at(xy, seeds, warps), lattice_spacing(settings, SWEEP_RADII)
     )
-    return Grid(region, xy, faces), _of_step(xy, None, found, reference=True)
+    everyone = np.arange(len(xy))
+    matched = _of_step(xy, np.full(len(xy), Status.GOOD, np.int8), ((1, everyone, found),))
+    matched.px[0], matched.sigma[0] = xy, 0.0  # the grid itself, exact
+    return Grid(region, xy, faces), matched
 
 
 def match_step(
-    stereo: Stereo, reference: Reference, xy: Array, first: Image | None, second: Image | None
+    stereo: Stereo,
+    reference: Reference,
+    xy: Array,
+    first: Image | None,
+    second: Image | None,
+    at_reference: StepMatches,
 ) -> StepMatches:
     """Match the points xy (n, 2) px of a pair in both cameras' images of a step; None where one is missing.
 
     The first camera's image is matched in time; the second's from there, by the calibration and a sweep, so a large
-    motion does not matter.
+    motion does not matter. A point that the pair's reference images do not share keeps its status there: it never has
+    a place in space. One lost in the first camera's image is not looked for in the second's.
     """
     settings = stereo.settings
     in_time = between = None
-    if first is not None:
-        in_time = _match_in_time(reference, prepare_current(first, settings=settings), xy, settings)
-    if in_time is not None and second is not None:
+    points, there = np.flatnonzero(at_reference.good), np.arange(0)
+    if first is not None and len(points):
+        in_time = _match_in_time(reference, prepare_current(first, settings=settings), xy[points], settings)
+        there = np.flatnonzero(in_time.good)
+    if in_time is not None and second is not None and len(there):
         current = prepare_current(second, settings=settings)
-        start = _start_after_motion(stereo, reference, current, xy, in_time)
+        start = _start_after_motion(stereo, reference, current, xy[points], in_time)[there]
+        both = points[there]
+        before = np.concatenate(
+            [at_reference.px[1, both] - xy[both], at_reference.gradient[both].reshape(-1, 4)], axis=1
+        )
         if np.isfinite(start).any():
-            between = match_from_lattice(reference, current, xy, settings, start, lattice_spacing(settings))
-    return _of_step(xy, in_time, between)
+            between = match_from_lattice(
+                reference, current, xy[both], settings, start, lattice_spacing(settings), before
+            )
+    return _of_step(xy, at_reference.status, ((0, points, in_time), (1, points[there], between)))
 
 
 def _match_in_time(reference: Reference, current: Current, xy: Array, settings: CorrelationSettings) -> Correlation:
@@ -220,22 +244,26 @@ def _start_after_motion(
 
 
 def _of_step(
-    xy: Array, in_time: Correlation | None, between: Correlation | None, reference: bool = False
+    xy: Array, status: NDArray[np.int8], found: Sequence[tuple[int, NDArray[np.int64], Correlation | None]]
 ) -> StepMatches:
-    """Both cameras' matches of a step together; at the reference the first camera's are the grid itself, exact."""
-    n = len(xy)
+    """The matches of a step's images together: found are a camera, the points (k,) it was asked for, and their matches.
+
+    status : (n,) of the points before.
+    """
+    n, status = len(xy), status.copy()
     px, sigma = np.full((2, n, 2), np.nan), np.full((2, n, 2), np.nan, np.float32)
-    c_ls, status = np.full(n, np.nan, np.float32), np.full(n, Status.GOOD, np.int8)
+    c_ls, gradient = np.full(n, np.nan, np.float32), np.full((n, 2, 2), np.nan, np.float32)
     seconds = dict.fromkeys(_STAGES, 0.0)
-    if reference:
-        px[0], sigma[0] = xy, 0.0
-    for camera, match in ((1, between),) if reference else ((0, in_time), (1, between)):
+    for camera, points, match in found:
+        open_points = points[status[points] == Status.GOOD]
+        status[open_points] = Status.NOT_REACHED
         if match is None:
-            status = np.where(status == Status.GOOD, Status.NOT_REACHED, status).astype(np.int8)
             continue
-        px[camera], sigma[camera] = xy + match.uv, match.sigma
-        c_ls = np.fmax(c_ls, match.c_ls.astype(np.float32))
-        status = np.where(status == Status.GOOD, match.status, status).astype(np.int8)
+        px[camera, points], sigma[camera, points] = xy[points] + match.uv, match.sigma
+        c_ls[points] = np.fmax(c_ls[points], match.c_ls.astype(np.float32))
+        status[points] = match.status
+        if camera == 1:
+            gradient[points] = match.gradient
         for name in _STAGES:
             seconds[name] += match.seconds[name]
-    return StepMatches(px, sigma, c_ls, status, seconds)
+    return StepMatches(px, sigma, c_ls, status, seconds, gradient)

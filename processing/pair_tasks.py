@@ -112,7 +112,13 @@ def reference_task(stereo: Stereo, images: tuple[Path, Path], mask: Path | None,
     drawn = None if mask is None else read_mask(mask, (first.size[1], first.size[0]))
     grid, found = match_reference(stereo, step_image(images[0], first), step_image(images[1], second), drawn)
     region = {"region": np.packbits(grid.region), "shape": np.array(grid.region.shape)}
-    return {**region, "xy": grid.xy, "faces": grid.faces, **_arrays(found), "points": np.array(len(grid.xy))}
+    own: dict[str, NDArray[Any]] = {
+        "xy": grid.xy,
+        "faces": grid.faces,
+        "gradient": found.gradient,
+        "points": np.array(len(grid.xy)),
+    }
+    return {**region, **own, **_arrays(found)}
 
 
 def step_task(
@@ -120,26 +126,30 @@ def step_task(
 ) -> Arrays:
     """Matches of a pair's images of one step. reference : the first camera's reference image."""
     (kept_grid,) = inputs
-    grid, prepared = _prepared(kept_grid, reference, stereo)
+    grid, at_reference, prepared = _prepared(kept_grid, reference, stereo)
     seen = [None if path is None else step_image(path, each) for path, each in zip(images, stereo.cameras, strict=True)]
-    found = match_step(stereo, prepared, grid.xy, seen[0], seen[1])
-    made = len(grid.xy) * sum(image is not None for image in seen)
+    found = match_step(stereo, prepared, grid.xy, seen[0], seen[1], at_reference)
+    made = int(at_reference.good.sum()) * sum(image is not None for image in seen)
     return {**_arrays(found), "points": np.array(made)}
 
 
-def _prepared(grid_file: Path, image: Path, stereo: Stereo) -> tuple[Grid, Reference]:
-    """A pair's points and its prepared reference image, kept in memory for all its steps."""
+def _prepared(grid_file: Path, image: Path, stereo: Stereo) -> tuple[Grid, StepMatches, Reference]:
+    """A pair's points, their matches at the reference and its prepared image, kept in memory for all its steps."""
 
-    def make() -> tuple[Grid, Reference]:
-        grid = _grid(read_output(grid_file))
+    def make() -> tuple[Grid, StepMatches, Reference]:
+        of_reference = read_output(grid_file)
+        grid = _grid(of_reference)
         reference = prepare_reference(step_image(image, stereo.cameras[0]), grid.region, stereo.settings)
         assert reference.slopes  # computed when first asked for
-        return grid, reference
+        return grid, _step_matches(of_reference), reference
 
-    def size(value: tuple[Grid, Reference]) -> int:
-        grid, reference = value
+    def size(value: tuple[Grid, StepMatches, Reference]) -> int:
+        grid, found, reference = value
+        matched = sum(array.nbytes for array in (found.px, found.sigma, found.c_ls, found.status, found.gradient))
         filtered = reference.grey.nbytes + sum(slope.nbytes for slope in reference.slopes) + reference.mask.nbytes
-        return int(filtered + grid.region.nbytes + grid.xy.nbytes + grid.faces.nbytes + reference.image.nbytes)
+        return int(
+            filtered + matched + grid.region.nbytes + grid.xy.nbytes + grid.faces.nbytes + reference.image.nbytes
+        )
 
     return kept.get(("reference", str(grid_file)), make, size)
 
@@ -152,7 +162,8 @@ def _arrays(found: StepMatches) -> dict[str, NDArray[Any]]:
 def _step_matches(arrays: Arrays) -> StepMatches:
     start = len("seconds_")
     seconds = {name[start:]: float(value) for name, value in arrays.items() if name.startswith("seconds_")}
-    return StepMatches(arrays["px"], arrays["sigma"], arrays["c_ls"], arrays["status"], seconds)
+    gradient = arrays.get("gradient", np.empty((0, 2, 2), np.float32))
+    return StepMatches(arrays["px"], arrays["sigma"], arrays["c_ls"], arrays["status"], seconds, gradient)
 
 
 def _grid(arrays: Arrays) -> Grid:

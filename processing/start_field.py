@@ -32,16 +32,26 @@ def on_lattice(xy: Array, spacing: int) -> Mask:
 
 
 def match_from_lattice(
-    reference: Reference, current: Current, xy: Array, settings: CorrelationSettings, start: Array, spacing: int
+    reference: Reference,
+    current: Current,
+    xy: Array,
+    settings: CorrelationSettings,
+    start: Array,
+    spacing: int,
+    before: Array | None = None,
 ) -> Correlation:
-    """Matches of points xy (n, 2) px from start values (n, 6) of some of those ``spacing`` px apart, NaN elsewhere."""
+    """Matches of points xy (n, 2) px from start values (n, 6) of some of those ``spacing`` px apart, NaN elsewhere.
+
+    before : (n, 6), the points' matches in another image of the same camera: what has changed since varies far less
+    from point to point than the matches do.
+    """
     chosen = np.flatnonzero(on_lattice(xy, spacing))
     known = np.isfinite(start[chosen]).all(axis=1)
     if known.sum() < _FEWEST:
         return correlate(reference, current, xy, settings, start=start)
     part = _about(current, xy, chosen[known], start, settings)
     coarse = correlate(reference, part, xy[chosen], replace(settings, step=spacing), start=start[chosen])
-    dense = between(coarse, xy, spacing, settings.order)
+    dense = between(coarse, xy, spacing, settings.order, None if before is None else (before[chosen], before))
     if not np.isfinite(dense).all(axis=1).any():
         return correlate(reference, current, xy, settings, start=start)
     found = correlate(reference, part, xy, settings, start=dense)
@@ -50,14 +60,20 @@ def match_from_lattice(
     return found
 
 
-def between(coarse: Correlation, xy: Array, spacing: int, order: int) -> Array:
+def between(
+    coarse: Correlation, xy: Array, spacing: int, order: int, before: tuple[Array, Array] | None = None
+) -> Array:
     """Start values (n, 6), of second order (n, 12), of points xy (n, 2) px among matches on a lattice; NaN far from it.
 
-    coarse : matches of points whose coordinates are multiples of ``spacing`` px.
+    coarse : matches of m points whose coordinates are multiples of ``spacing`` px. before : matches (m, 6) and (n, 6)
+    in another image, of the lattice and of the points: only what differs from them is taken from neighbours.
     """
     n = len(coarse.xy)
     parts = [coarse.uv, coarse.gradient.reshape(n, 4), *([coarse.curvature.reshape(n, 6)] if order == 2 else [])]
-    warps = np.concatenate(parts, axis=1)[coarse.good]
+    warps = np.concatenate(parts, axis=1)
+    if before is not None:
+        warps[:, :6] -= before[0]
+    warps = warps[coarse.good]
     if not len(warps):
         return np.full((len(xy), sum(part.shape[1] for part in parts)), np.nan)
     cells = np.rint(coarse.xy[coarse.good] / spacing).astype(np.int64)
@@ -80,7 +96,10 @@ def between(coarse: Correlation, xy: Array, spacing: int, order: int) -> Array:
             total += near[:, None] * np.nan_to_num(told)
             weight += near
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(weight[:, None] > _LEAST_WEIGHT, total / weight[:, None], np.nan)
+        told_all = np.where(weight[:, None] > _LEAST_WEIGHT, total / weight[:, None], np.nan)
+    if before is not None:
+        told_all[:, :6] += before[1]
+    return told_all
 
 
 def _about(

@@ -161,7 +161,7 @@ def matched(stereo: Stereo, image: Callable[[str, int], np.ndarray]) -> PairMatc
     first, second = stereo.ids
     grid, found = match_reference(stereo, image(first, 0), image(second, 0), None)
     reference = prepare_reference(image(first, 0), grid.region, CORRELATION)
-    later = [match_step(stereo, reference, grid.xy, image(first, k), image(second, k)) for k in range(1, STEPS)]
+    later = [match_step(stereo, reference, grid.xy, image(first, k), image(second, k), found) for k in range(1, STEPS)]
     return collect(stereo.ids, grid, [found, *later])
 
 
