@@ -62,9 +62,9 @@ def inconsistent(xy: Array, parameters: Array, good: NDArray[np.bool_], near: ND
 @nb.njit(cache=True, nogil=True)
 def _expected(xy, parameters, source, target, at):  # type: ignore[no-untyped-def]
     """The displacement along x (at 0) or y (at 6) that a point expects of another."""
-    dx, dy, p = xy[target, 0] - xy[source, 0], xy[target, 1] - xy[source, 1], parameters[source]
-    curved = 0.5 * p[at + 3] * dx * dx + p[at + 4] * dx * dy + 0.5 * p[at + 5] * dy * dy
-    return p[at] + p[at + 1] * dx + p[at + 2] * dy + curved
+    dx, dy, p, s = xy[target, 0] - xy[source, 0], xy[target, 1] - xy[source, 1], parameters, source
+    curved = 0.5 * p[s, at + 3] * dx * dx + p[s, at + 4] * dx * dy + 0.5 * p[s, at + 5] * dy * dy
+    return p[s, at] + p[s, at + 1] * dx + p[s, at + 2] * dy + curved
 
 
 @nb.njit(cache=True, nogil=True, parallel=True)
@@ -83,9 +83,21 @@ def _jumps(xy, parameters, good, near):  # type: ignore[no-untyped-def]
                 expected[1, m] = _expected(xy, parameters, source, k, 6)
                 m += 1
         if m:
-            u, v = np.median(expected[0, :m]), np.median(expected[1, :m])
+            u, v = _median(expected[0], m), _median(expected[1], m)
             out[k] = math.hypot(parameters[k, 0] - u, parameters[k, 6] - v)
     return out
+
+
+@nb.njit(cache=True, nogil=True)
+def _median(values, count):  # type: ignore[no-untyped-def]
+    """Median of the first few values, which it puts in order."""
+    for k in range(1, count):
+        value, at = values[k], k
+        while at and values[at - 1] > value:
+            values[at] = values[at - 1]
+            at -= 1
+        values[at] = value
+    return 0.5 * (values[(count - 1) // 2] + values[count // 2])
 
 
 @nb.njit(cache=True, nogil=True)

@@ -164,12 +164,14 @@ class Field:
     def _wave(self, level: float) -> bool:
         """One wave from neighbours at least this reliable; false if there was nothing to do."""
         reliable = self.good & (np.nan_to_num(self.zncc, nan=-1.0) >= level)
-        open_points = ~self.good & (self.tried.sum(axis=1) < _RETRIES) & (self.status != Status.NO_TEXTURE)
-        offer = open_points[:, None] & (self.near >= 0) & reliable[self.near] & ~self.tried
-        index = np.flatnonzero(offer.any(axis=1))
+        index = np.flatnonzero(~self.good & (self.status != Status.NO_TEXTURE))
+        index = index[self.tried[index].sum(axis=1) < _RETRIES]
+        offer = (self.near[index] >= 0) & reliable[self.near[index]] & ~self.tried[index]
+        offered = offer.any(axis=1)
+        index, offer = index[offered], offer[offered]
         if not len(index):
             return False
-        worth = np.where(offer[index], self.zncc[self.near[index]], -np.inf)
+        worth = np.where(offer, self.zncc[self.near[index]], -np.inf)
         slot = np.argmax(worth, axis=1)
         self.tried[index, slot] = True
         start = predicted(self.xy, self.parameters, self.near[index, slot], index)
