@@ -41,7 +41,9 @@ Mask = NDArray[np.bool_]
 
 _STAGES = ("prepare", "start", "refine")
 _HELD = 0.6  # ZNCC under the warp that optical flow tells, from which on it is a start value
-_ENOUGH = 0.8  # share of the points that must hold, or start values are looked for in other ways
+_ENOUGH = 0.8  # share of the points that must be matched, or start values are looked for in other ways
+_SOME = 0.2  # share of the lattice that must hold for the rest of it to be reached from there
+_COARSE = 4.0  # subset radii between the lattice's points where what has changed since the reference is looked for
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,7 @@ def match_step(
         )
         if np.isfinite(start).any():
             between = match_from_lattice(
-                reference, current, xy[both], settings, start, lattice_spacing(settings), before
+                reference, current, xy[both], settings, start, lattice_spacing(settings, _COARSE), before
             )
     return _of_step(xy, at_reference.status, ((0, points, in_time), (1, points[there], between)))
 
@@ -169,7 +171,7 @@ def _match_in_time(reference: Reference, current: Current, xy: Array, settings: 
     known = np.flatnonzero(np.isfinite(flow).all(axis=1))
     warps, zncc, _ = search_hypotheses(reference, current, xy[chosen[known]], flow[known][:, None], settings.radius)
     held = zncc > _HELD
-    if held.sum() < _ENOUGH * max(len(chosen), 1):
+    if held.sum() < _SOME * max(len(chosen), 1):
         return correlate(reference, current, xy, settings)
     start = np.full((len(xy), 6), np.nan)
     start[chosen[known[held]]] = warps[held]
@@ -231,7 +233,7 @@ def _start_after_motion(
 ) -> Array:
     """Start values (n, 6) in the second camera's image of a later step, from the first camera's motion and a sweep."""
     settings = stereo.settings
-    chosen = np.flatnonzero((in_time.status == Status.GOOD) & on_lattice(xy, lattice_spacing(settings)))
+    chosen = np.flatnonzero(in_time.good & on_lattice(xy, lattice_spacing(settings, _COARSE)))
     moved = xy[chosen] + in_time.uv[chosen]
     hypotheses = stereo_hypotheses(*stereo.cameras, moved, stereo.radii, settings.radius)
     motion = np.concatenate([in_time.uv[chosen], in_time.gradient[chosen].reshape(-1, 4)], axis=1)

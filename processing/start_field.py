@@ -81,6 +81,8 @@ def between(
     high = np.maximum(cells.max(axis=0), np.floor(xy.max(axis=0) / spacing).astype(np.int64) + 1)
     table = np.full((*(high - low + 1), warps.shape[1]), np.nan)
     table[tuple((cells - low).T)] = warps
+    if before is not None:
+        table = _continued(table, spacing)
     corner = np.floor(xy / spacing).astype(np.int64)
     share = xy / spacing - corner
     total, weight = np.zeros((len(xy), warps.shape[1])), np.zeros(len(xy))
@@ -100,6 +102,24 @@ def between(
     if before is not None:
         told_all[:, :6] += before[1]
     return told_all
+
+
+def _continued(table: Array, spacing: int) -> Array:
+    """The table (columns, rows, k) of what has changed at a lattice, continued by a cell where it is NaN: the mean of
+    what the cells around expect there by their gradients."""
+    padded = np.pad(table, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
+    columns, rows, _ = table.shape
+    total, count = np.zeros(table.shape), np.zeros(table.shape[:2])
+    for i, j in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
+        told = padded[1 + i : 1 + i + columns, 1 + j : 1 + j + rows].copy()
+        slope = told[..., 2:6].reshape(columns, rows, 2, 2)
+        told[..., :2] -= spacing * (slope[..., 0] * i + slope[..., 1] * j)
+        known = np.isfinite(told[..., 0])
+        total[known] += told[known]
+        count += known
+    unknown = np.isnan(table[..., 0]) & (count > 0)
+    table[unknown] = total[unknown] / count[unknown][:, None]
+    return table
 
 
 def _about(

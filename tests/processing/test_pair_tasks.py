@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from processing.camera import Camera
-from processing.correlation import CorrelationSettings
+from processing.correlation import CorrelationSettings, Status
 from processing.pair_tasks import PairJob, in_order, pair_jobs
 from processing.pipeline import process_session
 from processing.results import Results, read_results
@@ -17,7 +17,7 @@ from processing.ring import calibrate_ring
 from processing.session import read_session
 from processing.settings import Settings, load_settings
 from processing.sweep import Search
-from processing.tasks import LocalExecutor, Ran, Task, Told, kept
+from processing.tasks import LocalExecutor, Ran, Task, Told, kept, read_output
 
 SCALE, STEPS = 0.2, 3  # of the session
 SMALL = ["correlation.radius_px=12", "correlation.step_px=8"]
@@ -85,6 +85,23 @@ def test_an_interrupted_job_makes_only_what_is_missing_and_the_same_results(sess
     again = Counted()
     same(read_results(process_session(session, settings, executor=again) / "results.h5"), fresh)
     assert again.made == []
+
+
+def test_what_the_reference_does_not_share_is_left_out(session: Path) -> None:
+    process_session(session, SETTINGS, executor=LocalExecutor(1))
+    for job in jobs(session):
+        shared = read_output(job.reference.output)["status"] == Status.GOOD
+        assert 0.9 < shared.mean() < 1.0
+        for task in job.steps:
+            found = read_output(task.output)
+            np.testing.assert_array_equal(
+                found["status"][~shared], read_output(job.reference.output)["status"][~shared]
+            )
+            known = np.isfinite(found["px"]).all(axis=2)
+            assert not known[:, ~shared].any()
+            assert not known[1, ~known[0]].any()
+            np.testing.assert_array_equal(known.all(axis=0), found["status"] == Status.GOOD)
+            assert (found["status"][shared] == Status.GOOD).mean() > 0.95
 
 
 def test_threads_side_by_side_make_the_same(session: Path) -> None:
