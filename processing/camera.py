@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from processing import lens
+
 Array = NDArray[np.float64]
 
 
@@ -42,31 +44,11 @@ class Intrinsics:
 
     def distort_normalised(self, xy: Array) -> Array:
         """Ideal normalised points (..., 2) to distorted normalised points."""
-        k1, k2, p1, p2, k3 = self.distortion
-        x, y = xy[..., 0], xy[..., 1]
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        return np.stack(
-            [
-                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-            ],
-            axis=-1,
-        )
+        return np.asarray(lens.distorted(_rows(xy), self.distortion)).reshape(np.shape(xy))
 
     def _jacobian_normalised(self, xy: Array) -> Array:
         """d(distorted)/d(ideal) of normalised points. (..., 2, 2)."""
-        k1, k2, p1, p2, k3 = self.distortion
-        x, y = xy[..., 0], xy[..., 1]
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))
-        cross = x * y * slope + 2 * (p1 * x + p2 * y)
-        J = np.empty((*xy.shape[:-1], 2, 2))
-        J[..., 0, 0] = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
-        J[..., 1, 1] = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
-        J[..., 0, 1] = J[..., 1, 0] = cross
-        return J
+        return np.asarray(lens.slopes(_rows(xy), self.distortion)).reshape(*np.shape(xy), 2)
 
     def to_undistorted(self, px: Array) -> Array:
         """Image pixels (..., 2) to undistorted pixels, by Newton's method to round-off; NaN where it diverges."""
@@ -74,23 +56,7 @@ class Intrinsics:
         (fx, s, cx), (_, fy, cy) = self.K[0], self.K[1]
         y_d = (px[..., 1] - cy) / fy
         target = np.stack([(px[..., 0] - cx - s * y_d) / fx, y_d], axis=-1)
-        xy = target.copy()
-        for _ in range(30):
-            error = self.distort_normalised(xy) - target
-            J = self._jacobian_normalised(xy)
-            det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-            with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-                dx = (J[..., 1, 1] * error[..., 0] - J[..., 0, 1] * error[..., 1]) / det
-                dy = (J[..., 0, 0] * error[..., 1] - J[..., 1, 0] * error[..., 0]) / det
-                xy = xy - np.stack([dx, dy], axis=-1)
-            if not np.any(np.abs(error) > 1e-14):
-                break
-        error = self.distort_normalised(xy) - target
-        J = self._jacobian_normalised(xy)
-        det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-        # Beyond the largest radius that the lens can show, roots of the polynomial turn the image over.
-        real = (np.abs(error).max(axis=-1) < 1e-10) & (det > 0) & (J[..., 0, 0] + J[..., 1, 1] > 0)
-        xy = np.where(real[..., None], xy, np.nan)
+        xy = np.asarray(lens.ideal(_rows(target), self.distortion)).reshape(px.shape)
         return xy * np.array([fx, fy]) + np.array([cx, cy])
 
     def to_distorted(self, px: Array) -> Array:
@@ -102,10 +68,8 @@ class Intrinsics:
 
     def slope(self, px: Array) -> Array:
         """d(image pixel)/d(undistorted pixel) at undistorted pixels (..., 2). (..., 2, 2)."""
-        px = np.asarray(px, dtype=float)
-        (fx, s, cx), (_, fy, cy) = self.K[0], self.K[1]
-        J = self._jacobian_normalised((px - np.array([cx, cy])) / np.array([fx, fy]))
-        return np.array([[fx, s], [0.0, fy]]) @ J / np.array([fx, fy])
+        K = np.ascontiguousarray(self.K)
+        return np.asarray(lens.pixel_slopes(_rows(px), K, self.distortion)).reshape(*np.shape(px), 2)
 
 
 @dataclass(frozen=True)
@@ -163,3 +127,8 @@ class Camera:
         """Cosine of the angle between outward normals (..., 3) and the direction to the camera. (...)."""
         towards = self.centre - xyz
         return np.sum(towards * normals, axis=-1) / np.linalg.norm(towards, axis=-1)
+
+
+def _rows(xy: Array) -> Array:
+    """Points (..., 2) as the loops take them, (n, 2)."""
+    return np.ascontiguousarray(xy, dtype=float).reshape(-1, 2)

@@ -8,11 +8,13 @@ the normal. All tensors are Cartesian in the world frame; E lives in the referen
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from processing import strain
+from processing import triangle_kernels as kernels
 
 Array = NDArray[np.float64]
 _I = np.eye(3)
@@ -34,42 +36,101 @@ class Deformation:
     direction1_current, direction2_current : (..., M, 3) the same lines in the current configuration.
     shear_direction_reference, shear_direction_current : (..., M, 2, 3) the two lines of largest shear, ± 45° from the
         principal directions of that configuration.
+    directors_reference : (M, 3, 3); directors_current : (..., M, 3, 3) mm, rows D1 D2 and the unit normal.
     area : (M,) mm², reference. isotropy : (..., M) 1 equilateral … 0 degenerate, current.
     normal_reference : (M, 3); normal_current : (..., M, 3), unit.
+
+    What few ask for follows from the rest when it is asked for.
 
     Other families of strain follow from the stretches and directions: :mod:`processing.strain`.
     """
 
     F: Array
     E: Array
-    e: Array
     J: Array
     lambda1: Array
     lambda2: Array
     E1: Array
     E2: Array
-    e1: Array
-    e2: Array
-    E_magnitude: Array
-    e_magnitude: Array
-    E_equivalent: Array
-    e_equivalent: Array
-    E_shear: Array
-    e_shear: Array
     direction1_reference: Array
     direction2_reference: Array
     direction1_current: Array
     direction2_current: Array
-    shear_direction_reference: Array
-    shear_direction_current: Array
+    directors_reference: Array
+    directors_current: Array
     area: Array
     isotropy: Array
-    normal_reference: Array
-    normal_current: Array
 
     def __post_init__(self) -> None:
         if self.F.shape[-2:] != (3, 3) or self.E.shape != self.F.shape or self.J.shape != self.F.shape[:-2]:
             raise ValueError("deformation fields of different shapes")
+
+    @cached_property
+    def e(self) -> Array:
+        """Euler-Almansi strain."""
+        out = np.empty_like(self.F)
+        kernels.euler_almansi(_matrices(self.directors_reference), _matrices(self.directors_current), _matrices(out))
+        return out
+
+    @property
+    def e1(self) -> Array:
+        """The smaller principal value of e."""
+        return self.E1 / (1.0 + 2.0 * self.E1)  # e = ½ (1 - λ⁻²), monotonic in E
+
+    @property
+    def e2(self) -> Array:
+        """The larger principal value of e."""
+        return self.E2 / (1.0 + 2.0 * self.E2)
+
+    @property
+    def E_magnitude(self) -> Array:
+        """Frobenius norm of E."""
+        return _norm(self.E)
+
+    @property
+    def e_magnitude(self) -> Array:
+        """Frobenius norm of e."""
+        return _norm(self.e)
+
+    @property
+    def E_equivalent(self) -> Array:
+        """√(⅔ dev:dev) of E."""
+        return _equivalent(self.E)
+
+    @property
+    def e_equivalent(self) -> Array:
+        """√(⅔ dev:dev) of e."""
+        return _equivalent(self.e)
+
+    @property
+    def E_shear(self) -> Array:
+        """Largest in-plane shear strain of E."""
+        return strain.shear(self.E1, self.E2)
+
+    @property
+    def e_shear(self) -> Array:
+        """Largest in-plane shear strain of e."""
+        return strain.shear(self.e1, self.e2)
+
+    @property
+    def shear_direction_reference(self) -> Array:
+        """The two lines of largest shear in the reference configuration."""
+        return _diagonals(self.direction1_reference, self.direction2_reference)
+
+    @property
+    def shear_direction_current(self) -> Array:
+        """The two lines of largest shear in the current configuration."""
+        return _diagonals(self.direction1_current, self.direction2_current)
+
+    @property
+    def normal_reference(self) -> Array:
+        """Unit normals of the reference configuration."""
+        return self.directors_reference[..., 2, :]
+
+    @property
+    def normal_current(self) -> Array:
+        """Unit normals of the current configuration."""
+        return self.directors_current[..., 2, :]
 
 
 def deformation(reference: Array, current: Array, faces: NDArray[np.int_]) -> Deformation:
@@ -92,77 +153,48 @@ def of_directors(D: Array, d: Array, area: Array, isotropy: Array) -> Deformatio
 
     area : (M,) mm². isotropy : (..., M).
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        F = np.einsum("...ki,...kj->...ij", d, _reciprocal(D))  # eq. 13
-        C = np.einsum("...ki,...kj->...ij", F, F)  # eq. 14
-        E = 0.5 * (C - _I)  # eq. 16
-        b_inverse = _inverse_left_cauchy_green(D, d)
-        e = 0.5 * (_I - b_inverse)  # eq. 17
-        E1, E2, direction1, direction2 = _principal_in_plane(E, D)
-        lambda1, lambda2 = np.sqrt(1.0 + 2.0 * E1), np.sqrt(1.0 + 2.0 * E2)
-        e1, e2 = E1 / (1.0 + 2.0 * E1), E2 / (1.0 + 2.0 * E2)  # e = ½ (1 - λ⁻²), monotonic in E
-        now1 = np.einsum("...ij,...j->...i", F, direction1) / lambda1[..., None]
-        now2 = np.einsum("...ij,...j->...i", F, direction2) / lambda2[..., None]
-        return Deformation(
-            F=F, E=E, e=e, J=lambda1 * lambda2, lambda1=lambda1, lambda2=lambda2, E1=E1, E2=E2, e1=e1, e2=e2,
-            E_magnitude=_norm(E), e_magnitude=_norm(e), E_equivalent=_equivalent(E), e_equivalent=_equivalent(e),
-            E_shear=strain.shear(E1, E2), e_shear=strain.shear(e1, e2),
-            direction1_reference=direction1, direction2_reference=direction2,
-            direction1_current=now1, direction2_current=now2,
-            shear_direction_reference=_diagonals(direction1, direction2),
-            shear_direction_current=_diagonals(now1, now2),
-            area=area, isotropy=isotropy, normal_reference=D[..., 2, :], normal_current=d[..., 2, :],
-        )  # fmt: skip
+    D, d = np.ascontiguousarray(D, dtype=float), np.ascontiguousarray(d, dtype=float)
+    places = d.shape[:-2]
+    F, E = np.empty(d.shape), np.empty(d.shape)
+    scalars, directions = np.empty((5, *places)), np.empty((4, *places, 3))
+    kernels.deformation(
+        _matrices(D), _matrices(d), _matrices(F), _matrices(E), scalars.reshape(5, -1), directions.reshape(4, -1, 3)
+    )
+    lambda1, lambda2, J, E1, E2 = scalars
+    first, second, first_now, second_now = directions
+    return Deformation(
+        F=F, E=E, J=J, lambda1=lambda1, lambda2=lambda2, E1=E1, E2=E2,
+        direction1_reference=first, direction2_reference=second,
+        direction1_current=first_now, direction2_current=second_now,
+        directors_reference=D, directors_current=d, area=area, isotropy=isotropy,
+    )  # fmt: skip
 
 
 def directors(vertices: Array, faces: NDArray[np.int_]) -> tuple[Array, Array]:
     """Directors (..., M, 3, 3), rows D1 D2 D3 (eq. 12), and areas (..., M) mm², of vertices (..., N, 3) mm."""
-    corners = vertices[..., faces, :]
-    D1 = corners[..., 1, :] - corners[..., 0, :]
-    D2 = corners[..., 2, :] - corners[..., 0, :]
-    with np.errstate(invalid="ignore"):
-        cross = np.cross(D1, D2)
-        length = np.linalg.norm(cross, axis=-1, keepdims=True)
-        length = np.where(length > 0, length, np.nan)
-        return np.stack([D1, D2, cross / length], axis=-2), 0.5 * length[..., 0]
+    vertices, faces = _steps(vertices), np.ascontiguousarray(faces)
+    D, area = np.empty((*vertices.shape[:-2], len(faces), 3, 3)), np.empty((*vertices.shape[:-2], len(faces)))
+    kernels.directors(
+        vertices.reshape(-1, *vertices.shape[-2:]), faces, D.reshape(-1, len(faces), 3, 3), area.reshape(-1, len(faces))
+    )
+    return D, area
 
 
 def isotropy(vertices: Array, faces: NDArray[np.int_]) -> Array:
     """Shape of triangles, (..., M), 1 equilateral … 0 degenerate: ``2 σ2/(σ2 + σ3)`` of ``X Xᵀ/3`` about centroids."""
-    corners = vertices[..., faces, :]
-    X = corners - corners.mean(axis=-2, keepdims=True)
-    S = np.einsum("...ki,...kj->...ij", X, X) / 3.0
-    # One singular value is zero; the other two have the sum tr S and the product of S's second invariant.
-    trace = np.einsum("...ii->...", S)
-    product = 0.5 * (trace**2 - np.einsum("...ij,...ij->...", S, S))
-    smaller = 0.5 * (trace - np.sqrt(np.maximum(trace**2 - 4.0 * product, 0.0)))
-    return 2.0 * smaller / trace
+    vertices, faces = _steps(vertices), np.ascontiguousarray(faces)
+    out = np.empty((*vertices.shape[:-2], len(faces)))
+    kernels.isotropy(vertices.reshape(-1, *vertices.shape[-2:]), faces, out.reshape(-1, len(faces)))
+    return out
 
 
-def _reciprocal(D: Array) -> Array:
-    """Reciprocal directors, rows, with ``D^i · D_j = δ_ij``. D : (..., 3, 3) with rows D_j."""
-    D1, D2, D3 = D[..., 0, :], D[..., 1, :], D[..., 2, :]
-    volume = np.einsum("...i,...i->...", np.cross(D1, D2), D3)[..., None]
-    return np.stack([np.cross(D2, D3) / volume, np.cross(D3, D1) / volume, D3], axis=-2)
+def _steps(vertices: Array) -> Array:
+    return np.ascontiguousarray(vertices, dtype=float)
 
 
-def _inverse_left_cauchy_green(D: Array, d: Array) -> Array:
-    """``B⁻¹ = F⁻ᵀ F⁻¹`` with ``F⁻¹ = Σ D_i ⊗ d^i``, the same element seen from the current configuration."""
-    F_inverse = np.einsum("...ki,...kj->...ij", D, _reciprocal(d))
-    return np.einsum("...ki,...kj->...ij", F_inverse, F_inverse)
-
-
-def _principal_in_plane(E: Array, D: Array) -> tuple[Array, Array, Array, Array]:
-    """Principal values and unit directions of E in the plane of the reference triangle, smaller value first."""
-    a1 = D[..., 0, :] / np.linalg.norm(D[..., 0, :], axis=-1, keepdims=True)
-    a2 = np.cross(D[..., 2, :], a1)
-    E11 = np.einsum("...i,...ij,...j->...", a1, E, a1)
-    E22 = np.einsum("...i,...ij,...j->...", a2, E, a2)
-    E12 = np.einsum("...i,...ij,...j->...", a1, E, a2)
-    mean, half, radius = 0.5 * (E11 + E22), 0.5 * (E11 - E22), np.hypot(0.5 * (E11 - E22), E12)
-    angle = 0.5 * np.arctan2(E12, half) + 0.5 * np.pi  # of the smaller principal value, from a1
-    cos, sin = np.cos(angle)[..., None], np.sin(angle)[..., None]
-    return mean - radius, mean + radius, cos * a1 + sin * a2, cos * a2 - sin * a1
+def _matrices(tensors: Array) -> Array:
+    """Contiguous tensors (..., 3, 3) in one row, (n, 3, 3), without a copy."""
+    return tensors.reshape(-1, 3, 3)
 
 
 def _norm(T: Array) -> Array:

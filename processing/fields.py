@@ -80,8 +80,7 @@ def _stretch(E: Array) -> Array:
 
 def _seth_hill(m: float, E: Array) -> Array:
     """Principal strain of the Seth-Hill family m from that of Green-Lagrange; small strains keep their digits."""
-    log = 0.5 * np.log1p(2.0 * E)
-    return log if m == 0 else np.expm1(2.0 * m * log) / (2.0 * m)
+    return strain.seth_hill_of_log(0.5 * np.log1p(2.0 * E), m)
 
 
 def _bazant(E: Array) -> Array:
@@ -235,6 +234,19 @@ class Certainty:
     sigma_displacement_calibration: Array | None = None
     sigma_lambda_calibration: Array | None = None
 
+    def fields(self) -> StepFields:
+        """What is known, as arrays of the points and the triangles."""
+        on_points = (
+            "correlation", "sigma_xyz", "sigma_displacement", "chi2", "sigma_calibration",
+            "sigma_displacement_calibration",
+        )  # fmt: skip
+        point = {name: getattr(self, name) for name in on_points}
+        face: dict[str, Array] = {}
+        for name in ("sigma_lambda", "sigma_lambda_calibration"):
+            if (sigma := getattr(self, name)) is not None:
+                face[f"{name}1"], face[f"{name}2"] = sigma.T
+        return StepFields({name: values for name, values in point.items() if values is not None}, face)
+
 
 def field(name: str) -> Field:
     """The field of a name; KeyError if there is none.
@@ -287,15 +299,11 @@ def compute_fields(
     scatter : of the windows, for its standard deviations where those of the displacements are known.
     """
     found = deformation(reference, current, faces)
+    known = certainty.fields()
     point = {
         "displacement": current - reference,
         "displacement_without_rigid_motion": to_reference.apply(current) - reference,
-        "correlation": certainty.correlation,
-        "sigma_xyz": certainty.sigma_xyz,
-        "sigma_displacement": certainty.sigma_displacement,
-        "chi2": certainty.chi2,
-        "sigma_calibration": certainty.sigma_calibration,
-        "sigma_displacement_calibration": certainty.sigma_displacement_calibration,
+        **known.point,
     }
     face = {
         **_of_deformation(found),
@@ -304,17 +312,15 @@ def compute_fields(
         "area": found.area,
         "face_correlation": certainty.correlation[faces].max(axis=1),
         "pair": pair.astype(float),
+        **known.face,
     }
-    for name in ("sigma_lambda", "sigma_lambda_calibration"):
-        if (sigma := getattr(certainty, name)) is not None:
-            face[f"{name}1"], face[f"{name}2"] = sigma.T
     if window is not None:
         over = window.deformation(current, reference)
         face |= {f"window_{name}": values for name, values in _of_deformation(over).items()}
         if scatter is not None and certainty.sigma_displacement is not None:
             sigma = scatter.stretch_sigma(over, certainty.sigma_displacement)
             face["window_sigma_lambda1"], face["window_sigma_lambda2"] = sigma.T
-    return StepFields({name: values for name, values in point.items() if values is not None}, face)
+    return StepFields(point, face)
 
 
 def _of_deformation(found: Deformation) -> dict[str, Array]:
@@ -324,12 +330,12 @@ def _of_deformation(found: Deformation) -> dict[str, Array]:
 
 def _linear(found: Deformation, to_reference: RigidMotion) -> dict[str, Array]:
     """Principal linear strains, after the rigid motion: what is left of the rotation counts as strain."""
-    values = strain.infinitesimal_principal(to_reference.R @ found.F, found.normal_reference)
+    values = strain.infinitesimal_principal(found.F, found.normal_reference, to_reference.R)
     return dict(zip(("linear1", "linear2"), values, strict=True))
 
 
 def _six(tensor: Array) -> Array:
-    return np.stack([tensor[..., i, j] for i, j in _SYMMETRIC], axis=-1)
+    return np.take(tensor.reshape(*tensor.shape[:-2], 9), [3 * i + j for i, j in _SYMMETRIC], axis=-1)
 
 
 def _number(text: str) -> float:

@@ -7,6 +7,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from processing import point_kernels as kernels
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -29,8 +31,8 @@ def crossing_outliers(residuals: Array, factor: float = 8.0, floor: float = 0.3)
     taken about their median, in units of the median absolute deviation, and never below ``floor`` px.
     """
     with np.errstate(invalid="ignore"):
-        about = np.abs(residuals - _median(residuals, axis=1)[:, None])
-        limit = np.maximum(factor * _SIGMA_OF_MAD * _median(about, axis=1), floor)
+        about = np.abs(residuals - _medians(residuals)[:, None])
+        limit = np.maximum(factor * _SIGMA_OF_MAD * _medians(about), floor)
         return np.asarray((about > limit[:, None]).any(axis=(0, 2)))
 
 
@@ -42,36 +44,52 @@ def midpoint_residuals(xy: Array, values: Array, step: int, doubt: Array | None 
     neighbour. NaN where no pair is complete. Where a ``doubt`` (n,) is given, nobody is judged by a neighbour more
     doubtful than himself.
     """
+    return _residuals(neighbours(xy, step), values, doubt)
+
+
+def neighbours(xy: Array, step: int) -> NDArray[np.int64]:
+    """The rows of up to four pairs of opposite neighbours on the grid, (n, 4, 2), -1 where there is none."""
     cells = np.round(xy / step).astype(int)
     cells -= cells.min(axis=0) - 1
-    doubt = np.zeros(len(xy)) if doubt is None else doubt
-    field = np.full((*(cells.max(axis=0) + 2), values.shape[1] + 1), np.nan)
-    field[cells[:, 0], cells[:, 1]] = np.column_stack([values, doubt])
-    means = []
-    for i, j in _OPPOSITE:
-        after = field[cells[:, 0] + i, cells[:, 1] + j]
-        before = field[cells[:, 0] - i, cells[:, 1] - j]
-        fit_to_judge = np.fmax(after[:, -1], before[:, -1]) <= doubt
-        means.append(np.where(fit_to_judge[:, None], 0.5 * (after + before)[:, :-1], np.nan))
-    return np.asarray(np.linalg.norm(values - _median(np.stack(means), axis=0), axis=1))
+    row = np.full(cells.max(axis=0) + 2, -1)
+    row[cells[:, 0], cells[:, 1]] = np.arange(len(xy))
+    pairs = [[row[cells[:, 0] + sign * i, cells[:, 1] + sign * j] for sign in (1, -1)] for i, j in _OPPOSITE]
+    return np.ascontiguousarray(np.moveaxis(np.array(pairs), -1, 0))
 
 
-def surface_outliers(xy: Array, values: Array, step: int, factor: float = 10.0, floor: float = 0.1) -> Mask:
-    """Points (n,) whose values (n, 3) mm contradict their neighbours by more than ``floor`` mm and usual scatter."""
-    residual = midpoint_residuals(xy, values, step)
+def _residuals(
+    pairs: NDArray[np.int64], values: Array, doubt: Array | None, rows: NDArray[np.intp] | None = None
+) -> Array:
+    """The same of all points or of some rows (r,), by their neighbours."""
+    doubt = np.zeros(len(values)) if doubt is None else doubt
+    rows = np.arange(len(values)) if rows is None else rows
+    return np.asarray(kernels.midpoint_residuals(pairs, np.ascontiguousarray(values, dtype=float), doubt, rows))
+
+
+def surface_outliers(pairs: NDArray[np.int64], values: Array, factor: float = 10.0, floor: float = 0.1) -> Mask:
+    """Points (n,) whose values (n, 3) mm contradict their neighbours by more than ``floor`` mm and usual scatter.
+
+    pairs : (n, 4, 2), of :func:`neighbours`.
+    """
+    residual = _residuals(pairs, values, None)
     usual = float(np.nanmedian(residual)) if np.isfinite(residual).any() else 0.0
     limit = max(factor * usual, floor)
     with np.errstate(invalid="ignore"):
         suspect = residual > limit
         # At the rim a good point may have been judged by a wrong one, which then lies further off itself.
-        again = midpoint_residuals(xy, values, step, doubt=np.where(suspect, residual, 0.0))
-        return suspect & (again > limit)
+        doubt = np.where(suspect, residual, 0.0)
+        suspect[suspect] = _residuals(pairs, values, doubt, np.flatnonzero(suspect)) > limit
+        return np.asarray(suspect)
 
 
-def _median(values: Array, axis: int) -> Array:
-    """Median without NaN along an axis, without the warning where nothing is left."""
-    ordered = np.sort(values, axis=axis)  # NaN last
-    last = np.maximum(np.isfinite(values).sum(axis=axis, keepdims=True) - 1, 0)
-    lower = np.take_along_axis(ordered, last // 2, axis=axis)
-    upper = np.take_along_axis(ordered, (last + 1) // 2, axis=axis)
-    return np.squeeze(0.5 * (lower + upper), axis=axis)
+def _medians(values: Array) -> Array:
+    """Medians (C, 2) over the points of (C, n, 2), without NaN and without a warning where nothing is left."""
+    return np.array([[_median(one[np.isfinite(one)]) for one in camera.T] for camera in values])
+
+
+def _median(values: Array) -> float:
+    half = len(values) // 2
+    if not half:
+        return float(values[0]) if len(values) else np.nan
+    ordered = np.partition(values, (half - 1, half))
+    return float(0.5 * (ordered[(len(values) - 1) // 2] + ordered[half]))

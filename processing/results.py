@@ -19,9 +19,10 @@ What follows from the stored arrays is computed when it is read: a step takes ab
 from __future__ import annotations
 
 import json
-import math
+import os
 import tomllib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -36,8 +37,9 @@ from processing.deformation import Deformation, deformation
 from processing.errors import InputError
 from processing.fields import Certainty, Field, StepFields, available, compute_fields
 from processing.fields import field as field_of
+from processing.json_values import plain
 from processing.mesh import Mesh
-from processing.ranges import Ranges
+from processing.ranges import Extent, Ranges
 from processing.rigid_motion import RigidMotion, motion_to_reference
 from processing.strain_window import StrainWindow, strain_window
 from processing.uncertainty.strain import overlap
@@ -45,6 +47,7 @@ from processing.uncertainty.window import WindowScatter, window_scatter
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+StepArrays = tuple[Array, dict[str, NDArray[Any]], dict[str, NDArray[Any]]]
 SCHEMA = 2
 
 #: Arrays kept for every step as they are; the other fields follow from them and from the positions.
@@ -220,8 +223,15 @@ class Results:
         motion, current = self.motion(step, previous), self.vertices[step]
         if rigid_motion_removed:
             motion, current = RigidMotion(np.eye(3), np.zeros(3)), motion.apply(current)
+        certainty = self.certainty(step, previous)
+        return compute_fields(
+            self.before(step, previous), current, self.faces, motion, certainty, self.pair, window, scatter
+        )
+
+    def certainty(self, step: int, previous: bool = False) -> Certainty:
+        """What is known of each point and triangle beside its place; previous as of :meth:`deformation`."""
         of_motion = None if previous else step  # what cameras add is known of the motion since the reference
-        certainty = Certainty(
+        return Certainty(
             self.correlation[step],
             self.sigma_xyz[step],
             self._since(self.sigma_displacement, step, previous),
@@ -230,9 +240,6 @@ class Results:
             _at(self.sigma_calibration, step),
             _at(self.sigma_displacement_calibration, of_motion),
             _at(self.sigma_lambda_calibration, of_motion),
-        )
-        return compute_fields(
-            self.before(step, previous), current, self.faces, motion, certainty, self.pair, window, scatter
         )
 
     def _since(self, sigma: Array | None, step: int, previous: bool) -> Array | None:
@@ -258,23 +265,35 @@ def write_results(path: Path, results: Results, progress: Callable[[float], None
     """Compute all fields and write the file; ``path`` must not exist. ``progress`` is told the share done."""
     window = strain_window(results.mesh, results.window_mm) if results.window_mm > 0 else None
     scatter = None if window is None else results.scatter(window)
-    with h5py.File(path, "x") as file:
-        group = vtkhdf.create(file, results.faces, len(results.vertices_ref), len(results.steps))
-        ranges: Ranges | None = None
-        for step in range(len(results.steps)):
-            fields = results.fields(step, window, scatter=scatter)
-            if ranges is None:
-                ranges = Ranges(available(fields.names))
-                for name in _CONSTANT:
-                    vtkhdf.write_constant(group, "CellData", name, fields.face[name].astype(np.float32))
-            current = results.vertices[step]
-            measured = np.isfinite(current).all(axis=1)
-            positions = np.where(measured[:, None], current, results.vertices_ref)
-            flags = {"measured": measured.astype(np.uint8), "status": results.status[step].astype(np.int8)}
-            vtkhdf.write_step(group, step, positions, {**_kept(fields.point), **flags}, _kept(fields.face))
-            ranges.add(fields)
-            progress((step + 1) / len(results.steps))
-        _write_rest(file.create_group("ringdic"), results, ranges or Ranges(()))
+    steps = range(len(results.steps))
+    with h5py.File(path, "x") as file, ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        group = vtkhdf.create(file, results.faces, len(results.vertices_ref), len(steps))
+        first = results.fields(0, window, scatter=scatter)
+        ranges = Ranges(available(first.names))
+        for name in _CONSTANT:
+            vtkhdf.write_constant(group, "CellData", name, first.face[name].astype(np.float32))
+
+        def found(step: int) -> tuple[StepArrays, Extent]:
+            fields = results.fields(step, window, scatter=scatter) if step else first
+            return _arrays(results, step, fields), ranges.extent(fields)
+
+        at_once = os.cpu_count() or 1  # bounds the memory
+        for start in steps[::at_once]:
+            some = steps[start : start + at_once]
+            for step, (arrays, extent) in zip(some, pool.map(found, some), strict=True):
+                vtkhdf.write_step(group, step, *arrays)
+                ranges.take(extent)
+                progress((step + 1) / len(steps))
+        _write_rest(file.create_group("ringdic"), results, ranges)
+
+
+def _arrays(results: Results, step: int, fields: StepFields) -> StepArrays:
+    """Positions, arrays of the points and of the faces of one step, as they are stored."""
+    current = results.vertices[step]
+    measured = np.isfinite(current).all(axis=1)
+    positions = np.where(measured[:, None], current, results.vertices_ref)
+    flags = {"measured": measured.astype(np.uint8), "status": results.status[step].astype(np.int8)}
+    return positions, {**_kept(fields.point), **flags}, _kept(fields.face)
 
 
 def _at(known: Array | None, step: int | None) -> Array | None:
@@ -295,7 +314,7 @@ def read_results(path: Path, matches: bool = True) -> Results:
         steps = tuple(json.loads(own.attrs["steps"]))
         F, N = len(steps), len(own["reference"])
         measured = group["PointData/measured"][:].reshape(F, N).astype(bool)
-        known: dict[str, Any] = {name: _stored(group, name, kind, F) for name, kind in WHERE_KNOWN.items()}
+        known: dict[str, Any] = {name: vtkhdf.read_steps(group, name, kind, F) for name, kind in WHERE_KNOWN.items()}
         return Results(
             rig=str(own.attrs["rig"]),
             steps=steps,
@@ -412,8 +431,8 @@ def _write_rest(own: h5py.Group, results: Results, ranges: Ranges) -> None:
     own["rigid_motion/R"] = np.array([motion.R for motion in motions])
     own["rigid_motion/t"] = np.array([motion.t for motion in motions])
     own["settings"] = results.settings
-    own["calibration"] = json.dumps(_plain(results.calibration), allow_nan=False)
-    own["summary"] = json.dumps(_plain(results.summary), allow_nan=False)
+    own["calibration"] = json.dumps(plain(results.calibration), allow_nan=False)
+    own["summary"] = json.dumps(plain(results.summary), allow_nan=False)
     cameras = own.create_group("cameras")
     for camera in results.cameras:
         group = cameras.create_group(camera.id)
@@ -425,19 +444,8 @@ def _write_rest(own: h5py.Group, results: Results, ranges: Ranges) -> None:
         group.attrs["cameras"] = json.dumps(matches.cameras)
         group.attrs["seconds"] = json.dumps(matches.seconds)
         for name in ("xy", "px", "c_ls", "sigma", "status", "vertex"):
-            values = np.asarray(getattr(matches, name))
-            group.create_dataset(name, data=values, compression="gzip", compression_opts=1, shuffle=True)
+            group[name] = np.asarray(getattr(matches, name))
     own.require_group("matches")
-
-
-def _stored(group: h5py.Group, name: str, kind: str, steps: int) -> Array | None:
-    """One of the arrays that not every run has, (F, N), (F, N, 3) or (F, M, 2)."""
-    places = [f"CellData/{name}{k}" for k in (1, 2)] if kind == "face" else [f"PointData/{name}"]
-    if not all(place in group for place in places):
-        return None
-    parts = [group[place][:].astype(float) for place in places]
-    stored = np.stack(parts, axis=-1) if kind == "face" else parts[0]
-    return stored.reshape(steps, -1, *stored.shape[1:])
 
 
 def _open(path: Path) -> h5py.File:
@@ -468,17 +476,6 @@ def _check(holder: object, shapes: dict[str, tuple[int, ...]]) -> None:
 
 def _pairs(own: h5py.Group) -> tuple[tuple[str, str], ...]:
     return tuple((first, second) for first, second in json.loads(own.attrs["pairs"]))
-
-
-def _plain(value: Any) -> Any:
-    """The same as JSON knows it: arrays as lists, what is not finite as null."""
-    if isinstance(value, dict):
-        return {str(key): _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _text(own: h5py.Group, name: str) -> str:

@@ -11,9 +11,12 @@ shows in the matches in time; what more a match between cameras leaves over is t
 
 from __future__ import annotations
 
+import os
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +24,7 @@ from numpy.typing import NDArray
 from processing.calibration.bundle import BundleFit
 from processing.calibration.parameters import PER_CAMERA
 from processing.camera import Camera
+from processing.point_kernels import gradients
 from processing.results import Matches, Results
 from processing.uncertainty.calibration import (
     CameraCovariance,
@@ -115,26 +119,65 @@ def _with_scatter(results: Results) -> Results:
     group = tomllib.loads(results.settings).get("correlation", {})
     radius, order = int(group.get("radius_px", 20)), int(group.get("order", 1))
     cameras = {camera.id: camera for camera in results.cameras}
-    scatter = [_noise_in_time(matches) for matches in results.matches]
-    edges = [_edges(matches, results.faces, N) for matches in results.matches]
-    first = [_stretched(*each, 0) for each in zip(results.matches, edges, strict=True)]
-    for step in range(1, F):
-        parts = _Sources(np.zeros((4, N, 3, 2)), np.full((N, 2), np.nan), np.full((4, N, 2), np.nan))
-        for k, matches in enumerate(results.matches):
-            pair = [cameras[id_] for id_ in matches.cameras]
-            gradients = first[k], _stretched(matches, edges[k], step)
-            _fill(parts, results, pair, matches, scatter[k][step], gradients, step)
-            held = matches.vertex >= 0
-            parts.px[matches.vertex[held]] = matches.xy[held] + (k * _APART, 0.0)
-        found = results.deformation(step)
-        displacement[step] = np.sqrt(np.einsum("nii->ni", covariance(parts.gain, parts.sigma)))
-        stretches[step] = stretch_sigma(
-            found, results.vertices_ref, results.faces, parts.gain, np.broadcast_to(parts.px, (4, N, 2)),
-            parts.sigma, radius, order,
-        )  # fmt: skip
-        displacement[step, ~np.isfinite(results.vertices[step]).all(axis=1)] = np.nan
-        stretches[step, ~np.isfinite(found.J)] = np.nan
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        pairs = list(pool.map(partial(_Pair.of, results, cameras), range(len(results.matches))))
+        px = np.full((N, 2), np.nan)
+        for pair in pairs:
+            px[pair.matches.vertex[pair.held]] = pair.px
+        found = pool.map(partial(_step_scatter, results, pairs, px, radius, order), range(1, F))
+        for step, (one, two) in enumerate(found, start=1):
+            displacement[step], stretches[step] = one, two
     return replace(results, sigma_displacement=displacement, sigma_lambda=stretches)
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """What the steps of a pair have in common.
+
+    cameras, matches : n points. held : rows of those that have a vertex, and px (k, 2) their places, apart from other
+    pairs'. noise : (F, n, 2) px. edges : (E, 2). gradient : (n, 2, 2) of the match at the reference, and gain :
+    (2, n, 3, 2) mm a px there.
+    """
+
+    cameras: tuple[Camera, ...]
+    matches: Matches
+    held: Ints
+    px: Array
+    noise: Array
+    edges: Ints
+    gradient: Array
+    gain: Array
+
+    @classmethod
+    def of(cls, results: Results, cameras: Mapping[str, Camera], k: int) -> _Pair:
+        """Of the k-th matches of some results."""
+        matches = results.matches[k]
+        own = tuple(cameras[id_] for id_ in matches.cameras)
+        held = np.flatnonzero(matches.vertex >= 0)
+        edges = _edges(matches, results.faces, len(results.vertices_ref))
+        gain = np.zeros((2, len(matches.xy), 3, 2))
+        gain[:, held] = position_gain(own, results.vertices_ref[matches.vertex[held]], np.ones((2, len(held), 2)))
+        px = matches.xy[held] + (k * _APART, 0.0)
+        return cls(own, matches, held, px, _noise_in_time(matches), edges, _stretched(matches, edges, 0), gain)
+
+
+def _step_scatter(
+    results: Results, pairs: Sequence[_Pair], px: Array, radius: int, order: int, step: int
+) -> tuple[Array, Array]:
+    """Standard deviations of a step's displacements (N, 3) mm and stretches (M, 2). px : (N, 2)."""
+    N = len(results.vertices_ref)
+    parts = _Sources(np.zeros((4, N, 3, 2)), px, np.full((4, N, 2), np.nan))
+    for pair in pairs:
+        _fill(parts, results, pair, step)
+    found = results.deformation(step)
+    displacement = np.sqrt(np.einsum("nii->ni", covariance(parts.gain, parts.sigma)))
+    stretches = stretch_sigma(
+        found, results.vertices_ref, results.faces, parts.gain, np.broadcast_to(parts.px, (4, N, 2)), parts.sigma,
+        radius, order,
+    )  # fmt: skip
+    displacement[~np.isfinite(results.vertices[step]).all(axis=1)] = np.nan
+    stretches[~np.isfinite(found.J)] = np.nan
+    return displacement, stretches
 
 
 def _noise_in_time(matches: Matches) -> Array:
@@ -150,27 +193,23 @@ def _noise_in_time(matches: Matches) -> Array:
     return np.asarray(stated * share[:, None, None])
 
 
-def _fill(
-    parts: _Sources,
-    results: Results,
-    pair: Sequence[Camera],
-    matches: Matches,
-    noise: Array,
-    gradients: tuple[Array, Array],
-    step: int,
-) -> None:
-    """Add the points of one pair. noise : (n, 2) px. gradients : (n, 2, 2) of the match at the reference and now."""
-    used = np.flatnonzero((matches.vertex >= 0) & (matches.status[step] == 0) & np.isfinite(noise).all(axis=1))
+def _fill(parts: _Sources, results: Results, pair: _Pair, step: int) -> None:
+    """Add the points of one pair."""
+    matches, noise = pair.matches, pair.noise[step]
+    used = pair.held[(matches.status[step, pair.held] == 0) & np.isfinite(noise[pair.held]).all(axis=1)]
     who = matches.vertex[used]
-    alike = np.ones((2, len(used), 2))
-    before = position_gain(pair, results.vertices_ref[who], alike)
-    now = position_gain(pair, results.vertices[step, who], alike)
-    G0, G = (each[used] for each in gradients)
+    now = position_gain(pair.cameras, results.vertices[step, who], np.ones((2, len(used), 2)))
+    before, G0, G = pair.gain[:, used], pair.gradient[used], _stretched(matches, pair.edges, step)[used]
     seen, seen_first = now[1] @ G, before[1] @ G0
     parts.gain[:, who] = np.stack([now[0] + seen - seen_first, now[0], seen, seen_first])
     # A patch that is larger in the second image has more pixels there that tell its place.
-    larger = [np.ones(len(used)), np.ones(len(used)), np.abs(np.linalg.det(G)), np.abs(np.linalg.det(G0))]
+    larger = [np.ones(len(used)), np.ones(len(used)), _area(G), _area(G0)]
     parts.sigma[:, who] = noise[used] / np.sqrt(np.stack(larger))[..., None]
+
+
+def _area(G: Array) -> Array:
+    """How much larger a patch is in the other image, (n,), by gradients (n, 2, 2)."""
+    return np.asarray(np.abs(G[:, 0, 0] * G[:, 1, 1] - G[:, 0, 1] * G[:, 1, 0]))
 
 
 def _edges(matches: Matches, faces: Ints, count: int) -> Ints:
@@ -190,14 +229,8 @@ def _stretched(matches: Matches, edges: Ints, step: int) -> Array:
 
     Where no neighbour was matched the median of all stands for it.
     """
-    a, b = edges[(matches.status[step][edges] == 0).all(axis=1)].T
-    apart, there = matches.xy[b] - matches.xy[a], matches.px[step, 1, b] - matches.px[step, 1, a]
-    square, mixed = np.zeros((len(matches.xy), 2, 2)), np.zeros((len(matches.xy), 2, 2))
-    for end in (a, b):
-        np.add.at(square, end, apart[:, :, None] * apart[:, None, :])
-        np.add.at(mixed, end, there[:, :, None] * apart[:, None, :])
-    spans = np.linalg.det(square) > 1e-3 * np.trace(square, axis1=1, axis2=2) ** 2
     out = np.full((len(matches.xy), 2, 2), np.nan)
-    out[spans] = mixed[spans] @ np.linalg.inv(square[spans])
+    there = np.ascontiguousarray(matches.px[step, 1])
+    spans = gradients(np.ascontiguousarray(matches.xy), there, matches.status[step], edges, out)
     out[~spans] = np.median(out[spans], axis=0) if spans.any() else np.eye(2)
     return out

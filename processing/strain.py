@@ -23,9 +23,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.triangle_kernels import linear_principal
+
 Array = NDArray[np.float64]
 
 GREEN_LAGRANGE, BIOT, HENCKY, EULER_ALMANSI = 1.0, 0.5, 0.0, -1.0
+_LOGARITHMIC = 1e-18  # an exponent below it changes no digit of the logarithm, and products with it may underflow
 
 
 def seth_hill(stretch: Array, m: float) -> Array:
@@ -33,14 +36,18 @@ def seth_hill(stretch: Array, m: float) -> Array:
 
     Written with ``expm1``: small strains keep their digits, and small m runs smoothly into the logarithm.
     """
-    log = np.log(stretch)
-    return log if m == 0 else np.expm1(2.0 * m * log) / (2.0 * m)
+    return seth_hill_of_log(np.log(stretch), m)
+
+
+def seth_hill_of_log(log: Array, m: float) -> Array:
+    """The same of the logarithms of stretches."""
+    return log if abs(m) < _LOGARITHMIC else np.expm1(2.0 * m * log) / (2.0 * m)
 
 
 def bazant(stretch: Array, m: float) -> Array:
     """Bažant's (1998) symmetric family ``(λ^m - λ^-m) / (2m)``: opposite for inverse stretches; ``ln λ`` for m = 0."""
     log = np.log(stretch)
-    return log if m == 0 else np.sinh(m * log) / m
+    return log if abs(m) < _LOGARITHMIC else np.sinh(m * log) / m
 
 
 def magnitude(first: Array, second: Array) -> Array:
@@ -74,13 +81,15 @@ def infinitesimal(F: Array, normal_reference: Array) -> Array:
     return np.asarray(in_plane @ linear @ in_plane)
 
 
-def infinitesimal_principal(F: Array, normal_reference: Array) -> tuple[Array, Array]:
-    """Principal values (...), first ≤ second, of the same tensor in the tangent plane."""
-    linear = infinitesimal(F, normal_reference)
-    half = 0.5 * np.trace(linear, axis1=-2, axis2=-1)
-    square = np.einsum("...ij,...ij->...", linear, linear)
-    radius = np.sqrt(np.maximum(0.5 * square - half**2, 0.0))
-    return half - radius, half + radius
+def infinitesimal_principal(F: Array, normal_reference: Array, turn: Array | None = None) -> tuple[Array, Array]:
+    """Principal values (...), first ≤ second, of the same tensor, after a rotation (3, 3) if there is one."""
+    shape = F.shape[:-2]
+    normal = np.ascontiguousarray(np.broadcast_to(normal_reference, (*shape, 3)))
+    out = np.empty((2, *shape))
+    turn = np.eye(3) if turn is None else np.ascontiguousarray(turn, dtype=float)
+    tensors = np.ascontiguousarray(F, dtype=float).reshape(-1, 3, 3)
+    linear_principal(turn, tensors, normal.reshape(-1, 3), out.reshape(2, -1))
+    return out[0], out[1]
 
 
 def _square(direction: Array) -> Array:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
-from dataclasses import asdict
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -39,7 +42,8 @@ def summarise(
     drift : (F,) px by pair or camera, the mean vertical residual of each step: cameras that moved between frames.
     agreement : of the surfaces of camera pairs, or of the cameras about the points that all measured together.
     """
-    steps = [_step(results, k) for k in range(len(results.steps))]
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        steps = list(pool.map(partial(_step, results), range(len(results.steps))))
     control = {
         "mean_mm": _mean([error.mean for error in errors.values()]),
         "rms_mm": _mean([error.rms for error in errors.values()]),
@@ -74,7 +78,8 @@ def _calibration(ring: Ring) -> dict[str, Any]:
 
 def _strain(results: Results) -> dict[str, float | None]:
     """What a strain averages over, mm: each triangle alone, and the window if the run has one."""
-    alone, over = gauge(results, 0.0), gauge(results, results.window_mm)
+    alone = gauge(results, 0.0)
+    over = replace(alone, width=results.window_mm)
     return {
         "step_mm": _number(alone.step),
         "subset_mm": _number(alone.subset),
@@ -90,7 +95,7 @@ def _uncertainty(results: Results, ring: Ring) -> dict[str, Any]:
     None for what is not known; ``why`` tells why the calibration's are not.
     """
     last = int(np.flatnonzero(np.isfinite(results.vertices[..., 0]).any(axis=1))[-1])
-    arrays = results.fields(last)
+    arrays = results.certainty(last).fields()
     known = {entry.name: entry for entry in available(arrays.names)}
 
     def row(names: Mapping[str, str]) -> dict[str, float | None]:

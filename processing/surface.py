@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from processing.camera import Camera
 from processing.matching import PairMatches
 from processing.mesh import Mesh
-from processing.outliers import Lost, crossing_outliers, surface_outliers
+from processing.outliers import Lost, crossing_outliers, neighbours, surface_outliers
 from processing.results import Matches
 from processing.triangulation import LinearSystem, reprojection_residuals
 from processing.uncertainty.position import linear_sigma
@@ -50,6 +50,7 @@ def pair_surface(cameras: tuple[Camera, Camera], found: PairMatches, step_px: in
         uncertain = (matches.sigma > sigma_max_px).any(axis=(1, 3))
     status = np.where((matches.status == 0) & uncertain, Lost.UNCERTAIN, matches.status).astype(np.int8)
     drift = np.full(steps, np.nan)
+    beside = neighbours(matches.xy, step_px)
     for step in range(steps):
         good = status[step] == 0
         px = np.where(good[None, :, None], matches.px[step], np.nan)
@@ -61,7 +62,7 @@ def pair_surface(cameras: tuple[Camera, Camera], found: PairMatches, step_px: in
             drift[step] = float(np.nanmean(residuals[0, :, 1]))
         status[step, good & crossing_outliers(residuals)] = Lost.RESIDUAL
         xyz[step, status[step] != 0] = np.nan
-        _drop_off_surface(matches.xy, xyz, status, step, step_px)
+        _drop_off_surface(beside, xyz, status, step)
     sigma[status != 0] = np.nan
     whole = _whole_faces(xyz[0], found.faces, cameras)
     used = np.unique(whole)
@@ -79,10 +80,10 @@ def pair_surface(cameras: tuple[Camera, Camera], found: PairMatches, step_px: in
     )
 
 
-def _drop_off_surface(xy: Array, xyz: Array, status: NDArray[np.int8], step: int, step_px: int) -> None:
+def _drop_off_surface(beside: NDArray[np.int64], xyz: Array, status: NDArray[np.int8], step: int) -> None:
     """Drop points off the surface of their neighbours, or that moved otherwise than their neighbours did."""
     values = xyz[step] if step == 0 else xyz[step] - xyz[0]
-    lost = surface_outliers(xy, values, step_px)
+    lost = surface_outliers(beside, values)
     status[step, lost] = Lost.SURFACE
     xyz[step, lost] = np.nan
     # A point without a reference cannot be tracked.

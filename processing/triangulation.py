@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from processing import point_kernels as kernels
 from processing.camera import Camera
 
 Array = NDArray[np.float64]
@@ -37,15 +38,19 @@ def triangulate(cameras: Sequence[Camera], px: Array) -> Array:
 
 def triangulate_undistorted(P: Array, px: Array) -> Array:
     """The same from projection matrices (C, 3, 4) and undistorted pixels (C, n, 2). (n, 3) mm, NaN as above."""
-    return LinearSystem(np.asarray(P, dtype=float), np.asarray(px, dtype=float)).solution
+    return LinearSystem(P, px).solution
 
 
 @dataclass(frozen=True)
 class LinearSystem:
-    """Eq. 7-9 of n points in C images: P (C, 3, 4) and undistorted pixels (C, n, 2)."""
+    """Eq. 7-9 of n points in C images: P (C, 3, 4) and undistorted pixels (C, n, 2), NaN for a camera without part."""
 
     P: Array
     undistorted: Array
+
+    def __post_init__(self) -> None:
+        for name in ("P", "undistorted"):
+            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=float))
 
     @classmethod
     def of(cls, cameras: Sequence[Camera], px: Array) -> LinearSystem:
@@ -59,51 +64,31 @@ class LinearSystem:
         return cls(np.stack([camera.P for camera in cameras]), undistorted)
 
     @cached_property
-    def equations(self) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """A (C, n, 2, 3), b (C, n, 2) and which cameras take part (C, n)."""
-        return equations(self.P, self.undistorted)
+    def _summed(self) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.bool_]]:
+        """``AᵀA`` (n, 3, 3), ``Aᵀb`` (n, 3), cameras a point (n,), and which ``AᵀA`` are well conditioned for sure."""
+        n = self.undistorted.shape[1]
+        normal, right, seen = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty(n, np.int64)
+        return normal, right, seen, kernels.normal_equations(self.P, self.undistorted, normal, right, seen)
 
-    @cached_property
+    @property
     def normal(self) -> Array:
         """``AᵀA``. (n, 3, 3)."""
-        A = _stacked(self.equations[0])
-        return A.transpose(0, 2, 1) @ A
+        return self._summed[0]
 
     @cached_property
     def solvable(self) -> NDArray[np.bool_]:
         """Points (n,) with two cameras whose lines of sight cross."""
-        return determined(self.normal, self.equations[2])
+        normal, _, seen, sure = self._summed
+        solvable = sure.copy()
+        solvable[~sure] = _well_conditioned(normal[~sure])
+        return np.asarray(solvable & (seen >= 2))
 
     @cached_property
     def solution(self) -> Array:
         """(n, 3) mm, NaN where it is not determined."""
-        A, b, _ = self.equations
-        right = _stacked(A).transpose(0, 2, 1) @ _stacked(b[..., None])
-        xyz = np.full((len(self.normal), 3), np.nan)
-        xyz[self.solvable] = np.linalg.solve(self.normal[self.solvable], right[self.solvable])[..., 0]
+        xyz = np.empty(self.normal.shape[:2])
+        kernels.solve(self.normal, self._summed[1], self.solvable, xyz)
         return xyz
-
-
-def _stacked(rows: Array) -> Array:
-    """The equations (C, n, 2, k) of all cameras under one another. (n, 2 C, k)."""
-    return np.moveaxis(rows, 0, 1).reshape(rows.shape[1], -1, rows.shape[3])
-
-
-def equations(P: Array, px: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """The equations ``A X = b`` of eq. 7-9, from matrices (C, 3, 4) and undistorted pixels (C, n, 2).
-
-    Returns A (C, n, 2, 3), b (C, n, 2), both zero for a camera that takes no part, and which take part, (C, n).
-    """
-    P, px = np.asarray(P, dtype=float), np.asarray(px, dtype=float)
-    seen: NDArray[np.bool_] = np.all(np.isfinite(px), axis=-1)
-    rows = P[:, None, :2, :] - px[..., None] * P[:, None, 2:, :]  # (C, n, 2, 4)
-    rows = np.where(seen[..., None, None], rows, 0.0)
-    return rows[..., :3], -rows[..., 3], seen
-
-
-def determined(normal: Array, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which points (n,) have two cameras whose lines of sight cross. normal : ``AᵀA`` (n, 3, 3); seen : (C, n)."""
-    return np.asarray((seen.sum(axis=0) >= 2) & _well_conditioned(normal))
 
 
 def _well_conditioned(normal: Array) -> NDArray[np.bool_]:

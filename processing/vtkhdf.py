@@ -73,6 +73,16 @@ def read_step(group: h5py.Group, place: str, name: str, step: int) -> NDArray[np
     return np.asarray(group[place][name][start : start + rows])
 
 
+def read_steps(group: h5py.Group, name: str, kind: str, steps: int) -> NDArray[np.float64] | None:
+    """An array of all steps, None where there is none: kind "point" (F, N), "vector" (F, N, 3), "face" (F, M, 2)."""
+    places = [f"CellData/{name}{k}" for k in (1, 2)] if kind == "face" else [f"PointData/{name}"]
+    if not all(place in group for place in places):
+        return None
+    parts = [group[place][:].astype(float) for place in places]
+    stored = np.stack(parts, axis=-1) if kind == "face" else parts[0]
+    return stored.reshape(steps, -1, *stored.shape[1:])
+
+
 def _array(group: h5py.Group, place: str, name: str, values: NDArray[np.generic]) -> h5py.Dataset:
     if name not in group[place]:
         steps = int(group["Steps"].attrs["NSteps"])

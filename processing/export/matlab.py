@@ -137,8 +137,8 @@ def _named(found: Deformation) -> dict[str, NDArray[np.float32]]:
 def _floats_a_face() -> int:
     one = np.ones((1, 3, 3))
     found = dict.fromkeys(Deformation.__dataclass_fields__, one[:, 0, 0])
-    found |= dict.fromkeys(("F", "E", "e"), one)
-    found |= {name: one[:, 0] for name in found if name.startswith(("direction", "normal"))}
+    found |= {name: one[:, 0] for name in found if name.startswith("direction")}
+    found |= dict.fromkeys(("F", "E", "directors_reference", "directors_current"), one)
     return sum(values.size for values in _named(Deformation(**found)).values())
 
 

@@ -16,7 +16,7 @@ from processing.multiview.matching import Image
 from processing.multiview.shape import ReferenceShape
 from processing.multiview.tracking import Track, Tracking, track
 from processing.multiview.weights import smooth_sigma
-from processing.outliers import Lost, surface_outliers
+from processing.outliers import Lost, neighbours, surface_outliers
 from processing.uncertainty.matches import match_parts
 from processing.uncertainty.noise import camera_noise
 from processing.uncertainty.texture import Texture
@@ -187,7 +187,7 @@ def _step(cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, step
     lost: Mask = np.asarray(~np.isfinite(points.xyz).all(axis=1))
     status = np.where(lost, np.where(enough, Lost.RESIDUAL, status), 0).astype(np.int8)
     moved = np.where(lost[:, None], np.nan, points.xyz - shape.xyz)
-    status = np.where(surface_outliers(shape.node.astype(float), moved, 1), Lost.SURFACE, status)
+    status = np.where(surface_outliers(neighbours(shape.node.astype(float), 1), moved), Lost.SURFACE, status)
     measured: Mask = np.asarray(status == 0)
     used &= measured
     motion.status[step] = status

@@ -19,6 +19,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from processing import point_kernels as kernels
 from processing.camera import Camera
 from processing.triangulation import LinearSystem
 
@@ -31,21 +32,13 @@ def position_gain(cameras: Sequence[Camera], xyz: Array, sigma: Array) -> Array:
     xyz : (n, 3) mm, as ``triangulate_weighted`` found them with sigma : (C, n, 2) px, NaN for a camera that took no
     part.
     """
-    sigma = np.asarray(sigma, dtype=float)
-    gain = np.zeros((len(cameras), len(xyz), 3, 2))
-    normal = np.zeros((len(xyz), 3, 3))
+    sigma = np.ascontiguousarray(sigma, dtype=float)
+    slopes = np.full((len(cameras), len(xyz), 2, 3), np.nan)
     for k, camera in enumerate(cameras):
         index = np.flatnonzero(np.isfinite(sigma[k]).all(axis=1) & np.isfinite(xyz).all(axis=1))
-        _, slope = camera.project_with_slope(xyz[index])
-        weighted = slope / sigma[k, index, :, None] ** 2
-        normal[index] += weighted.transpose(0, 2, 1) @ slope
-        gain[k, index] = weighted.transpose(0, 2, 1)
-    seen = np.linalg.det(normal) > 0
-    inverse = np.full_like(normal, np.nan)
-    inverse[seen] = np.linalg.inv(normal[seen])
-    for k in range(len(cameras)):
-        index = np.flatnonzero(gain[k].any(axis=(1, 2)))
-        gain[k, index] = inverse[index] @ gain[k, index]
+        slopes[k, index] = camera.project_with_slope(xyz[index])[1]
+    gain = np.empty((len(cameras), len(xyz), 3, 2))
+    kernels.gain(slopes, sigma, gain)
     return gain
 
 
@@ -54,15 +47,8 @@ def covariance(gain: Array, sigma: Array) -> Array:
 
     NaN where fewer than two cameras take part.
     """
-    total = np.zeros((gain.shape[1], 3, 3))
-    count = np.zeros(gain.shape[1], dtype=int)
-    for one, scatter in zip(gain, sigma, strict=True):
-        index = np.flatnonzero(one.any(axis=(1, 2)))
-        scaled = one[index] * scatter[index, None, :]
-        total[index] += scaled @ scaled.transpose(0, 2, 1)
-        count[index] += 1
-    total[count < 2] = np.nan
-    return total
+    found = kernels.covariance(np.ascontiguousarray(gain, dtype=float), np.ascontiguousarray(sigma, dtype=float))
+    return np.asarray(found)
 
 
 def along_surface(cameras: Sequence[Camera], reference: NDArray[np.int64], xyz: Array, normals: Array) -> Array:
@@ -145,24 +131,10 @@ def linear_sigma(cameras: Sequence[Camera], system: LinearSystem, sigma: Array) 
     The linear solution minimises ``|A(px) X - b(px)|²``; for consistent pixels its change is ``dX = -(AᵀA)⁻¹ Aᵀ dr``
     with ``dr = (dA) X - db``, and the residual of a camera moves by ``-(p3 · (X, 1))`` times the change of its pixel.
     """
-    A, _, seen = system.equations
-    solvable, xyz = system.solvable, system.solution
-    inverse = np.full_like(system.normal, np.nan)
-    inverse[solvable] = np.linalg.inv(system.normal[solvable])
-    variance = np.zeros_like(xyz)
+    slopes = np.full((*system.undistorted.shape, 2), np.nan)
     for k, camera in enumerate(cameras):
-        depth = xyz @ camera.P[2, :3] + camera.P[2, 3]
-        # Change of the point by each pixel coordinate of the image: (n, 3, 2).
-        slope = inverse @ A[k].transpose(0, 2, 1) * depth[:, None, None]
         if camera.intrinsics is not None:
-            slope = slope @ np.linalg.inv(_finite(camera.intrinsics.slope(system.undistorted[k])))
-        pixel = np.where(seen[k, :, None], np.nan_to_num(np.asarray(sigma[k], dtype=float)), 0.0)
-        variance += np.where(seen[k, :, None], ((slope * pixel[:, None, :]) ** 2).sum(axis=2), 0.0)
-    variance[~solvable] = np.nan
-    return np.sqrt(variance)
-
-
-def _finite(slope: Array) -> Array:
-    """Matrices (n, 2, 2), the identity where one is not known: nothing is multiplied by it that counts."""
-    known: NDArray[np.bool_] = np.asarray(np.isfinite(slope).all(axis=(1, 2)))
-    return np.where(known[:, None, None], slope, np.eye(2))
+            slopes[k] = camera.intrinsics.slope(system.undistorted[k])
+    scatter = np.ascontiguousarray(sigma, dtype=float)
+    solved = system.normal, system.solvable, system.solution
+    return np.sqrt(kernels.linear_variance(system.P, system.undistorted, slopes, *solved, scatter))

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from processing import triangle_kernels as kernels
 from processing.deformation import Deformation, directors
 
 Array = NDArray[np.float64]
@@ -57,53 +58,35 @@ def stretch_sigma(
     Where λ1 and λ2 are nearly alike their order sorts the noise too; there the figures are a little large.
     """
     variance = np.zeros((len(faces), 2))
-    slopes, _ = stretch_slopes(found, reference, faces)
-    for one, at, scatter in zip(gain, px, sigma, strict=True):
-        _add_camera(variance, slopes, one, at, scatter, faces, radius, order)
+    slopes = stretch_slopes(found, reference, faces, current_only=True)[0]
+    places = px[:1] if np.ndim(px) == 3 and np.asarray(px).strides[0] == 0 else px  # the same for all of them
+    alike = np.stack([_alike(at, faces, radius, order) for at in places])
+    gain, sigma = np.ascontiguousarray(gain, dtype=float), np.ascontiguousarray(sigma, dtype=float)
+    kernels.stretch_variance(slopes, gain, sigma, alike, np.ascontiguousarray(faces), variance)
     return np.sqrt(np.maximum(variance, 0.0))
 
 
-def stretch_slopes(found: Deformation, reference: Array, faces: Faces) -> tuple[Array, Array]:
+def stretch_slopes(
+    found: Deformation, reference: Array, faces: Faces, current_only: bool = False
+) -> tuple[Array, Array]:
     """How λ1 and λ2 move with the current positions of the corners, and, turned about, with the reference ones.
 
     (2, M, 3, 3) each: stretch, triangle, corner, component. ``δλ = Σ_k g_k · δx_k - Σ_k h_k · δX_k`` with
     ``h_2 = (D¹·N) λ N`` and its like: the corners that an edge is measured from count against those it is measured to.
     """
     D, _ = directors(reference, faces)
-    first, second = _reciprocal_in_plane(D)
-    current, before = np.empty((2, len(faces), 3, 3)), np.empty((2, len(faces), 3, 3))
-    lines = ((found.direction1_reference, found.lambda1), (found.direction2_reference, found.lambda2))
-    for k, (N, stretch) in enumerate(lines):
-        after = np.einsum("mij,mj->mi", found.F, N) / stretch[:, None]
-        for slopes, along in ((current, after), (before, stretch[:, None] * N)):
-            slopes[k, :, 1] = np.einsum("mi,mi->m", first, N)[:, None] * along
-            slopes[k, :, 2] = np.einsum("mi,mi->m", second, N)[:, None] * along
-            slopes[k, :, 0] = -(slopes[k, :, 1] + slopes[k, :, 2])
+    current = np.empty((2, len(faces), 3, 3))
+    before = np.empty((2, 0 if current_only else len(faces), 3, 3))
+    directions = np.stack([found.direction1_reference, found.direction2_reference])
+    kernels.stretch_slopes(D, found.F, directions, np.stack([found.lambda1, found.lambda2]), current, before)
     return current, before
 
 
-def _add_camera(
-    variance: Array, slopes: Array, gain: Array, px: Array, sigma: Array, faces: Faces, radius: float, order: int
-) -> None:
-    """Add what one camera's noise makes of the stretches to their variances (M, 2)."""
-    takes_part: NDArray[np.bool_] = np.asarray(gain.any(axis=(1, 2)))
-    some = np.flatnonzero(takes_part[faces].any(axis=1))
-    corners = faces[some]
-    scaled = np.where(takes_part[:, None, None], gain * np.nan_to_num(sigma)[:, None, :], 0.0)[corners]  # (m, 3, 3, 2)
-    felt = np.einsum("smci,mcij->smcj", slopes[:, some], scaled)  # stretch, triangle, corner, pixel coordinate
-    total = np.einsum("smcj,smcj->ms", felt, felt)
-    for a, b in ((0, 1), (1, 2), (2, 0)):
-        apart = np.linalg.norm(px[corners[:, a]] - px[corners[:, b]], axis=1)
-        alike = np.nan_to_num(overlap(apart, radius, order))
-        total += 2.0 * alike[:, None] * np.einsum("smj,smj->ms", felt[:, :, a], felt[:, :, b])
-    variance[some] += total
-
-
-def _reciprocal_in_plane(D: Array) -> tuple[Array, Array]:
-    """D¹ and D² (M, 3) of directors (M, 3, 3)."""
-    D1, D2, D3 = D[:, 0], D[:, 1], D[:, 2]
-    volume = np.einsum("mi,mi->m", np.cross(D1, D2), D3)[:, None]
-    return np.cross(D2, D3) / volume, np.cross(D3, D1) / volume
+def _alike(px: Array, faces: Faces, radius: float, order: int) -> Array:
+    """Correlations (M, 3) of the errors of corners 0 and 1, 1 and 2, 2 and 0 of each triangle; 0 where not seen."""
+    corners = px[faces]
+    apart = corners - np.roll(corners, -1, axis=1)
+    return np.nan_to_num(overlap(np.hypot(apart[..., 0], apart[..., 1]), radius, order))
 
 
 def _curved() -> tuple[Array, Array]:
