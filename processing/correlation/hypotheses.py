@@ -84,25 +84,32 @@ def _pixels(grey, mask, left_of_mask, top_of_mask, jx, iy, off_x, off_y, radius,
 
 
 @nb.njit(cache=True, nogil=True, fastmath=_FAST)
-def _alike(image, x0, y0, warp, px, n, norm):  # type: ignore[no-untyped-def]
-    """ZNCC of n pixels with the image under a warp (6,), bilinear; -1 where they leave it or the warp is NaN."""
+def _alike(image, x0, y0, warp, px, n, norm, radius, nearest):  # type: ignore[no-untyped-def]
+    """ZNCC of n pixels with the image under a warp (6,), bilinear or of the nearest pixels; -1 where they leave it or
+    the warp is NaN."""
     u, v, ux, uy, vx, vy = warp[0], warp[1], warp[2], warp[3], warp[4], warp[5]
     if n < 8 or not norm > 0.0 or not math.isfinite(u + v + ux + uy + vx + vy):
         return -1.0
     height, width = image.shape
+    wide = (radius + 1.0) * (1.0 + abs(ux) + abs(uy))
+    high = (radius + 1.0) * (1.0 + abs(vx) + abs(vy))
+    within = x0 + u > wide and y0 + v > high and x0 + u + wide < width - 1 and y0 + v + high < height - 1
     s_g = s_gg = s_fg = 0.0
     for m in range(n):
         dx, dy = px[0, m], px[1, m]
         x = x0 + u + (1.0 + ux) * dx + uy * dy
         y = y0 + v + vx * dx + (1.0 + vy) * dy
-        if not (x >= 0.0 and y >= 0.0 and x < width - 1 and y < height - 1):
+        if not within and not (x >= 0.0 and y >= 0.0 and x < width - 1 and y < height - 1):
             return -1.0
-        left, top = np.uint64(x), np.uint64(y)
-        fx, fy = x - left, y - top
-        right, below = left + np.uint64(1), top + np.uint64(1)
-        g = (1.0 - fy) * ((1.0 - fx) * image[top, left] + fx * image[top, right]) + fy * (
-            (1.0 - fx) * image[below, left] + fx * image[below, right]
-        )
+        if nearest:
+            g = float(image[np.uint64(np.int64(y + 0.5)), np.uint64(np.int64(x + 0.5))])
+        else:
+            left, top = np.uint64(np.int64(x)), np.uint64(np.int64(y))
+            fx, fy = x - left, y - top
+            right, below = left + np.uint64(1), top + np.uint64(1)
+            g = (1.0 - fy) * ((1.0 - fx) * image[top, left] + fx * image[top, right]) + fy * (
+                (1.0 - fx) * image[below, left] + fx * image[below, right]
+            )
         s_g += g
         s_gg += g * g
         s_fg += g * px[2, m]
@@ -115,7 +122,8 @@ def _score(grey, mask, left_of_mask, top_of_mask, image, xy, warps, radius, stri
     """ZNCC (n, K) of every warp; -1 where the subset leaves either image or the warp is NaN. Bilinear in the current.
 
     grey, image : the whole images, xy : (n, 2) px in them; mask : (h, w) of the box whose corner is given. Of many
-    warps those that a quarter of the pixels shows to be far from the best keep that first score.
+    warps those that a quarter of the pixels, read without interpolation, shows to be far from the best keep that first
+    score.
     """
     count = warps.shape[1]
     for k in nb.prange(xy.shape[0]):
@@ -128,9 +136,9 @@ def _score(grey, mask, left_of_mask, top_of_mask, image, xy, warps, radius, stri
                 grey, mask, left_of_mask, top_of_mask, jx, iy, off_x, off_y, radius, _THINNED * stride, px
             )
             for h in range(count):
-                score[k, h] = _alike(image, xy[k, 0], xy[k, 1], warps[k, h], px, n, norm)
+                score[k, h] = _alike(image, xy[k, 0], xy[k, 1], warps[k, h], px, n, norm, radius, True)
             limit = max(np.max(score[k]) - _DOUBT, -0.99)
         n, norm = _pixels(grey, mask, left_of_mask, top_of_mask, jx, iy, off_x, off_y, radius, stride, px)
         for h in range(count):
             if count < _MANY or score[k, h] > limit:
-                score[k, h] = _alike(image, xy[k, 0], xy[k, 1], warps[k, h], px, n, norm)
+                score[k, h] = _alike(image, xy[k, 0], xy[k, 1], warps[k, h], px, n, norm, radius, False)
