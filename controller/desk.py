@@ -62,6 +62,11 @@ class Round:
     capture_id: str | None = None
     error: str | None = None
 
+    @property
+    def ended(self) -> bool:
+        """Nothing about it will change any more."""
+        return self.state in ("closed", "refused")
+
 
 class Desk:
     """Sessions, captures, jobs and live state in one place; safe to use from several threads.
@@ -112,6 +117,7 @@ class Desk:
         self.quiet = quiet
         self._lock = Lock()
         self._publishing = Lock()
+        self._telling = Lock()
         self._selected: str | None = None
         self._rounds: dict[str, Round] = {}
         self._running: str | None = None
@@ -184,7 +190,7 @@ class Desk:
         sessions = self.sessions()
         current = self.current()
         with self._lock:
-            running = asdict(self._rounds[self._running]) if self._running else None
+            newest = next(reversed(self._rounds.values()), None)  # running or not: how it ended stays to be read
         return {
             "rig": self.rig_state(),
             "sessions": sessions,
@@ -194,7 +200,7 @@ class Desk:
             "newest": self.newest_step(current) if current else None,
             "processing": asdict(self.jobs.processing.warmth),
             "jobs": [asdict(job) for job in self.jobs.list()[:20]],
-            "round": running,
+            "round": None if newest is None else asdict(newest),
         }
 
     def rig_state(self) -> dict[str, Any]:
@@ -275,7 +281,7 @@ class Desk:
             started = Round(f"r{1 + len(self._rounds)}", session, kind, override)
             self._rounds[started.id] = started
             self._running = started.id
-        self._round_changed()
+        self._change_round(started)
         Thread(target=self._capture, args=(started,), name=f"capture-{started.id}", daemon=True).start()
         return started
 
@@ -305,9 +311,7 @@ class Desk:
         if running and running.capture_id is None and session == running.session:
             known = {record["capture_id"] for record in self.catalogue.captures(session)}
             if capture_id not in known:  # the round's own; a late image of an earlier capture comes this way too
-                with self._lock:
-                    self._rounds[running.id] = replace(running, state="open", capture_id=capture_id)
-                self._round_changed()
+                self._change_round(running, state="open", capture_id=capture_id)
         self._publish_capture(session, capture_id)
 
     def _watch(self, interval: float) -> None:
@@ -364,18 +368,18 @@ class Desk:
         return " and ".join(lacking) or None
 
     def _end_round(self, started: Round, **changes: Any) -> None:
-        with self._lock:
-            ended = self._rounds[started.id] = replace(self._rounds[started.id], **changes)
-            self._running = None
-        self.live.publish("round", asdict(ended))
-        self._publish_rig()
+        self._change_round(started, **changes)
         self._publish_sessions()
 
-    def _round_changed(self) -> None:
-        with self._lock:
-            running = self._rounds[self._running] if self._running else None
-        if running:
-            self.live.publish("round", asdict(running))
+    def _change_round(self, which: Round, **changes: Any) -> None:
+        """Changes of a round are told in the order in which they happen; one that has ended stays as it is."""
+        with self._telling:
+            with self._lock:
+                if self._rounds[which.id].ended:
+                    return
+                changed = self._rounds[which.id] = replace(self._rounds[which.id], **changes)
+                self._running = None if changed.ended else changed.id
+            self.live.publish("round", asdict(changed))
         self._publish_rig()
 
     def _publish_rig(self) -> None:

@@ -25,17 +25,20 @@ class Live:
 
     def publish(self, name: str, payload: dict[str, Any]) -> None:
         """Tell every follower; returns at once and may be called from any thread."""
+        self._offer((name, payload))
+
+    def publish_snapshot(self) -> None:
+        """Tell every follower the whole state anew, as it is when the follower's turn comes.
+
+        Taken here, it could be told after an event that is newer than it.
+        """
+        self._offer(None)
+
+    def _offer(self, event: Event | None) -> None:
         with self._lock:
             followers = tuple(self._followers)
         for follower in followers:
-            follower.offer((name, payload))
-
-    def publish_snapshot(self) -> None:
-        """Tell every follower the whole state anew."""
-        with self._lock:
-            anybody = bool(self._followers)
-        if anybody:
-            self.publish("snapshot", self._snapshot())
+            follower.offer(event)
 
     async def follow(self) -> AsyncIterator[Event]:
         """The snapshot, then events as they come, without end."""
@@ -59,13 +62,14 @@ class _Follower:
         self._loop = loop
         self._events: asyncio.Queue[Event | None] = asyncio.Queue()
 
-    def offer(self, event: Event) -> None:
+    def offer(self, event: Event | None) -> None:
+        """An event to follow; None for a fresh snapshot."""
         try:
             self._loop.call_soon_threadsafe(self._put, event)
         except RuntimeError:  # the loop has closed: nobody follows any more
             return
 
-    def _put(self, event: Event) -> None:
+    def _put(self, event: Event | None) -> None:
         if self._events.qsize() >= BACKLOG:
             while not self._events.empty():
                 self._events.get_nowait()

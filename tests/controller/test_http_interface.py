@@ -111,6 +111,15 @@ def test_a_second_capture_at_once_is_refused_and_the_first_goes_on(client, ring)
     assert client.get(f"{API}/rig").json()["refusal"] is None
 
 
+def test_how_a_round_ended_can_be_read_until_the_next_begins(client, desk) -> None:
+    client.post(f"{API}/sessions", json={"name": "limb"})
+    assert desk.snapshot()["round"] is None
+    for number, kind in enumerate(("board", "target"), start=1):
+        assert capture(client, kind)["state"] == "closed"
+        told = desk.snapshot()["round"]
+        assert (told["capture_id"], told["state"]) == (f"{number:04d}-{kind}", "closed")
+
+
 def test_a_round_that_the_ring_refuses_tells_why_and_leaves_no_capture(client, ring) -> None:
     client.post(f"{API}/sessions", json={"name": "limb"})
     ring.unarmed = "02"

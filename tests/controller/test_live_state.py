@@ -51,3 +51,25 @@ def test_publishing_after_the_loop_has_ended_is_harmless() -> None:
     kept = asyncio.run(begin())
     live.publish("job", {})
     assert kept is not None
+
+
+def test_an_event_that_happens_while_a_snapshot_is_taken_is_told_after_it() -> None:
+    async def story() -> list:
+        state = {"round": "open"}
+        busy = False
+
+        def snapshot() -> dict:
+            taken = dict(state)
+            if busy and state["round"] == "open":
+                state["round"] = "closed"
+                live.publish("round", {"round": "closed"})
+            return taken
+
+        live = Live(snapshot)
+        events = live.follow()
+        await anext(events)
+        busy = True
+        live.publish_snapshot()
+        return [await asyncio.wait_for(anext(events), 5) for _ in range(2)]
+
+    assert asyncio.run(story()) == [("snapshot", {"round": "open"}), ("round", {"round": "closed"})]

@@ -46,7 +46,8 @@ export function showCapture() {
 async function capture(kind) {
   try {
     notice("");
-    state.round = await post(url("captures"), { kind, override: byId("override").checked });
+    const round = await post(url("captures"), { kind, override: byId("override").checked });
+    if (state.round?.id !== round.id) state.round = round; // else the events were quicker, and know more
   } catch (error) {
     notice(error.message);
   }
