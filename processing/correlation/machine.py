@@ -24,6 +24,7 @@ _ONCE = {1: 4 + 21, 2: 4 + 31}
 _INTERPOLATE = {3: 4 + 2 * 9 + 4 * 4 + 4, 5: 4 + 2 * 26 + 6 * 6 + 6}
 _STEP = {1: 10, 2: 14}
 _PLACE = 3
+_LINE = 16  # numbers of single precision in a cache line
 _BYTES = 4 * 4 + 1  # of a pixel: f, its gradient, a coefficient of the current image, the mask
 
 
@@ -62,7 +63,7 @@ def demand(settings: CorrelationSettings, iterations: float) -> Demand:
 
 def measure_machine() -> Machine:
     """The core this runs on."""
-    line = _aligned(np.full(2 * LANES, 1e-8, np.float32))
+    line = _aligned(np.full(LANES + _LINE, 1e-8, np.float32))
     block = np.ones(2**24, np.float32)
     turns = 200_000
     return Machine(
@@ -83,7 +84,8 @@ def _least(work: Callable[[], object], runs: int = 15) -> float:
 
 
 def _aligned(numbers: NDArray[np.float32]) -> NDArray[np.float32]:
-    skip = (-numbers.ctypes.data % 64) // 4
+    """LANES of the numbers, from the begin of a cache line on; there must be a line more of them."""
+    skip = (-numbers.ctypes.data % (4 * _LINE)) // 4
     return numbers[skip : skip + LANES]
 
 
