@@ -1,49 +1,31 @@
-"""Matching one camera pair over all steps: region, start values, correlation.
+"""Matching one camera pair: its reference images to one another, and with both cameras followed in time, every step.
 
-The reference is the first camera's first image; every image of both cameras is matched to it (Solav et al. 2018,
-step 2). Start values between the cameras come from the calibration and a sweep of proxy cylinders, at the
-reference and again at every step, so a large motion does not matter.
+The reference is the first camera's first image (Solav et al. 2018, step 2). Start values between the cameras come from
+the calibration and a sweep of proxy cylinders. Later images are matched each to its own camera's reference image
+(``in_time``), where the second camera's points are the places matched here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.camera import Camera
-from processing.correlation import (
-    Correlation,
-    CorrelationSettings,
-    Current,
-    Reference,
-    Status,
-    correlate,
-    grid,
-    prepare_current,
-    prepare_reference,
-    search_hypotheses,
-)
-from processing.correlation.seeds import flow_starts
+from processing.correlation import CorrelationSettings, Current, Status, grid, prepare_current, prepare_reference
 from processing.errors import ComputationError
-from processing.proxy import compose, stereo_hypotheses
+from processing.in_time import Places
 from processing.region import paint, well_seen
 from processing.results import Matches
-from processing.start_field import lattice_spacing, match_from_lattice, on_lattice
-from processing.sweep import SWEEP_RADII, Search, convincing, radii_of, sweep
+from processing.start_field import lattice_spacing, match_from_lattice
+from processing.sweep import SWEEP_RADII, Search, radii_of, sweep
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 Mask = NDArray[np.bool_]
-
-_STAGES = ("prepare", "start", "refine")
-_HELD = 0.6  # ZNCC under the warp that optical flow tells, from which on it is a start value
-_ENOUGH = 0.8  # share of the points that must be matched, or start values are looked for in other ways
-_SOME = 0.2  # share of the lattice that must hold for the rest of it to be reached from there
-_COARSE = 4.0  # subset radii between the lattice's points where what has changed since the reference is looked for
 
 
 @dataclass(frozen=True)
@@ -87,21 +69,25 @@ class Grid:
 class StepMatches:
     """The n points of a pair in both cameras' images of one step; NaN where a camera has no match.
 
-    px : (2, n, 2). sigma : (2, n, 2) px. c_ls : (n,), the larger. status : (n,), 0 good in both. seconds : by stage.
-    gradient : (n, 2, 2) of the second camera's displacements; (0, 2, 2) where a step was read from its file.
+    px : (2, n, 2). sigma : (2, n, 2) px. c_ls : (n,), the largest over the images used. status : (n,), 0 good in
+    both. seconds : of the match between the cameras, by stage.
     """
 
     px: Array
     sigma: NDArray[np.float32]
     c_ls: NDArray[np.float32]
     status: NDArray[np.int8]
-    seconds: dict[str, float]
-    gradient: NDArray[np.float32]
+    seconds: dict[str, float] = field(default_factory=dict)
 
     @property
     def good(self) -> Mask:
         """Points (n,) matched in both images."""
         return np.asarray(self.status == Status.GOOD)
+
+    @property
+    def second(self) -> Array:
+        """Places (n, 2) px of the matched points in the second camera's image, NaN elsewhere."""
+        return np.where(self.good[:, None], self.px[1], np.nan)
 
 
 def match_reference(
@@ -121,70 +107,35 @@ def match_reference(
     found = match_from_lattice(
         reference, current, xy, settings, _start_at(xy, seeds, warps), lattice_spacing(settings, SWEEP_RADII)
     )
-    everyone = np.arange(len(xy))
-    matched = _of_step(xy, np.full(len(xy), Status.GOOD, np.int8), ((1, everyone, found),))
-    matched.px[0], matched.sigma[0] = xy, 0.0  # the grid itself, exact
+    px = np.stack([xy, xy + found.uv])  # the grid itself, exact
+    sigma = np.stack([np.zeros_like(found.sigma), found.sigma]).astype(np.float32)
+    status = found.status.astype(np.int8)
+    matched = StepMatches(px, sigma, found.c_ls.astype(np.float32), status, found.seconds)
     return Grid(region, xy, faces), matched
 
 
-def match_step(
-    stereo: Stereo,
-    reference: Reference,
-    xy: Array,
-    first: Image | None,
-    second: Image | None,
-    at_reference: StepMatches,
-) -> StepMatches:
-    """Match the points xy (n, 2) px of a pair in both cameras' images of a step; None where one is missing.
+def at_step(at_reference: StepMatches, seen: tuple[Places | None, Places | None]) -> StepMatches:
+    """A pair's points at a step, by what its cameras' images say of their places there; None where one is missing.
 
-    The first camera's image is matched in time; the second's from there, by the calibration and a sweep, so a large
-    motion does not matter. A point that the pair's reference images do not share keeps its status there: it never has
-    a place in space. One lost in the first camera's image is not looked for in the second's.
+    A point that the pair's reference images do not share keeps its status: it never has a place in space. sigma is that
+    of the match in time.
     """
-    settings = stereo.settings
-    in_time = between = None
-    points, there = np.flatnonzero(at_reference.good), np.arange(0)
-    if first is not None and len(points):
-        in_time = _match_in_time(reference, prepare_current(first, settings=settings), xy[points], settings)
-        there = np.flatnonzero(in_time.good)
-    if in_time is not None and second is not None and len(there):
-        current = prepare_current(second, settings=settings)
-        start = _start_after_motion(stereo, reference, current, xy[points], in_time)[there]
-        both = points[there]
-        before = np.concatenate(
-            [at_reference.px[1, both] - xy[both], at_reference.gradient[both].reshape(-1, 4)], axis=1
-        )
-        if np.isfinite(start).any():
-            between = match_from_lattice(
-                reference, current, xy[both], settings, start, lattice_spacing(settings, _COARSE), before
-            )
-    return _of_step(xy, at_reference.status, ((0, points, in_time), (1, points[there], between)))
-
-
-def _match_in_time(reference: Reference, current: Current, xy: Array, settings: CorrelationSettings) -> Correlation:
-    """The first camera's points in its image of a step, from where optical flow puts some of them.
-
-    Where that leads to few matches the correlation looks for start values in its own ways.
-    """
-    chosen = np.flatnonzero(on_lattice(xy, lattice_spacing(settings)))
-    flow = flow_starts(reference, current, xy[chosen], settings.radius)[:, [0, 6, 1, 2, 7, 8]]
-    known = np.flatnonzero(np.isfinite(flow).all(axis=1))
-    warps, zncc, _ = search_hypotheses(reference, current, xy[chosen[known]], flow[known][:, None], settings.radius)
-    held = zncc > _HELD
-    if held.sum() < _SOME * max(len(chosen), 1):
-        return correlate(reference, current, xy, settings)
-    start = np.full((len(xy), 6), np.nan)
-    start[chosen[known[held]]] = warps[held]
-    found = match_from_lattice(reference, current, xy, settings, start, lattice_spacing(settings))
-    if found.good.mean() >= _ENOUGH:
-        return found
-    searched = correlate(reference, current, xy, settings)
-    return searched if searched.good.sum() > found.good.sum() else found
+    px, sigma = np.full_like(at_reference.px, np.nan), np.full_like(at_reference.sigma, np.nan)
+    status, c_ls = at_reference.status.copy(), at_reference.c_ls.copy()
+    shared = at_reference.good
+    for camera, places in enumerate(seen):
+        still = status == Status.GOOD
+        if places is None:
+            status[still] = Status.NOT_REACHED
+            continue
+        status[still] = places.status[still]
+        px[camera, shared], sigma[camera, shared] = places.px[shared], places.sigma[shared]
+        c_ls[shared] = np.fmax(c_ls[shared], places.c_ls[shared].astype(np.float32))
+    return StepMatches(px, sigma, c_ls, status)
 
 
 def collect(pair: tuple[str, str], grid_: Grid, steps: Sequence[StepMatches]) -> PairMatches:
     """The matches of all steps, the reference first."""
-    seconds = {name: float(sum(step.seconds.get(name, 0.0) for step in steps)) for name in _STAGES}
     matches = Matches(
         pair,
         grid_.xy,
@@ -193,7 +144,7 @@ def collect(pair: tuple[str, str], grid_: Grid, steps: Sequence[StepMatches]) ->
         np.stack([step.sigma for step in steps]).astype(float),
         np.stack([step.status for step in steps]),
         np.full(len(grid_.xy), -1),
-        seconds,
+        steps[0].seconds,
     )
     return PairMatches(matches, grid_.faces)
 
@@ -226,46 +177,3 @@ def _start_at(xy: Array, seeds: Array, warps: Array) -> Array:
         if i is not None:
             start[i] = warp
     return start
-
-
-def _start_after_motion(
-    stereo: Stereo, reference: Reference, current: Current, xy: Array, in_time: Correlation
-) -> Array:
-    """Start values (n, 6) in the second camera's image of a later step, from the first camera's motion and a sweep."""
-    settings = stereo.settings
-    chosen = np.flatnonzero(in_time.good & on_lattice(xy, lattice_spacing(settings, _COARSE)))
-    moved = xy[chosen] + in_time.uv[chosen]
-    hypotheses = stereo_hypotheses(*stereo.cameras, moved, stereo.radii, settings.radius)
-    motion = np.concatenate([in_time.uv[chosen], in_time.gradient[chosen].reshape(-1, 4)], axis=1)
-    candidates = compose(motion[:, None, :], hypotheses.warps)
-    warps, zncc, second_best = search_hypotheses(reference, current, xy[chosen], candidates, settings.radius)
-    believed = convincing(stereo.search, zncc, second_best)
-    start = np.full((len(xy), 6), np.nan)
-    start[chosen[believed]] = warps[believed]
-    return start
-
-
-def _of_step(
-    xy: Array, status: NDArray[np.int8], found: Sequence[tuple[int, NDArray[np.int64], Correlation | None]]
-) -> StepMatches:
-    """The matches of a step's images together: found are a camera, the points (k,) it was asked for, and their matches.
-
-    status : (n,) of the points before.
-    """
-    n, status = len(xy), status.copy()
-    px, sigma = np.full((2, n, 2), np.nan), np.full((2, n, 2), np.nan, np.float32)
-    c_ls, gradient = np.full(n, np.nan, np.float32), np.full((n, 2, 2), np.nan, np.float32)
-    seconds = dict.fromkeys(_STAGES, 0.0)
-    for camera, points, match in found:
-        open_points = points[status[points] == Status.GOOD]
-        status[open_points] = Status.NOT_REACHED
-        if match is None:
-            continue
-        px[camera, points], sigma[camera, points] = xy[points] + match.uv, match.sigma
-        c_ls[points] = np.fmax(c_ls[points], match.c_ls.astype(np.float32))
-        status[points] = match.status
-        if camera == 1:
-            gradient[points] = match.gradient
-        for name in _STAGES:
-            seconds[name] += match.seconds[name]
-    return StepMatches(px, sigma, c_ls, status, seconds, gradient)

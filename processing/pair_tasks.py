@@ -1,50 +1,81 @@
-"""The matching of all camera pairs as tasks: one for each pair's reference images, one for each pair and step.
+"""The matching of all camera pairs as tasks: one for each pair's reference images, one for each camera and later step.
 
-The steps of a pair are independent of one another: each is matched from the reference. So one more capture, or the
+The steps of a camera are independent of one another: each is matched from the reference. So one more capture, or the
 newest step alone, makes no other step anew.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.camera import Camera
 from processing.correlation import CorrelationSettings, Reference, prepare_reference
+from processing.errors import ComputationError
 from processing.images import read_mask
-from processing.matching import Grid, PairMatches, StepMatches, Stereo, collect, match_reference, match_step
+from processing.in_time import CameraGrid, Followed, Own, Places, Shared, camera_grid, follow, places
+from processing.matching import Grid, PairMatches, StepMatches, Stereo, at_step, collect, match_reference
 from processing.session import Capture, Session
 from processing.step_images import Digests, step_image
 from processing.sweep import Search
 from processing.tasks import Arrays, Task, code_stamp, digest, kept, read_output, work_folder
 
-Array = NDArray[np.float64]
-_MATCH_COST = 0.6  # of a step's second correlation, in correlations of the reference
+_REFERENCE_COST = 2.0  # of a pair, in steps of a camera
+_SECONDS = "seconds_"  # before the names of stages in an output
+_FOLLOWED = ("xy", "uv", "gradient", "sigma", "c_ls", "status")
+
+
+@dataclass(frozen=True)
+class CameraJob:
+    """The tasks of one camera: one for each later step, None where it has no image."""
+
+    steps: tuple[Task | None, ...]
+
+    def places(self, step: int, xy: NDArray[np.float64]) -> Places | None:
+        """Where places xy (n, 2) px of the reference image lie at a step from 1 on; None without an image."""
+        task = self.steps[step - 1]
+        if task is None:
+            return None
+        arrays = read_output(task.output)
+        return places(Followed(step=int(arrays["step"]), **{name: arrays[name] for name in _FOLLOWED}), xy)
 
 
 @dataclass(frozen=True)
 class PairJob:
-    """The tasks of one pair: the reference's, then a step's each."""
+    """The task of one pair's reference images, and those of its cameras."""
 
     cameras: tuple[Camera, Camera]
     reference: Task
-    steps: tuple[Task, ...]
+    followed: tuple[CameraJob, CameraJob]
 
     @property
     def name(self) -> str:
         """The pair's name."""
         return f"{self.cameras[0].id}-{self.cameras[1].id}"
 
+    @property
+    def later(self) -> range:
+        """The steps but the reference."""
+        return range(1, len(self.followed[0].steps) + 1)
+
+    def at_reference(self) -> tuple[Grid, StepMatches]:
+        """The pair's points and their matches at the reference. Raises the ComputationError that this ended with."""
+        arrays = read_output(self.reference.output)
+        return _grid(arrays), _step_matches(arrays)
+
+    def step(self, k: int, at_reference: StepMatches) -> StepMatches:
+        """The matches at a later step k."""
+        first, second = self.followed
+        return at_step(at_reference, (first.places(k, at_reference.px[0]), second.places(k, at_reference.second)))
+
     def matches(self) -> PairMatches:
         """The pair's matches at all steps. Raises the ComputationError that the reference ended with."""
-        of_reference = read_output(self.reference.output)
-        grid = _grid(of_reference)
-        found = [_step_matches(of_reference), *(_step_matches(read_output(task.output)) for task in self.steps)]
+        grid, at_reference = self.at_reference()
+        found = [at_reference, *(self.step(k, at_reference) for k in self.later)]
         return collect((self.cameras[0].id, self.cameras[1].id), grid, found)
 
 
@@ -57,113 +88,105 @@ def pair_jobs(
     correlation: CorrelationSettings,
 ) -> list[PairJob]:
     """The tasks of all pairs over these steps, the reference first."""
-    plan = _Plan(session, work_folder(session.path), Digests(session))
-    return [plan.job(Stereo((cameras[first], cameras[second]), search, correlation), steps) for first, second in pairs]
+    digests, folder = Digests(session), work_folder(session.path)
+    references: dict[tuple[str, str], Task] = {}
+    for first, second in pairs:
+        stereo, mask = Stereo((cameras[first], cameras[second]), search, correlation), session.mask(first)
+        images = [digests.image(steps[0], id_) for id_ in stereo.ids]
+        key = digest(
+            code_stamp(), "pair reference", stereo.cameras, search, correlation, images, digests.mask(first)
+        )  # fmt: skip
+        given = (stereo, tuple(steps[0].images[id_] for id_ in stereo.ids), mask)
+        name = f"pair {first}-{second}"
+        references[first, second] = Task(key, name, reference_task, given, folder, cost=_REFERENCE_COST)
+
+    def followed(id_: str) -> CameraJob:
+        own = [pair for pair in references if id_ in pair]
+        is_first, needs = tuple(pair[0] == id_ for pair in own), tuple(references[pair].key for pair in own)
+
+        def task(step: Capture) -> Task | None:
+            if id_ not in step.images:
+                return None
+            key = digest("camera step", is_first, needs, [digests.image(each, id_) for each in (steps[0], step)])
+            given = (cameras[id_], correlation, is_first, steps[0].images[id_], step.images[id_])
+            return Task(key, f"camera {id_}, {step.id}", camera_task, given, folder, needs)
+
+        return CameraJob(tuple(task(step) for step in steps[1:]))
+
+    jobs = {id_: followed(id_) for id_ in dict.fromkeys(id_ for pair in pairs for id_ in pair)}
+    return [
+        PairJob((cameras[first], cameras[second]), reference, (jobs[first], jobs[second]))
+        for (first, second), reference in references.items()
+    ]
 
 
 def in_order(jobs: Sequence[PairJob]) -> list[Task]:
-    """All tasks, step by step and round the ring: what two of them read is read while it is still in memory."""
-    steps = range(len(jobs[0].steps) if jobs else 0)
-    return [*(job.reference for job in jobs), *(job.steps[step] for step in steps for job in jobs)]
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """What the tasks of a session's pairs are made of."""
-
-    session: Session
-    folder: Path
-    digests: Digests
-
-    def job(self, stereo: Stereo, steps: Sequence[Capture]) -> PairJob:
-        first, second = stereo.ids
-        mask = self.session.mask(first)
-        reference = Task(
-            digest(
-                code_stamp(), "pair reference", stereo.cameras, stereo.search, stereo.settings,
-                [self.digests.image(steps[0], id_) for id_ in stereo.ids], self.digests.mask(first),
-            ),
-            f"pair {first}-{second}",
-            reference_task,
-            (stereo, tuple(steps[0].images[id_] for id_ in stereo.ids), mask),
-            self.folder,
-            cost=1.0 + _MATCH_COST,
-        )  # fmt: skip
-        return PairJob(stereo.cameras, reference, tuple(self._step(stereo, reference, steps, k) for k in _later(steps)))
-
-    def _step(self, stereo: Stereo, reference: Task, steps: Sequence[Capture], k: int) -> Task:
-        first, second = stereo.ids
-        seen = tuple(steps[k].images.get(id_) for id_ in stereo.ids)
-        return Task(
-            digest("pair step", reference.key, [self.digests.image(steps[k], id_) for id_ in stereo.ids]),
-            f"pair {first}-{second}, {steps[k].id}",
-            step_task,
-            (stereo, steps[0].images[first], seen),
-            self.folder,
-            (reference.key,),
-            cost=1.0 + _MATCH_COST,
-        )
+    """All tasks, camera by camera: what the steps of one need is read while it is still in memory."""
+    followed = {id(each): each for job in jobs for each in job.followed}
+    later = [task for each in followed.values() for task in each.steps if task is not None]
+    return [*(job.reference for job in jobs), *later]
 
 
 def reference_task(stereo: Stereo, images: tuple[Path, Path], mask: Path | None, *, inputs: tuple[Path, ...]) -> Arrays:
-    """Region, points and matches of a pair's reference images."""
-    del inputs
+    """A pair's region, points and matches at the reference. mask : drawn for the first camera."""
     first, second = stereo.cameras
     drawn = None if mask is None else read_mask(mask, (first.size[1], first.size[0]))
     grid, found = match_reference(stereo, step_image(images[0], first), step_image(images[1], second), drawn)
-    region = {"region": np.packbits(grid.region), "shape": np.array(grid.region.shape)}
-    own: dict[str, NDArray[Any]] = {
-        "xy": grid.xy,
-        "faces": grid.faces,
-        "gradient": found.gradient,
-        "points": np.array(len(grid.xy)),
-    }
-    return {**region, **own, **_arrays(found)}
+    seconds = {f"{_SECONDS}{name}": np.array(value) for name, value in found.seconds.items()}
+    return {
+        "region": np.packbits(grid.region), "shape": np.array(grid.region.shape), "xy": grid.xy, "faces": grid.faces,
+        "px": found.px, "sigma": found.sigma, "c_ls": found.c_ls, "status": found.status,
+        "points": np.array(len(grid.xy)), **seconds,
+    }  # fmt: skip
 
 
-def step_task(
-    stereo: Stereo, reference: Path, images: tuple[Path | None, Path | None], *, inputs: tuple[Path, ...]
+def camera_task(
+    camera: Camera,
+    settings: CorrelationSettings,
+    is_first: tuple[bool, ...],
+    reference: Path,
+    image: Path,
+    *,
+    inputs: tuple[Path, ...],
 ) -> Arrays:
-    """Matches of a pair's images of one step. reference : the first camera's reference image."""
-    (kept_grid,) = inputs
-    grid, at_reference, prepared = _prepared(kept_grid, reference, stereo)
-    seen = [None if path is None else step_image(path, each) for path, each in zip(images, stereo.cameras, strict=True)]
-    found = match_step(stereo, prepared, grid.xy, seen[0], seen[1], at_reference)
-    made = int(at_reference.good.sum()) * sum(image is not None for image in seen)
-    return {**_arrays(found), "points": np.array(made)}
+    """A camera's points in its image of one step. is_first : whether it is the first camera of each pair in inputs."""
+    grid, prepared = _prepared(camera, settings, is_first, reference, inputs)
+    found = follow(prepared, step_image(image, camera), grid, settings)
+    arrays = {name: getattr(found, name) for name in _FOLLOWED}
+    return {**arrays, "step": np.array(found.step), "points": np.array(len(grid.xy))}
 
 
-def _prepared(grid_file: Path, image: Path, stereo: Stereo) -> tuple[Grid, StepMatches, Reference]:
-    """A pair's points, their matches at the reference and its prepared image, kept in memory for all its steps."""
+def _prepared(
+    camera: Camera, settings: CorrelationSettings, is_first: tuple[bool, ...], image: Path, pairs: tuple[Path, ...]
+) -> tuple[CameraGrid, Reference]:
+    """A camera's points and its prepared reference image, kept in memory for all its steps."""
 
-    def make() -> tuple[Grid, StepMatches, Reference]:
-        of_reference = read_output(grid_file)
-        grid = _grid(of_reference)
-        reference = prepare_reference(step_image(image, stereo.cameras[0]), grid.region, stereo.settings)
+    def make() -> tuple[CameraGrid, Reference]:
+        own: list[Own] = []
+        shared: list[Shared] = []
+        for path, first in zip(pairs, is_first, strict=True):
+            try:
+                arrays = read_output(path)
+            except ComputationError:  # told where the pair is left out
+                continue
+            grid, found = _grid(arrays), _step_matches(arrays)
+            if first:
+                own.append((grid.region, grid.xy[found.good]))
+            else:
+                shared.append((found.second, grid.faces))
+        followed = camera_grid(camera.size, settings.step, own, shared)
+        if not len(followed.xy):
+            raise ComputationError(f"camera {camera.id}: none of its pairs gave a surface")
+        reference = prepare_reference(step_image(image, camera), followed.region, settings)
         assert reference.slopes  # computed when first asked for
-        return grid, _step_matches(of_reference), reference
+        return followed, reference
 
-    def size(value: tuple[Grid, StepMatches, Reference]) -> int:
-        grid, found, reference = value
-        matched = sum(array.nbytes for array in (found.px, found.sigma, found.c_ls, found.status, found.gradient))
+    def size(value: tuple[CameraGrid, Reference]) -> int:
+        grid, reference = value
         filtered = reference.grey.nbytes + sum(slope.nbytes for slope in reference.slopes) + reference.mask.nbytes
-        return int(
-            filtered + matched + grid.region.nbytes + grid.xy.nbytes + grid.faces.nbytes + reference.image.nbytes
-        )
+        return int(filtered + grid.region.nbytes + grid.xy.nbytes + reference.image.nbytes)
 
-    return kept.get(("reference", str(grid_file)), make, size)
-
-
-def _arrays(found: StepMatches) -> dict[str, NDArray[Any]]:
-    seconds = {f"seconds_{name}": np.array(value) for name, value in found.seconds.items()}
-    return {"px": found.px, "sigma": found.sigma, "c_ls": found.c_ls, "status": found.status, **seconds}
-
-
-def _step_matches(arrays: Arrays) -> StepMatches:
-    start = len("seconds_")
-    seconds = {name[start:]: float(value) for name, value in arrays.items() if name.startswith("seconds_")}
-    gradient = arrays.get("gradient", np.empty((0, 2, 2), np.float32))
-    return StepMatches(arrays["px"], arrays["sigma"], arrays["c_ls"], arrays["status"], seconds, gradient)
+    return kept.get(("reference", camera.id, *map(str, pairs)), make, size)
 
 
 def _grid(arrays: Arrays) -> Grid:
@@ -172,5 +195,7 @@ def _grid(arrays: Arrays) -> Grid:
     return Grid(region, arrays["xy"], arrays["faces"])
 
 
-def _later(steps: Sequence[Capture]) -> Iterator[int]:
-    return iter(range(1, len(steps)))
+def _step_matches(arrays: Arrays) -> StepMatches:
+    told = [name for name in arrays if name.startswith(_SECONDS)]
+    seconds = {name.removeprefix(_SECONDS): float(arrays[name]) for name in told}
+    return StepMatches(arrays["px"], arrays["sigma"], arrays["c_ls"], arrays["status"], seconds)

@@ -183,41 +183,6 @@ def covariance(gain, sigma):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def gradients(xy, there, status, edges, out):  # type: ignore[no-untyped-def]
-    """Gradients (n, 2, 2) of places (n, 2) in another image by those of their neighbours along edges (E, 2).
-
-    status (n,): 0 for what is known. Returns (n,) bool, where the neighbours span both directions; the rest is not
-    filled.
-    """
-    square, mixed = np.zeros((len(xy), 3)), np.zeros((len(xy), 2, 2))
-    for e in range(len(edges)):
-        a, b = edges[e, 0], edges[e, 1]
-        if status[a] != 0 or status[b] != 0:
-            continue
-        x, y = xy[b, 0] - xy[a, 0], xy[b, 1] - xy[a, 1]
-        u, v = there[b, 0] - there[a, 0], there[b, 1] - there[a, 1]
-        for k in range(2):
-            end = edges[e, k]
-            square[end, 0] += x * x
-            square[end, 1] += x * y
-            square[end, 2] += y * y
-            mixed[end, 0, 0] += u * x
-            mixed[end, 0, 1] += u * y
-            mixed[end, 1, 0] += v * x
-            mixed[end, 1, 1] += v * y
-    spans = np.zeros(len(xy), np.bool_)
-    for n in range(len(xy)):
-        xx, xy_, yy = square[n, 0], square[n, 1], square[n, 2]
-        det = xx * yy - xy_ * xy_
-        if det > 1e-3 * (xx + yy) ** 2:
-            spans[n] = True
-            for i in range(2):
-                out[n, i, 0] = (mixed[n, i, 0] * yy - mixed[n, i, 1] * xy_) / det
-                out[n, i, 1] = (mixed[n, i, 1] * xx - mixed[n, i, 0] * xy_) / det
-    return spans
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
 def midpoint_residuals(pairs, values, doubt, rows):  # type: ignore[no-untyped-def]
     """How far values (n, k) of some rows (r,) lie from the median of the middles of their pairs of neighbours, (r,).
 

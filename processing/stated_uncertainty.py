@@ -3,10 +3,10 @@
 Two parts that never mix: the noise of the images, which another exposure would draw anew, and the calibration, which
 all points and steps share. Of the global way the first is known before; of camera pairs it is found here.
 
-A pair's images are all matched to the reference image of its first camera. With δ what noise makes of a subset there,
-ε of the same subset in another image, both in px of the reference, and G the gradient of the match between cameras, the
-displacement is off by ``A₁ (ε₁ - δ) + A₂ G (ε₂ - δ) - A₂⁰ G⁰ (ε₂⁰ - δ)``: of δ hardly more than A₁ is left. The noise
-shows in the matches in time; what more a match between cameras leaves over is the same in every exposure.
+Each camera of a pair is followed in its own images. With δ what noise makes of a subset in the reference image and ε of
+the same in a later one, the displacement is off by ``A₁ (ε₁ - δ₁) + A₂ ε₂ - A₂⁰ δ₂``. The second camera's place rests
+on the match between the cameras too: it was found with δ₂ in the reference image and is followed from there, so of δ₂
+the reference position alone holds a part; and what else that match is off by moves along with the point.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from processing.calibration.bundle import BundleFit
 from processing.calibration.parameters import PER_CAMERA
 from processing.camera import Camera
-from processing.point_kernels import gradients
 from processing.results import Matches, Results
 from processing.uncertainty.calibration import (
     CameraCovariance,
@@ -100,10 +99,9 @@ def _gain(results: Results, step: int) -> Array:
 
 @dataclass(frozen=True)
 class _Sources:
-    """Independent errors, all in px of the reference images, and what they do to the points of one step.
+    """Independent errors: of a pair's two reference images, and of the step's two images.
 
-    gain : (4, N, 3, 2) mm a px: of the reference image, of the step's two images, of the second camera's reference.
-    px : (N, 2) places in the reference images. sigma : (4, N, 2) px.
+    gain : (4, N, 3, 2) mm a px. px : (4, N, 2) places in the reference images. sigma : (4, N, 2) px.
     """
 
     gain: Array
@@ -121,9 +119,9 @@ def _with_scatter(results: Results) -> Results:
     cameras = {camera.id: camera for camera in results.cameras}
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         pairs = list(pool.map(partial(_Pair.of, results, cameras), range(len(results.matches))))
-        px = np.full((N, 2), np.nan)
+        px = np.full((2, N, 2), np.nan)
         for pair in pairs:
-            px[pair.matches.vertex[pair.held]] = pair.px
+            px[:, pair.matches.vertex[pair.held]] = pair.px
         found = pool.map(partial(_step_scatter, results, pairs, px, radius, order), range(1, F))
         for step, (one, two) in enumerate(found, start=1):
             displacement[step], stretches[step] = one, two
@@ -134,9 +132,8 @@ def _with_scatter(results: Results) -> Results:
 class _Pair:
     """What the steps of a pair have in common.
 
-    cameras, matches : n points. held : rows of those that have a vertex, and px (k, 2) their places, apart from other
-    pairs'. noise : (F, n, 2) px. edges : (E, 2). gradient : (n, 2, 2) of the match at the reference, and gain :
-    (2, n, 3, 2) mm a px there.
+    cameras, matches : n points. held : rows of those that have a vertex, and px (2, k, 2) their places in the reference
+    images, apart from other pairs'. noise : (2, F, n, 2) px. gain : (2, k, 3, 2) mm a px at the reference.
     """
 
     cameras: tuple[Camera, ...]
@@ -144,8 +141,6 @@ class _Pair:
     held: Ints
     px: Array
     noise: Array
-    edges: Ints
-    gradient: Array
     gain: Array
 
     @classmethod
@@ -154,40 +149,38 @@ class _Pair:
         matches = results.matches[k]
         own = tuple(cameras[id_] for id_ in matches.cameras)
         held = np.flatnonzero(matches.vertex >= 0)
-        edges = _edges(matches, results.faces, len(results.vertices_ref))
-        gain = np.zeros((2, len(matches.xy), 3, 2))
-        gain[:, held] = position_gain(own, results.vertices_ref[matches.vertex[held]], np.ones((2, len(held), 2)))
-        px = matches.xy[held] + (k * _APART, 0.0)
-        return cls(own, matches, held, px, _noise_in_time(matches), edges, _stretched(matches, edges, 0), gain)
+        gain = position_gain(own, results.vertices_ref[matches.vertex[held]], np.ones((2, len(held), 2)))
+        px = matches.px[0][:, held] + np.array([[2 * k * _APART, 0.0], [(2 * k + 1) * _APART, 0.0]])[:, None]
+        noise = np.stack([_noise_in_time(matches, camera) for camera in (0, 1)])
+        return cls(own, matches, held, px, noise, gain)
 
 
 def _step_scatter(
     results: Results, pairs: Sequence[_Pair], px: Array, radius: int, order: int, step: int
 ) -> tuple[Array, Array]:
-    """Standard deviations of a step's displacements (N, 3) mm and stretches (M, 2). px : (N, 2)."""
+    """Standard deviations of a step's displacements (N, 3) mm and stretches (M, 2). px : (2, N, 2)."""
     N = len(results.vertices_ref)
-    parts = _Sources(np.zeros((4, N, 3, 2)), px, np.full((4, N, 2), np.nan))
+    parts = _Sources(np.zeros((4, N, 3, 2)), np.concatenate([px, px]), np.full((4, N, 2), np.nan))
     for pair in pairs:
         _fill(parts, results, pair, step)
     found = results.deformation(step)
     displacement = np.sqrt(np.einsum("nii->ni", covariance(parts.gain, parts.sigma)))
     stretches = stretch_sigma(
-        found, results.vertices_ref, results.faces, parts.gain, np.broadcast_to(parts.px, (4, N, 2)), parts.sigma,
-        radius, order,
-    )  # fmt: skip
+        found, results.vertices_ref, results.faces, parts.gain, parts.px, parts.sigma, radius, order
+    )
     displacement[~np.isfinite(results.vertices[step]).all(axis=1)] = np.nan
     stretches[~np.isfinite(found.J)] = np.nan
     return displacement, stretches
 
 
-def _noise_in_time(matches: Matches) -> Array:
+def _noise_in_time(matches: Matches, camera: int) -> Array:
     """Standard deviations (F, n, 2) px of one subset's place by the noise of one image, NaN where there is no match.
 
-    What the first camera's own images leave over in the quietest step is noise; motion and light add to the others.
+    What a camera's own images leave over in the quietest step is noise; motion and light add to the others.
     """
-    stated = np.where((matches.status == 0)[..., None], matches.sigma[:, 0], np.nan) / np.sqrt(_BOTH)
+    stated = np.where((matches.status == 0)[..., None], matches.sigma[:, camera], np.nan) / np.sqrt(_BOTH)
     level = np.array([np.nanmedian(one) if np.isfinite(one).any() else np.nan for one in stated])
-    level[0] = np.nan
+    level[0] = np.nan  # the grid itself, or the match between the cameras
     with np.errstate(invalid="ignore"):
         share = np.nanmin(level) / level if np.isfinite(level).any() else level
     return np.asarray(stated * share[:, None, None])
@@ -195,42 +188,10 @@ def _noise_in_time(matches: Matches) -> Array:
 
 def _fill(parts: _Sources, results: Results, pair: _Pair, step: int) -> None:
     """Add the points of one pair."""
-    matches, noise = pair.matches, pair.noise[step]
-    used = pair.held[(matches.status[step, pair.held] == 0) & np.isfinite(noise[pair.held]).all(axis=1)]
+    matches, noise = pair.matches, pair.noise[:, step]
+    usable = (matches.status[step, pair.held] == 0) & np.isfinite(noise[:, pair.held]).all(axis=(0, 2))
+    used = pair.held[usable]
     who = matches.vertex[used]
     now = position_gain(pair.cameras, results.vertices[step, who], np.ones((2, len(used), 2)))
-    before, G0, G = pair.gain[:, used], pair.gradient[used], _stretched(matches, pair.edges, step)[used]
-    seen, seen_first = now[1] @ G, before[1] @ G0
-    parts.gain[:, who] = np.stack([now[0] + seen - seen_first, now[0], seen, seen_first])
-    # A patch that is larger in the second image has more pixels there that tell its place.
-    larger = [np.ones(len(used)), np.ones(len(used)), _area(G), _area(G0)]
-    parts.sigma[:, who] = noise[used] / np.sqrt(np.stack(larger))[..., None]
-
-
-def _area(G: Array) -> Array:
-    """How much larger a patch is in the other image, (n,), by gradients (n, 2, 2)."""
-    return np.asarray(np.abs(G[:, 0, 0] * G[:, 1, 1] - G[:, 0, 1] * G[:, 1, 0]))
-
-
-def _edges(matches: Matches, faces: Ints, count: int) -> Ints:
-    """Neighbouring matches (E, 2), by the triangles (M, 3) of ``count`` vertices."""
-    row = np.full(count, -1)
-    held = np.flatnonzero(matches.vertex >= 0)
-    row[matches.vertex[held]] = held
-    own = row[faces]
-    corners = own[(own >= 0).sum(axis=1) > 1]
-    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
-    single = np.unique(edges[edges[:, 0] >= 0] @ [len(matches.xy), 1])
-    return np.stack(np.divmod(single, len(matches.xy)), axis=1)
-
-
-def _stretched(matches: Matches, edges: Ints, step: int) -> Array:
-    """Gradients (n, 2, 2) of the second camera's pixels of a step by the reference's, from those of the neighbours.
-
-    Where no neighbour was matched the median of all stands for it.
-    """
-    out = np.full((len(matches.xy), 2, 2), np.nan)
-    there = np.ascontiguousarray(matches.px[step, 1])
-    spans = gradients(np.ascontiguousarray(matches.xy), there, matches.status[step], edges, out)
-    out[~spans] = np.median(out[spans], axis=0) if spans.any() else np.eye(2)
-    return out
+    parts.gain[:, who] = np.concatenate([now[:1], pair.gain[1:, usable], now])
+    parts.sigma[:, who] = np.concatenate([noise[:, used], noise[:, used]])

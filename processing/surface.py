@@ -56,7 +56,9 @@ def pair_surface(cameras: tuple[Camera, Camera], found: PairMatches, step_px: in
         px = np.where(good[None, :, None], matches.px[step], np.nan)
         system = LinearSystem.of(cameras, px)
         xyz[step] = system.solution
-        sigma[step] = linear_sigma(cameras, system, matches.sigma[step])
+        # The second camera's place rests on the match between the cameras and on that in time. The noise of its
+        # reference image is in both, the other way round, and goes out: the larger deviation holds.
+        sigma[step] = linear_sigma(cameras, system, np.fmax(matches.sigma[0], matches.sigma[step]))
         residuals = reprojection_residuals(cameras, xyz[step], px)
         if good.any():
             drift[step] = float(np.nanmean(residuals[0, :, 1]))

@@ -39,14 +39,14 @@ def test_the_reference_and_each_step_are_made_once_and_the_whole_run_uses_them(s
     assert counted.made == ["pair cam_01-cam_02"]
     assert shape.steps == (reference,)
     live = process_step(session, last, SETTINGS, executor=counted)
-    assert counted.made[1:] == [f"pair cam_01-cam_02, {last}"]
+    assert counted.made[1:] == [f"camera {id_}, {last}" for id_ in ("cam_01", "cam_02")]
     found = read_results(live / "results.h5")
     assert found.steps == (reference, last)
     assert found.matches == ()
     np.testing.assert_array_equal(found.faces, shape.faces)
 
     run = read_results(process_session(session, SETTINGS, executor=counted) / "results.h5")
-    assert counted.made[2:] == [f"pair cam_01-cam_02, {middle}"]
+    assert counted.made[3:] == [f"camera {id_}, {middle}" for id_ in ("cam_01", "cam_02")]
     by_place = {tuple(place): k for k, place in enumerate(run.vertices_ref)}
     same = [(k, by_place[tuple(place)]) for k, place in enumerate(found.vertices_ref) if tuple(place) in by_place]
     assert len(same) > 0.98 * len(run.vertices_ref)

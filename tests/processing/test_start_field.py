@@ -59,21 +59,3 @@ def test_the_lattice_is_a_multiple_of_the_step() -> None:
         spacing = lattice_spacing(CorrelationSettings(radius, step))
         assert spacing % step == 0
         assert spacing >= step
-
-
-def test_a_change_by_an_affine_field_is_met_exactly_and_beyond_the_lattice() -> None:
-    # The matches before vary from point to point as no lattice can follow; what has changed since is affine.
-    xy = grid(10)
-    chosen = on_lattice(xy, SPACING)
-    rough = np.random.default_rng(0).normal(0.0, 5.0, (len(xy), 6))
-    a = np.array([[3.0, 0.02, -0.05], [-7.0, 0.04, 0.01]])
-    change = np.concatenate([a[:, 0] + xy @ a[:, 1:].T, np.tile(a[:, 1:].ravel(), (len(xy), 1))], axis=1)
-    now, n = rough + change, int(chosen.sum())
-    lost = np.zeros(n, int)
-    lost[n // 2] = 1
-    coarse = Correlation(
-        xy[chosen], now[chosen, :2], now[chosen, 2:].reshape(-1, 2, 2), np.zeros((n, 2, 3)), np.ones(n), np.zeros(n),
-        np.ones(n, int), 2 * lost, np.zeros((n, 2)), {},
-    )  # fmt: skip
-    assert np.isnan(between(coarse, xy, SPACING, 1)).any()
-    np.testing.assert_allclose(between(coarse, xy, SPACING, 1, (rough[chosen], rough)), now, atol=1e-10)

@@ -17,10 +17,12 @@ from node_agent.virtual_rig.render import radiance
 from node_agent.virtual_rig.rig import paper_rig
 from node_agent.virtual_rig.scenes import Limb, Specimen
 from node_agent.virtual_rig.sensor import expose
+from processing import in_time
 from processing.camera import Camera, Intrinsics
 from processing.correlation import CorrelationSettings, prepare_reference
 from processing.deformation import deformation
-from processing.matching import PairMatches, Stereo, collect, match_reference, match_step
+from processing.in_time import CameraGrid, Places, camera_grid, follow
+from processing.matching import PairMatches, Stereo, at_step, collect, match_reference
 from processing.multiview.certainty import Certainty, certainty
 from processing.multiview.motion import Motion, measure_motion
 from processing.multiview.shape import ReferenceShape, reference_shape
@@ -158,10 +160,19 @@ def by_pair(cameras: list[Camera], image: Callable[[str, int], np.ndarray], sear
 
 
 def matched(stereo: Stereo, image: Callable[[str, int], np.ndarray]) -> PairMatches:
-    first, second = stereo.ids
-    grid, found = match_reference(stereo, image(first, 0), image(second, 0), None)
-    reference = prepare_reference(image(first, 0), grid.region, CORRELATION)
-    later = [match_step(stereo, reference, grid.xy, image(first, k), image(second, k), found) for k in range(1, STEPS)]
+    first, second = stereo.cameras
+    grid, found = match_reference(stereo, image(first.id, 0), image(second.id, 0), None)
+    own = camera_grid(first.size, CORRELATION.step, [(grid.region, grid.xy[found.good])], [])
+    other = camera_grid(second.size, CORRELATION.step, [], [(found.second, grid.faces)])
+
+    def seen(id_: str, points: CameraGrid, xy: np.ndarray, step: int) -> Places:
+        reference = prepare_reference(image(id_, 0), points.region, CORRELATION)
+        return in_time.places(follow(reference, image(id_, step), points, CORRELATION), xy)
+
+    later = [
+        at_step(found, (seen(first.id, own, grid.xy, k), seen(second.id, other, found.second, k)))
+        for k in range(1, STEPS)
+    ]
     return collect(stereo.ids, grid, [found, *later])
 
 

@@ -36,7 +36,7 @@ from processing.errors import ComputationError, InputError  # noqa: E402
 
 SCALE = 0.2
 STEPS = 4  # with the reference
-TASKS = 2 * STEPS  # of two pairs: the reference images, and a task for each later step
+TASKS = 2 + 3 * (STEPS - 1)  # the reference images of two pairs, and for each of three cameras each later step
 SETTINGS = ["correlation.radius_px=10", "correlation.step_px=5"]
 Workers = Callable[..., "Worker"]
 
@@ -210,7 +210,7 @@ def test_a_cluster_finds_what_one_machine_finds(session: Path, local: Results, c
     options = [each for name in SETTINGS for each in ("--set", name)]
     done = ringdic("process", session, *options, "--cluster", crew, "--json", timeout_s=300)
     same(Path(json.loads(done.stdout)["run"]), local)
-    assert re.search(rf"correlate  pair .* of {TASKS}\)", done.stderr), "the progress tells of the tasks"
+    assert re.search(rf"correlate  camera .* of {TASKS}\)", done.stderr), "the progress tells of the tasks"
     assert [path.name for path in (session / "work").iterdir() if path.suffix != ".npz"] == [], "no sign is left"
 
 

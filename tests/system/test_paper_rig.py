@@ -141,7 +141,10 @@ def test_matches_are_as_sure_as_ncorr_s(results: Results, reference, figures) ->
     worst = float(np.nanmax(results.matches[0].c_ls))
     figures("paper's rig: C_LS median by frame", ", ".join(f"{c:.4f}" for c in ours), "0.019-0.020")
     figures("paper's rig: C_LS largest", f"{worst:.4f}", "0.066")
-    assert np.allclose(ours, theirs, rtol=0.01)
+    assert np.isclose(ours[0], theirs[0], rtol=0.01)
+    # Later images are matched to their own camera's, and look more alike than those of two cameras: the match between
+    # the cameras stays the worst of the three, where MultiDIC matches every image across.
+    assert all(0.95 < own / across < 1.01 for own, across in zip(ours[1:], theirs[1:], strict=True))
     assert worst <= 0.068
 
 
