@@ -1,6 +1,7 @@
 """How long a whole job takes from the images of the specimen to the results, by stage and by number of steps.
 
-A rig of virtual cameras with full-size images, rendered once and kept in a folder. Each job runs in a process of its
+A rig of virtual cameras with full-size images, rendered once and kept in a folder; those of the specimen are PGM files,
+as a rig's nodes deliver them and the archive keeps them. Each job runs in a process of its
 own, from nothing matched to the results written, once the kernels are compiled and the cameras calibrated, as in a
 session that goes on: so its peak memory and its processor time are known too.
 """
@@ -22,9 +23,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from controller.validate.darkroom import PNG, Darkroom, Shot
+from controller.validate.darkroom import Darkroom, Shot
 from controller.validate.folders import make_session
 from controller.validate.scenery import Scenery
+from node_agent.virtual_rig.scenes import Specimen
 from processing.errors import ComputationError, InputError
 from processing.images import read_gray
 
@@ -51,6 +53,15 @@ class _Again(Shot):
         return Shot(self.camera, self.scene, self.seed, self.jpeg)
 
 
+class _Delivered(Darkroom):
+    """Images of the specimen as PGM files, the others as they were developed."""
+
+    def path(self, shot: Shot) -> Path:
+        """Where an image lies as it goes into the session."""
+        developed = super().path(shot)
+        return developed.with_suffix(".pgm") if isinstance(shot.scene, Specimen) else developed
+
+
 def bench_job(
     folder: Path,
     steps: Sequence[int] = (5,),
@@ -72,12 +83,12 @@ def bench_job(
     if min(steps, default=0) < 2:
         raise InputError("a job needs the reference and at least one step: 2 steps or more")
     scenery = Scenery(scale=scale, cameras=cameras, boards=_BOARDS, limb=_RENDERED)
-    darkroom = Darkroom(Path(folder) / "images")
+    darkroom = _Delivered(Path(folder) / "images")
     shots = _shots(scenery, darkroom, max(steps), say)
     runs = []
     warm: Path | None = None
     for count in sorted(steps):
-        name = f"{cameras}-{scale:g}-{count}"
+        name = f"{cameras}-{scale:g}-{count}-delivered"
         captures = [("board", shot) for shot in scenery.shots("boards")]
         captures += [("target", shot) for shot in scenery.shots("target")] + [("specimen", s) for s in shots[:count]]
         path = Path(folder) / "sessions" / name
@@ -109,36 +120,35 @@ def job_ratios(new: dict[str, Any], old: dict[str, Any]) -> list[dict[str, Any]]
     return rows
 
 
-def _shots(scenery: Scenery, darkroom: Darkroom, count: int, say: Say) -> list[Mapping[str, Shot]]:
+def _shots(scenery: Scenery, delivered: Darkroom, count: int, say: Say) -> list[Mapping[str, Shot]]:
     """The specimen's images of each step by camera, all there."""
-    rendered = scenery.shots("limb")
+    developed, rendered = Darkroom(delivered.folder), scenery.shots("limb")
     every = [shot for scene in ("boards", "target") for shots in scenery.shots(scene) for shot in shots.values()]
     every += [shot for shots in rendered[:count] for shot in shots.values()]
-    missing = sum(not darkroom.path(shot).is_file() for shot in every)
+    missing = sum(not developed.path(shot).is_file() for shot in every)
     if missing:
-        say(f"rendering {missing} images into {darkroom.folder}")
-    darkroom.develop(every)
+        say(f"rendering {missing} images into {developed.folder}")
+    developed.develop(every)
     steps: list[Mapping[str, Shot]] = list(rendered[:count])
     for k in range(len(steps), count):
         turn, which = divmod(k - 1, _RENDERED)
-        again = {
-            id_: _Again(shot.camera, shot.scene, shot.seed, shot.jpeg, turn)
-            for id_, shot in rendered[1 + which].items()
-        }
-        for shot in again.values():
-            _take_again(shot, darkroom)
-        steps.append(again)
+        shots = rendered[1 + which].items()
+        steps.append({id_: _Again(shot.camera, shot.scene, shot.seed, shot.jpeg, turn) for id_, shot in shots})
+    for shot in [shot for shots in steps for shot in shots.values()]:
+        if not delivered.path(shot).is_file():
+            _deliver(shot, developed, delivered.path(shot))
     return steps
 
 
-def _take_again(shot: _Again, darkroom: Darkroom) -> None:
-    path = darkroom.path(shot)
-    if path.is_file():
-        return
-    image = read_gray(darkroom.path(shot.first)).astype(np.int64)
-    noise = np.random.default_rng([shot.turn, shot.seed]).integers(-1, 2, image.shape)
+def _deliver(shot: Shot, developed: Darkroom, path: Path) -> None:
+    """Write an image as it goes into the session."""
+    image = read_gray(developed.path(shot.first if isinstance(shot, _Again) else shot))
+    if isinstance(shot, _Again):
+        noise = np.random.default_rng([shot.turn, shot.seed]).integers(-1, 2, image.shape)
+        image = np.clip(image.astype(np.int64) + noise, 0, 255).astype(np.uint8)
     aside = path.with_name(f".{path.stem}.partial{path.suffix}")
-    cv2.imwrite(str(aside), np.clip(image + noise, 0, 255).astype(np.uint8), PNG)
+    if not cv2.imwrite(str(aside), image):
+        raise ComputationError(f"{path.parent}: the images cannot be written; check the disk")
     aside.replace(path)
 
 

@@ -42,9 +42,9 @@ def test_jobs_of_two_lengths_are_timed_by_stage(tmp_path: Path, capsys: pytest.C
     assert found["runs"][1]["kept_mb"] > 1.05 * found["runs"][0]["kept_mb"]
     assert not list(tmp_path.glob("sessions/*/results/*"))
     images = sorted(tmp_path.glob("images/*"))
-    again = [path for path in images if re.search(r"-1\.png$", path.name)]
+    again = [path for path in images if re.search(r"-1\.pgm$", path.name)]
     assert len(again) == 6  # the third image of each camera is its second with other noise
-    assert all(path.read_bytes() != path.with_name(path.name.replace("-1.png", ".png")).read_bytes() for path in again)
+    assert all(path.read_bytes() != path.with_name(path.name.replace("-1.pgm", ".pgm")).read_bytes() for path in again)
 
 
 def test_ratios_are_of_the_same_job() -> None:
