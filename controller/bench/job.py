@@ -3,7 +3,7 @@
 A rig of virtual cameras with full-size images, rendered once and kept in a folder; those of the specimen are PGM files,
 as a rig's nodes deliver them and the archive keeps them. Each job runs in a process of its
 own, from nothing matched to the results written, once the kernels are compiled and the cameras calibrated, as in a
-session that goes on: so its peak memory and its processor time are known too.
+session that goes on: so its peak memory and its processor time are known too. The calibration is timed by itself.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from processing.images import read_gray
 Say = Callable[[str], None]
 
 _RENDERED = 5  # steps that are rendered; later ones are these again with noise of their own
-_BOARDS = 8
+_BOARDS = 15
 _MB = 1e6
 
 
@@ -76,17 +76,19 @@ def bench_job(
     folder : of the images and sessions, kept for the next time. scale : 1 is 2464 x 3280 px. settings :
     ``group.name=value`` to process with. say : is told a line about every job.
 
-    Returns JSON values: the rig, and for each number of steps the seconds (``wall``, ``cpu``, by stage), the peak
-    memory in 1e6 bytes (None where the system does not tell), the triangles and the size of what is kept of the
-    matches; ``seconds_per_step`` and ``memory_per_step`` by a straight line through several.
+    Returns JSON values: the rig, the seconds of its calibration from the images of boards and target, and for each
+    number of steps the seconds (``wall``, ``cpu``, by stage), the peak memory in 1e6 bytes (None where the system does
+    not tell), the triangles and the size of what is kept of the matches; ``seconds_per_step`` and ``memory_per_step``
+    by a straight line through several.
     """
     if min(steps, default=0) < 2:
         raise InputError("a job needs the reference and at least one step: 2 steps or more")
     scenery = Scenery(scale=scale, cameras=cameras, boards=_BOARDS, limb=_RENDERED)
     darkroom = _Delivered(Path(folder) / "images")
     shots = _shots(scenery, darkroom, max(steps), say)
-    runs = []
+    runs: list[dict[str, Any]] = []
     warm: Path | None = None
+    calibration = 0.0
     for count in sorted(steps):
         name = f"{cameras}-{scale:g}-{count}-delivered"
         captures = [("board", shot) for shot in scenery.shots("boards")]
@@ -94,8 +96,10 @@ def bench_job(
         path = Path(folder) / "sessions" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         session = make_session(path, scenery.rig.rig_toml(), captures, darkroom, calibration=warm)
-        if warm is None:  # compiles, calibrates
-            _process(session, settings)
+        if warm is None:
+            shutil.rmtree(session / "calibration", ignore_errors=True)
+            calibration = _process(session, settings)["seconds"]["calibrate"]
+            say(f"{_BOARDS} boards a camera and the target: calibrated in {calibration:.1f} s")
             warm = session
         elif not list((session / "calibration").glob("*.json")):
             raise ComputationError(f"{session}: the calibration of {warm} was not taken over")
@@ -103,7 +107,8 @@ def bench_job(
         run = {"steps": count, **_process(session, settings)}
         say(_told(run))
         runs.append(run)
-    return {"cameras": cameras, "scale": scale, "settings": list(settings), "runs": runs, **_lines(runs)}
+    rig = {"cameras": cameras, "scale": scale, "settings": list(settings)}
+    return {**rig, "boards": _BOARDS, "calibration_seconds": calibration, "runs": runs, **_lines(runs)}
 
 
 def job_ratios(new: dict[str, Any], old: dict[str, Any]) -> list[dict[str, Any]]:

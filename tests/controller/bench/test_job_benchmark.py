@@ -33,6 +33,8 @@ def measured(folder: Path, capsys: pytest.CaptureFixture[str], **changed: Any) -
 def test_jobs_of_two_lengths_are_timed_by_stage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = measured(tmp_path, capsys)["job"]
     assert [run["steps"] for run in found["runs"]] == [2, 3]
+    assert found["boards"] == 5
+    assert found["calibration_seconds"] > 5 * max(run["seconds"]["calibrate"] for run in found["runs"])  # kept
     for run in found["runs"]:
         assert {"prepare", "calibrate", "correlate", "triangulate", "deform"} <= run["seconds"].keys()
         assert sum(run["seconds"].values()) <= run["wall"]
