@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from processing.adjacency import fan_numbers, piece_numbers
+from processing.mesh import half_edges
+
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -57,7 +60,7 @@ def lattice_faces(xyz: Array) -> tuple[Ints, tuple[Ints, Ints]]:
     faces = _cells(nodes)
     faces = np.concatenate([faces, _fillings(nodes, faces)])
     count = xyz.shape[0] * xyz.shape[1]
-    faces = _without_scraps(_without_pinches(faces, count), count)
+    faces = _without_scraps(_without_pinches(faces, count))
     used = np.unique(faces)
     renumber = np.full(count, -1, np.int64)
     renumber[used] = np.arange(len(used))
@@ -213,7 +216,7 @@ def _inside(p: Ints, triangle: Ints) -> bool:
 def _without_pinches(faces: Ints, count: int) -> Ints:
     """The triangles without those that hang on the rest by one vertex alone; the larger fan at a vertex stays."""
     for _ in range(20):
-        fan = _fans(faces)
+        fan = fan_numbers(half_edges(faces)).reshape(faces.shape)
         each, first, size = np.unique(fan, return_index=True, return_counts=True)
         vertex = faces.ravel()[first]
         if (np.bincount(vertex, minlength=count) <= 1).all():
@@ -226,29 +229,10 @@ def _without_pinches(faces: Ints, count: int) -> Ints:
     return faces
 
 
-def _without_scraps(faces: Ints, count: int) -> Ints:
+def _without_scraps(faces: Ints) -> Ints:
     """The triangles of the largest piece, and of all others that are no scraps."""
     if not len(faces):
         return faces
-    ends = faces[:, [0, 1, 0, 2]].reshape(-1, 2)
-    links = coo_matrix((np.ones(len(ends)), tuple(ends.T)), shape=(count, count))
-    _, label = connected_components(links, directed=False)
-    piece = label[faces[:, 0]]
+    piece = piece_numbers(half_edges(faces))
     triangles = np.bincount(piece)
     return faces[triangles[piece] >= min(_LEAST_PIECE, triangles.max())]
-
-
-def _fans(faces: Ints) -> Ints:
-    """The fan (M, 3) to which each corner of each triangle belongs: corners joined by edges at their vertex."""
-    corner = np.arange(faces.size).reshape(faces.shape)
-    ends = np.concatenate([faces[:, [i, (i + 1) % 3]] for i in range(3)])
-    at = np.concatenate([corner[:, [i, (i + 1) % 3]] for i in range(3)])
-    swap = ends[:, 0] > ends[:, 1]
-    ends[swap], at[swap] = ends[swap][:, ::-1], at[swap][:, ::-1]
-    order = np.lexsort((ends[:, 1], ends[:, 0]))
-    ends, at = ends[order], at[order]
-    same = np.flatnonzero((ends[1:] == ends[:-1]).all(axis=1))
-    joins = np.concatenate([np.stack([at[same, k], at[same + 1, k]], axis=1) for k in (0, 1)])
-    links = coo_matrix((np.ones(len(joins)), tuple(joins.T)), shape=(faces.size, faces.size))
-    _, label = connected_components(links, directed=False)
-    return np.asarray(label, dtype=np.int64).reshape(faces.shape)
