@@ -171,9 +171,9 @@ def _find_region(stereo: Stereo, image: Image, current: Current, mask: Mask | No
 def _start_at(xy: Array, seeds: Array, warps: Array) -> Array:
     """Start values (n, 6) of the grid: known at the seeds, NaN elsewhere."""
     start = np.full((len(xy), 6), np.nan)
-    where = {(int(x), int(y)): i for i, (x, y) in enumerate(xy)}
-    for (x, y), warp in zip(seeds, warps, strict=True):
-        i = where.get((int(x), int(y)))
-        if i is not None:
-            start[i] = warp
+    high = max(xy[:, 1].max(), seeds[:, 1].max()) + 1.0
+    number, sought = xy[:, 0] * high + xy[:, 1], seeds[:, 0] * high + seeds[:, 1]  # a grid goes column by column
+    at = np.minimum(np.searchsorted(number, sought), len(xy) - 1)
+    there = number[at] == sought
+    start[at[there]] = warps[there]
     return start

@@ -7,77 +7,90 @@ affine warp that the proxy's surface implies, so that even strong perspective gr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from processing import lens
 from processing.camera import Camera
+from processing.correlation import Row
 
 Array = NDArray[np.float64]
 
 _APART = 4  # radii from one that is followed exactly to the next
-
-
-@dataclass(frozen=True)
-class Hypotheses:
-    """Candidate matches of image positions, one for each radius of the sweep.
-
-    warps : (n, K, 6) px, u v du/dx du/dy dv/dx dv/dy from the first camera to the second; NaN where the line of
-        sight misses the proxy or the match leaves the second image.
-    xyz : (n, K, 3) mm, the point on the proxy.
-    radii : (K,) mm.
-    """
-
-    warps: Array
-    xyz: Array
-    radii: Array
+_AROUND = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=float)
+_NO_LENS = np.zeros(5)
 
 
 def on_cylinder(camera: Camera, px: Array, radii: Array) -> Array:
-    """Nearer intersections (n, K, 3) mm of lines of sight through px (n, 2) with cylinders about z; NaN if none."""
+    """Nearer intersections (n, K, 3) mm of lines of sight through px (n, 2) with cylinders about z; NaN if none.
+
+    radii : mm, (K,), or (n, K), each line's own.
+    """
     origin, d = camera.centre, camera.ray(px)
     a = d[:, None, 0] ** 2 + d[:, None, 1] ** 2
     b = (origin[0] * d[:, 0] + origin[1] * d[:, 1])[:, None]
-    c = origin[0] ** 2 + origin[1] ** 2 - radii[None, :] ** 2
+    c = origin[0] ** 2 + origin[1] ** 2 - np.atleast_2d(radii) ** 2
     with np.errstate(invalid="ignore"):
         t = (-b - np.sqrt(b * b - a * c)) / a
     return origin + t[..., None] * d[:, None, :]
 
 
-def stereo_hypotheses(first: Camera, second: Camera, px: Array, radii: Array, half_width: float) -> Hypotheses:
-    """Hypotheses for positions px (n, 2) of the first image in the second, for proxies of the given radii (K,) mm.
+def stereo_hypotheses(first: Camera, second: Camera, px: Array, radii: Array, half_width: float) -> Row:
+    """Warps from positions px (n, 2) of the first image into the second, for proxies of the given radii (K,) mm.
 
     The gradients are central differences over ``half_width`` px, about the radius of a subset. Of a long row of radii
-    every fourth is followed exactly, the others lie evenly between: along a line of sight a match moves evenly.
+    every fourth is followed exactly. NaN where the line of sight misses the proxy or the match leaves the second image.
     """
     fewer = radii if len(radii) <= 2 * _APART else np.append(radii[:-1:_APART], radii[-1])
-    warps, xyz = _exact_hypotheses(first, second, px, fewer, half_width)
-    if len(fewer) < len(radii):
-        at = np.clip(np.searchsorted(fewer, radii, side="right") - 1, 0, len(fewer) - 2)
-        share = ((radii - fewer[at]) / (fewer[at + 1] - fewer[at]))[:, None]
-        warps = warps[:, at] + share * (warps[:, at + 1] - warps[:, at])
-        xyz = xyz[:, at] + share * (xyz[:, at + 1] - xyz[:, at])
-    return Hypotheses(warps, xyz, radii)
+    rays = first.ray(px[:, None, :] + half_width * _AROUND)
+    lens_of, K = second.intrinsics, np.eye(3)
+    knots = np.empty((len(px), len(fewer), 6))
+    _follow(
+        first.centre,
+        np.ascontiguousarray(rays),
+        np.ascontiguousarray(px, dtype=float),
+        fewer,
+        np.ascontiguousarray(second.P),
+        K if lens_of is None else np.ascontiguousarray(lens_of.K),
+        _NO_LENS if lens_of is None else lens_of.distortion,
+        second.size,
+        half_width,
+        knots,
+    )
+    return Row(knots, np.interp(radii, fewer, np.arange(len(fewer))))
 
 
-def _exact_hypotheses(first: Camera, second: Camera, px: Array, radii: Array, half_width: float) -> tuple[Array, Array]:
-    """Warps (n, K, 6) and places (n, K, 3) mm on the proxies."""
-    offsets = half_width * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=float)
-    n, k = len(px), len(radii)
-    around = (px[:, None, :] + offsets).reshape(-1, 2)
-    xyz = on_cylinder(first, around, radii).reshape(n, 5, k, 3)
-    seen = second.project(xyz)
-    warps = np.empty((n, k, 6))
-    warps[..., :2] = seen[:, 0] - px[:, None, :]
-    along_x = (seen[:, 1] - seen[:, 2]) / (2 * half_width)
-    along_y = (seen[:, 3] - seen[:, 4]) / (2 * half_width)
-    warps[..., 2], warps[..., 4] = along_x[..., 0] - 1, along_x[..., 1]
-    warps[..., 3], warps[..., 5] = along_y[..., 0], along_y[..., 1] - 1
-    width, height = second.size
-    inside = (seen[:, 0] >= 0).all(-1) & (seen[:, 0, :, 0] < width) & (seen[:, 0, :, 1] < height)
-    warps[~inside] = np.nan
-    return warps, xyz[:, 0]
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _seen(origin, ray, radius, P, K, distortion):  # type: ignore[no-untyped-def]
+    """Where a camera (P, K, distortion) sees the nearer point of a line of sight on a cylinder, px; NaN if none."""
+    a = ray[0] * ray[0] + ray[1] * ray[1]
+    b = origin[0] * ray[0] + origin[1] * ray[1]
+    t = (-b - np.sqrt(b * b - a * (origin[0] * origin[0] + origin[1] * origin[1] - radius * radius))) / a
+    x, y, z = origin[0] + t * ray[0], origin[1] + t * ray[1], origin[2] + t * ray[2]
+    w = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
+    u = (P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3]) / w
+    v = (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3]) / w
+    x_d, y_d = lens.distorted_point((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], distortion)
+    return K[0, 0] * x_d + K[0, 1] * y_d + K[0, 2], K[1, 1] * y_d + K[1, 2]
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", parallel=True)
+def _follow(origin, rays, px, radii, P, K, distortion, size, half_width, warps):  # type: ignore[no-untyped-def]
+    """Fills the warps (n, K, 6) of positions px (n, 2); rays (n, 5, 3) : their lines of sight and those about them."""
+    for i in nb.prange(len(px)):
+        seen = np.empty((5, 2))
+        for k in range(len(radii)):
+            for m in range(5):
+                seen[m, 0], seen[m, 1] = _seen(origin, rays[i, m], radii[k], P, K, distortion)
+            x, y = seen[0]
+            warps[i, k] = np.nan
+            if x >= 0.0 and y >= 0.0 and x < size[0] and y < size[1]:
+                warps[i, k, 0], warps[i, k, 1] = x - px[i, 0], y - px[i, 1]
+                warps[i, k, 2] = (seen[1, 0] - seen[2, 0]) / (2 * half_width) - 1
+                warps[i, k, 3] = (seen[3, 0] - seen[4, 0]) / (2 * half_width)
+                warps[i, k, 4] = (seen[1, 1] - seen[2, 1]) / (2 * half_width)
+                warps[i, k, 5] = (seen[3, 1] - seen[4, 1]) / (2 * half_width) - 1
 
 
 def compose(inner: Array, outer: Array) -> Array:

@@ -7,9 +7,12 @@ What neither camera can see well, by the angle between surface and line of sight
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -64,16 +67,37 @@ def coherent(radius: Array, convincing: Mask, tolerance: float, least: int = 0) 
 
 
 def contrast(image: NDArray[np.generic], xy: Array, half_width: int) -> Array:
-    """Root mean square of the grey level's gradient in a square about each position (..., 2) of an image. (...)."""
-    at = xy.reshape(-1, 2).astype(int)
-    if not len(at):
-        return np.zeros(xy.shape[:-1])
-    margin = half_width + 2
-    low, high = np.maximum(at.min(axis=0) - margin, 0), at.max(axis=0) + margin + 1
-    grey = image[low[1] : high[1], low[0] : high[0]].astype(np.float32)
-    along_x, along_y = cv2.Sobel(grey, -1, 1, 0, scale=0.125), cv2.Sobel(grey, -1, 0, 1, scale=0.125)
-    mean = cv2.blur(along_x * along_x + along_y * along_y, (2 * half_width + 1, 2 * half_width + 1))
-    return np.sqrt(mean[at[:, 1] - low[1], at[:, 0] - low[0]]).astype(float).reshape(xy.shape[:-1])
+    """Root mean square of the grey level's gradient in a square about each position (..., 2) of an image. (...).
+
+    By Sobel's differences, of what of the square lies inside the image.
+    """
+    at = np.ascontiguousarray(xy.reshape(-1, 2), dtype=np.float64)
+    out = np.empty(len(at))
+    _contrast(np.ascontiguousarray(image), at, half_width, out)
+    return out.reshape(xy.shape[:-1])
+
+
+@nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+def _contrast(image, xy, half_width, out):  # type: ignore[no-untyped-def]
+    """Fills out (n,) with the contrast about positions xy (n, 2)."""
+    (height, width), one = image.shape, np.uint64(1)
+    kind: Any = np.float32
+    for k in range(len(xy)):
+        column, row = int(xy[k, 0]), int(xy[k, 1])
+        left, right = max(column - half_width, 1), min(column + half_width + 1, width - 1)
+        total, count = 0.0, 0
+        for i in range(max(row - half_width, 1), min(row + half_width + 1, height - 1)):
+            of_row = kind(0.0)
+            for j in range(np.uint64(left), np.uint64(right)):
+                before, after = j - one, j + one
+                a, b, c = kind(image[i - 1, before]), kind(image[i - 1, j]), kind(image[i - 1, after])
+                d, e = kind(image[i, before]), kind(image[i, after])
+                f, g, h = kind(image[i + 1, before]), kind(image[i + 1, j]), kind(image[i + 1, after])
+                along_x, along_y = c - a + e - d + e - d + h - f, f - a + g - b + g - b + h - c
+                of_row += along_x * along_x + along_y * along_y
+            total += of_row
+            count += max(right - left, 0)
+        out[k] = math.sqrt(total / count) / 8.0 if count else 0.0
 
 
 def lattice_normals(xyz: Array) -> Array:
@@ -102,12 +126,19 @@ def well_seen(xyz: Array, cameras: tuple[Camera, Camera], limit_deg: float) -> M
 def paint(points: Lattice, good: Mask, size: tuple[int, int]) -> Mask:
     """The lattice's good positions as a filled region of the image. (height, width)."""
     width, height = size
-    mask = np.zeros((height, width), np.uint8)
-    half = points.spacing // 2 + 1
-    for x, y in points.xy[good].astype(int):
-        cv2.rectangle(mask, (int(x - half), int(y - half)), (int(x + half), int(y + half)), 255, -1)
-    closing = cv2.getStructuringElement(cv2.MORPH_RECT, (4 * points.spacing + 1, 4 * points.spacing + 1))
-    return cv2.morphologyEx(mask, cv2.MORPH_CLOSE, closing) > 0
+    region = np.zeros((height, width), bool)
+    at = points.xy[good].astype(int)
+    if not len(at):
+        return region
+    half, reach = points.spacing // 2 + 1, 2 * points.spacing
+    left, top = np.maximum(at.min(axis=0) - half - reach - 1, 0)
+    box = region[top : at[:, 1].max() + half + reach + 2, left : at[:, 0].max() + half + reach + 2]
+    mask = np.zeros(box.shape, np.uint8)
+    for x, y in at - (left, top):
+        mask[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1] = 1
+    closing = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * reach + 1, 2 * reach + 1))
+    box[:] = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, closing)
+    return region
 
 
 def _difference(xyz: Array, axis: int) -> Array:

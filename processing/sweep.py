@@ -1,18 +1,20 @@
 """Looking for the surface between two cameras: a lattice of image positions tried against a row of proxy cylinders.
 
 Nothing is known of the shape but that it lies within reach of a cylinder about the target's axis. A match is believed
-where it looks alike, where no other depth looks nearly as alike, and where its neighbours lie at a like depth.
+where it looks alike, where no other depth looks nearly as alike, and where its neighbours lie at a like depth. Every
+second position each way is tried first, the others only near those that are believed: most of an image is no specimen.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.camera import Camera
-from processing.correlation import CorrelationSettings, Current, prepare_reference, search_hypotheses
+from processing.correlation import CorrelationSettings, Current, search_row
 from processing.proxy import on_cylinder, stereo_hypotheses, sweep_radii
 from processing.region import Lattice, coherent, contrast, lattice
 from processing.start_field import lattice_spacing
@@ -86,45 +88,49 @@ def sweep(
     of a connected piece of surface that is kept; 0 keeps the largest alone.
     """
     first, second = cameras
-    spacing = lattice_spacing(settings, SWEEP_RADII)
-    points = lattice(first.size, spacing, settings.radius + 2)
+    points = lattice(first.size, lattice_spacing(settings, SWEEP_RADII), settings.radius + 2)
     shape = points.xy.shape[:2]
     px = points.xy.reshape(-1, 2)
     drawn = np.ones(len(px), bool) if mask is None else mask[px[:, 1].astype(int), px[:, 0].astype(int)]
-    met = np.flatnonzero(drawn & np.isfinite(on_cylinder(first, px, radii[-1:])).all(axis=(1, 2)))
-    hypotheses = stereo_hypotheses(first, second, px[met], radii, settings.radius)
-    everywhere = prepare_reference(image, np.ones(image.shape, bool), settings)
-    found = search_hypotheses(everywhere, current, px[met], hypotheses.warps, settings.radius)
-    nearest = _nearest(hypotheses.warps, found[0])
-    warps, zncc, second_best = (_spread(values, met, len(px)) for values in found)
-    which = np.zeros(len(px), np.int64)
-    which[met] = nearest
-    believed = convincing(search, zncc, second_best)
-    believed &= (which > 0) & (which < len(radii) - 1)
+    hit = np.zeros(len(px), bool)
+    hit[drawn] = np.isfinite(on_cylinder(first, px[drawn], radii[-1:])).all(axis=(1, 2))
+    warps, which, believed = np.full((len(px), 6), np.nan), np.zeros(len(px), np.int64), np.zeros(len(px), bool)
+
+    def look(wanted: Mask) -> None:
+        at = np.flatnonzero(wanted)
+        row = stereo_hypotheses(first, second, px[at], radii, settings.radius)
+        found = search_row(image, current, px[at], row, settings.radius, least=search.zncc_min)
+        warps[at], which[at] = found.warps, found.which
+        believed[at] = convincing(search, found.zncc, found.second_peak)
+        believed[at] &= (found.which > 0) & (found.which < len(radii) - 1)
+
+    few = _few(shape).ravel()
+    look(hit & few)
+    look(hit & ~few & _near(believed.reshape(shape)).ravel())
     if mask is None:
         seen = np.flatnonzero(believed)
         texture = contrast(image, px[seen], settings.radius)
         usual = float(np.median(texture)) if len(seen) else 0.0
         believed[seen[~(texture > _LEAST_CONTRAST * usual)]] = False
-    good = coherent(radii[which].reshape(shape), believed.reshape(shape), tolerance=2.0, least=least)
-    xyz = _spread(hypotheses.xyz[np.arange(len(met)), nearest], met, len(px)).reshape(*shape, 3)
-    return Sweep(points, px, warps, xyz, good)
+    good = coherent(radii[which].reshape(shape), believed.reshape(shape), tolerance=2.0, least=least).ravel()
+    xyz = np.full((len(px), 3), np.nan)
+    xyz[good] = on_cylinder(first, px[good], radii[which[good], None])[:, 0]
+    return Sweep(points, px, warps, xyz.reshape(*shape, 3), good.reshape(shape))
+
+
+def _few(shape: tuple[int, ...]) -> Mask:
+    """Every second position of a lattice each way, (rows, columns)."""
+    few = np.zeros(shape, bool)
+    few[::2, ::2] = True
+    return few
+
+
+def _near(believed: Mask) -> Mask:
+    """Positions of a lattice no farther than two from a believed one, (rows, columns)."""
+    return cv2.dilate(believed.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
 
 
 def convincing(search: Search, zncc: Array, second_best: Array) -> Mask:
     """Matches (n,) of a sweep that look alike enough, and more so than any other place on the line."""
     with np.errstate(invalid="ignore"):
         return np.asarray((zncc > search.zncc_min) & (second_best < 0.9 * zncc))
-
-
-def _spread(values: Array, index: NDArray[np.int_], count: int) -> Array:
-    """Values (k, ...) of some of ``count`` points in an array of all, NaN for the others."""
-    out = np.full((count, *values.shape[1:]), np.nan)
-    out[index] = values
-    return out
-
-
-def _nearest(candidates: Array, chosen: Array) -> NDArray[np.int_]:
-    """Index (n,) of the chosen warp among the candidates (n, K, 6)."""
-    distance = np.abs(candidates[..., :2] - chosen[:, None, :2]).sum(axis=-1)
-    return np.argmin(np.where(np.isfinite(distance), distance, np.inf), axis=1)

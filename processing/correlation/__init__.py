@@ -15,7 +15,7 @@ them. The room knows images, masks and points only: no camera, no calibration, n
 
 from processing.correlation.correlate import Correlation, correlate, in_order, refine_alone
 from processing.correlation.grid import grid
-from processing.correlation.hypotheses import search_hypotheses
+from processing.correlation.hypotheses import Row, search_hypotheses, search_row
 from processing.correlation.prepared import Current, Reference, prepare_current, prepare_reference
 from processing.correlation.settings import CorrelationSettings
 from processing.correlation.status import Status
@@ -25,6 +25,7 @@ __all__ = [
     "CorrelationSettings",
     "Current",
     "Reference",
+    "Row",
     "Status",
     "correlate",
     "grid",
@@ -33,4 +34,5 @@ __all__ = [
     "prepare_reference",
     "refine_alone",
     "search_hypotheses",
+    "search_row",
 ]
