@@ -93,17 +93,6 @@ def _follow(origin, rays, px, radii, P, K, distortion, size, half_width, warps):
                 warps[i, k, 5] = (seen[3, 1] - seen[4, 1]) / (2 * half_width) - 1
 
 
-def compose(inner: Array, outer: Array) -> Array:
-    """The warp "inner, then outer": both (..., 6) first-order warps; outer taken at the position inner leads to."""
-    result = np.empty(np.broadcast_shapes(inner.shape, outer.shape))
-    result[..., :2] = inner[..., :2] + outer[..., :2]
-    inner_gradient = np.broadcast_to(inner, result.shape)[..., 2:].reshape(*result.shape[:-1], 2, 2)
-    outer_gradient = np.broadcast_to(outer, result.shape)[..., 2:].reshape(*result.shape[:-1], 2, 2)
-    both = inner_gradient + outer_gradient + outer_gradient @ inner_gradient
-    result[..., 2:] = both.reshape(*result.shape[:-1], 4)
-    return result
-
-
 def sweep_radii(radius: float, reach: float, spacing: float) -> Array:
     """Radii (K,) mm of the sweep: ± reach about a radius in steps near ``spacing``, all positive."""
     count = max(3, 2 * round(reach / spacing) + 1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from processing.camera import Camera
-from processing.proxy import compose, on_cylinder, stereo_hypotheses, sweep_radii
+from processing.proxy import on_cylinder, stereo_hypotheses, sweep_radii
 from processing.region import Lattice, coherent, contrast, lattice, lattice_normals, paint, well_seen
 
 
@@ -51,18 +51,6 @@ def test_the_gradients_predict_the_match_nearby() -> None:
 
 def test_a_line_of_sight_beside_the_proxy_has_no_hypothesis() -> None:
     assert np.isnan(stereo_hypotheses(FIRST, SECOND, np.array([[5.0, 800.0]]), np.array([57.0]), 5.0).warps).all()
-
-
-def test_composition_of_warps_is_that_of_affine_maps() -> None:
-    rng = np.random.default_rng(1)
-    inner, outer = rng.normal(0, 0.3, (2, 6))
-    both = compose(inner, outer)
-
-    def matrix(warp: np.ndarray) -> np.ndarray:
-        return np.array([[1 + warp[2], warp[3], warp[0]], [warp[4], 1 + warp[5], warp[1]], [0, 0, 1]])
-
-    np.testing.assert_allclose(matrix(both)[:2, :2], (matrix(outer) @ matrix(inner))[:2, :2], atol=1e-14)
-    np.testing.assert_allclose(both[:2], inner[:2] + outer[:2], atol=1e-14)
 
 
 def test_the_sweep_is_centred_and_positive() -> None:
