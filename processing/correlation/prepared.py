@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.correlation.settings import CorrelationSettings
-from processing.correlation.spline import PAD, REACH, coefficients, gradients
+from processing.correlation.spline import REACH, Box, coefficients, gradients
 from processing.errors import InputError
 
 Array = NDArray[np.float64]
 Levels = NDArray[np.floating]
-Box = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
@@ -50,12 +49,12 @@ class Reference:
     @cached_property
     def slopes(self) -> tuple[Levels, Levels]:
         """∂/∂x and ∂/∂y of the box, two (h, w)."""
-        return gradients(self.grey, self.degree)
+        return gradients(self.image, self.degree, self.box, self.precision)
 
     @cached_property
     def coef(self) -> Levels:
         """Padded coefficients of the box; only points between the pixels need them."""
-        return coefficients(self.grey, self.degree)
+        return coefficients(self.image, self.degree, self.box, self.precision)
 
 
 @dataclass(frozen=True)
@@ -80,11 +79,7 @@ class Current:
     @cached_property
     def coef(self) -> Levels:
         """Padded coefficients of the box, those of the whole image: the filter sees the pixels around."""
-        x0, y0, x1, y1 = self.box
-        wider = _clip((x0 - REACH, y0 - REACH, x1 + REACH, y1 + REACH), self.image.shape)
-        left, top = x0 - wider[0], y0 - wider[1]
-        filtered = coefficients(_crop(self.image, wider, self.precision), self.degree)
-        return np.ascontiguousarray(filtered[top : top + y1 - y0 + 2 * PAD, left : left + x1 - x0 + 2 * PAD])
+        return coefficients(self.image, self.degree, self.box, self.precision)
 
     def around(self, positions: Array, margin: float) -> Current:
         """The same with the box no larger than the positions (k, 2) px and a margin about them."""

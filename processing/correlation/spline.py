@@ -8,12 +8,14 @@ image is filtered in single precision, with as many taps as that resolves.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.correlation.filters import BLOCK, along_columns, along_rows, mirrored
+
 Array = NDArray[np.float64]
 Levels = NDArray[np.floating]
+Box = tuple[int, int, int, int]
 
 _SAMPLES = {3: np.array([1.0, 4.0, 1.0]) / 6.0, 5: np.array([1.0, 26.0, 66.0, 26.0, 1.0]) / 120.0}
 # β'(k) at the integers k = -2 ... 2 (cubic: -1 ... 1).
@@ -41,19 +43,47 @@ def gradient_taps(degree: int, precision: str = "d") -> Array:
     return np.convolve(prefilter_taps(degree, precision), _SLOPES[degree])[::-1].copy()
 
 
-def coefficients(image: Levels, degree: int) -> Levels:
-    """Spline coefficients of an image (h, w), with PAD more on every side. (h + 2 PAD, w + 2 PAD)."""
-    taps = prefilter_taps(degree, image.dtype.char)
-    inner = cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_REFLECT_101)
-    padded = cv2.copyMakeBorder(inner, PAD, PAD, PAD, PAD, cv2.BORDER_REFLECT_101)
-    return np.ascontiguousarray(padded, dtype=image.dtype)
+def coefficients(image: NDArray, degree: int, box: Box | None = None, precision: type | None = None) -> Levels:
+    """Spline coefficients of a box (x0, y0, x1, y1; the whole if None) of an image (h, w), with PAD more on every side.
+
+    precision : float32 or float64; the image's own if None. (y1 - y0 + 2 PAD, x1 - x0 + 2 PAD).
+    """
+    x0, y0, x1, y1 = box or (0, 0, image.shape[1], image.shape[0])
+    kind = np.dtype(precision or image.dtype)
+    taps = prefilter_taps(degree, kind.char).astype(kind)
+    out = np.empty((y1 - y0 + 2 * PAD, x1 - x0 + 2 * PAD), kind)
+    filtered = _rows_about(image, taps, (x0 - PAD, y0 - PAD, x1 + PAD, y1 + PAD), len(taps) // 2)
+    along_columns(filtered, taps, 0, out)
+    return out
 
 
-def gradients(image: Levels, degree: int) -> tuple[Levels, Levels]:
-    """∂/∂x and ∂/∂y of the spline at the samples of an image (h, w). Two (h, w), grey levels a pixel."""
-    slope, one = gradient_taps(degree, image.dtype.char), np.ones(1)
-    border = cv2.BORDER_REFLECT_101
-    return (
-        np.asarray(cv2.sepFilter2D(image, -1, slope, one, borderType=border), dtype=image.dtype),
-        np.asarray(cv2.sepFilter2D(image, -1, one, slope, borderType=border), dtype=image.dtype),
-    )
+def gradients(
+    image: NDArray, degree: int, box: Box | None = None, precision: type | None = None
+) -> tuple[Levels, Levels]:
+    """∂/∂x and ∂/∂y of the spline at the samples of a box (the whole if None) of an image. Two (y1 - y0, x1 - x0),
+    grey levels a pixel. precision : as for :func:`coefficients`."""
+    x0, y0, x1, y1 = box or (0, 0, image.shape[1], image.shape[0])
+    kind = np.dtype(precision or image.dtype)
+    slope, one = gradient_taps(degree, kind.char).astype(kind), np.ones(1, kind)
+    along_x = _rows_about(image, slope, (x0, y0, x1, y1), 0)
+    along_y = np.empty((y1 - y0, x1 - x0), kind)
+    along_columns(_rows_about(image, one, (x0, y0, x1, y1), len(slope) // 2), slope, 0, along_y)
+    return np.ascontiguousarray(along_x[:, : x1 - x0]), along_y
+
+
+def _rows_about(image: NDArray, taps: Levels, box: Box, reach: int) -> Levels:
+    """The box and ``reach`` rows above and below it, filtered along the rows, both as mirrored beyond the image.
+
+    (y1 - y0 + 2 reach, x1 - x0 rounded up to a multiple of BLOCK)."""
+    (height, _), (x0, y0, x1, y1) = image.shape, box
+    first, last = y0 - reach, y1 + reach
+    low, high = max(first, 0), min(last, height)
+    out = np.empty((last - first, -(-(x1 - x0) // BLOCK) * BLOCK), taps.dtype)
+    along_rows(image, taps, x0, low, out[low - first : high - first])
+    for row in (*range(first, low), *range(high, last)):
+        shown = mirrored(row, height)
+        if low <= shown < high:
+            out[row - first] = out[shown - first]
+        else:
+            along_rows(image, taps, x0, shown, out[row - first : row - first + 1])
+    return out

@@ -16,6 +16,27 @@ def test_coefficients_are_those_of_the_recursive_filter(degree):
     np.testing.assert_allclose(inner, ndimage.spline_filter(image, degree, mode="mirror"), atol=1e-6)
 
 
+@pytest.mark.parametrize("degree", [3, 5])
+def test_a_box_has_the_coefficients_and_slopes_of_the_whole_image_in_single_precision_too(degree):
+    image = np.random.default_rng(0).integers(0, 256, (160, 190)).astype(np.uint8)
+    whole, slopes = coefficients(image, degree, None, np.float64), gradients(image, degree, None, np.float64)
+    for x0, y0, x1, y1 in ((0, 0, 190, 160), (50, 40, 121, 143), (0, 150, 8, 160), (181, 0, 190, 9)):
+        for kind, within in ((np.float64, 1e-10), (np.float32, 1e-6)):
+            inner = coefficients(image, degree, (x0, y0, x1, y1), kind)
+            expected = whole[y0 : y1 + 2 * PAD, x0 : x1 + 2 * PAD]
+            assert np.abs(inner - expected).max() < within * np.abs(whole).max()
+            for slope, along in zip(gradients(image, degree, (x0, y0, x1, y1), kind), slopes, strict=True):
+                assert slope.dtype == kind
+                assert np.abs(slope - along[y0:y1, x0:x1]).max() < within * 255.0
+
+
+def test_a_coefficient_depends_on_no_box_to_the_last_digit():
+    image = np.random.default_rng(0).integers(0, 256, (160, 190)).astype(np.uint8)
+    one = coefficients(image, 5, (50, 40, 121, 143), np.float32)
+    other = coefficients(image, 5, (61, 30, 150, 151), np.float32)
+    np.testing.assert_array_equal(one[:, 11:], other[10 : 10 + one.shape[0], : one.shape[1] - 11])
+
+
 @pytest.mark.parametrize(("degree", "order"), [(3, 4), (5, 6)])
 def test_gradients_converge_at_the_order_of_the_spline(degree, order):
     x = np.arange(400.0)[None, :] * np.ones((9, 1))
