@@ -12,6 +12,8 @@ from scipy.spatial import cKDTree
 Array = NDArray[np.float64]
 
 COUNT = 8
+_AROUND = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
+_MOST_CELLS = 64  # of a grid a point of it; a sparser one has its neighbours looked for
 # A jump across one grid step that no real surface makes, px; grows with the scatter of the field.
 _LEAST_JUMP = 0.5
 _SCATTERS = 8.0
@@ -19,9 +21,17 @@ _LEAST_ISLAND = 4
 
 
 def neighbours(xy: Array, step: float) -> NDArray[np.int64]:
-    """The up to eight nearest points within 1.6 steps of each point, nearest first, -1 beyond. (n, 8)."""
+    """The up to eight nearest points within 1.6 steps of each point, nearest first, -1 where there is none. (n, 8)."""
     if len(xy) < 2:
         return np.full((len(xy), COUNT), -1, np.int64)
+    cell = (xy - xy.min(axis=0)) / step
+    columns, rows = (int(size) + 1 for size in cell.max(axis=0))
+    if columns * rows <= _MOST_CELLS * len(xy) and (cell == np.rint(cell)).all():
+        column, row = cell.T.astype(np.int64) + 1
+        table = np.full((columns + 2, rows + 2), -1, np.int64)
+        table[column, row] = np.arange(len(xy))
+        if (table[column, row] == np.arange(len(xy))).all():  # no point twice
+            return np.stack([table[column + dx, row + dy] for dx, dy in _AROUND], axis=1)
     distance, index = cKDTree(xy).query(xy, k=COUNT + 1, distance_upper_bound=1.6 * step)
     index = np.where(np.isfinite(distance), index, -1).astype(np.int64)
     own = index == np.arange(len(xy))[:, None]
@@ -43,20 +53,22 @@ def predicted(xy: Array, parameters: Array, source: NDArray[np.int64], target: N
     return out
 
 
-def inconsistent(xy: Array, parameters: Array, good: NDArray[np.bool_], near: NDArray[np.int64]) -> NDArray[np.bool_]:
+def inconsistent(
+    xy: Array, parameters: Array, good: NDArray[np.bool_], near: NDArray[np.int64], jump: Array, stale: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
     """Good points that contradict the median of what their good neighbours predict, and small islands. (n,) bool.
 
     The median of affine predictions is the robust local fit: half the neighbours may be wrong.
+    jump : (n,) px, how far each lies from that median, as this function left it; stale : (n,) bool, what has changed
+    since, all at first. Both are brought up to date.
     """
-    jump = _jumps(xy, parameters, good, near)
+    _jumps(xy, parameters, good, near, stale, jump)
+    stale[:] = False
     known = np.isfinite(jump)
     scatter = 1.4826 * np.median(jump[known]) if known.any() else 0.0
     limit = max(_LEAST_JUMP, _SCATTERS * scatter)
     bad = known & (jump > limit)
-    size = _island_sizes(xy, parameters, good & ~bad, near, 2.0 * limit)
-    if size.max(initial=0) < 4 * _LEAST_ISLAND:
-        return bad
-    return bad | (good & ~bad & (size < _LEAST_ISLAND))
+    return bad | _islands(xy, parameters, good & ~bad, near, 2.0 * limit, _LEAST_ISLAND)
 
 
 @nb.njit(cache=True, nogil=True)
@@ -68,11 +80,18 @@ def _expected(xy, parameters, source, target, at):  # type: ignore[no-untyped-de
 
 
 @nb.njit(cache=True, nogil=True, parallel=True)
-def _jumps(xy, parameters, good, near):  # type: ignore[no-untyped-def]
-    """Distance (n,) px of each good point from the median of what its good neighbours expect; NaN without any."""
-    n = len(xy)
-    out = np.full(n, np.nan)
-    for k in nb.prange(n):
+def _jumps(xy, parameters, good, near, stale, jump):  # type: ignore[no-untyped-def]
+    """Distance (n,) px of each good point from the median of what its good neighbours expect; NaN without any.
+
+    Only where the point or a neighbour is stale (n,).
+    """
+    for k in nb.prange(len(xy)):
+        changed = stale[k]
+        for slot in range(near.shape[1]):
+            changed |= near[k, slot] >= 0 and stale[near[k, slot]]
+        if not changed:
+            continue
+        jump[k] = np.nan
         if not good[k]:
             continue
         expected, m = np.empty((2, near.shape[1])), 0
@@ -84,8 +103,7 @@ def _jumps(xy, parameters, good, near):  # type: ignore[no-untyped-def]
                 m += 1
         if m:
             u, v = _median(expected[0], m), _median(expected[1], m)
-            out[k] = math.hypot(parameters[k, 0] - u, parameters[k, 6] - v)
-    return out
+            jump[k] = math.hypot(parameters[k, 0] - u, parameters[k, 6] - v)
 
 
 @nb.njit(cache=True, nogil=True)
@@ -101,52 +119,119 @@ def _median(values, count):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def _root(parent, k):  # type: ignore[no-untyped-def]
-    while parent[k] != k:
-        parent[k] = parent[parent[k]]
-        k = parent[k]
-    return k
+def _agree(xy, parameters, one, other, limit):  # type: ignore[no-untyped-def]
+    """Whether either of two points lies where the other expects it."""
+    for source, target in ((one, other), (other, one)):
+        u = _expected(xy, parameters, source, target, 0) - parameters[target, 0]
+        v = _expected(xy, parameters, source, target, 6) - parameters[target, 6]
+        if u * u + v * v <= limit * limit:
+            return True
+    return False
 
 
 @nb.njit(cache=True, nogil=True)
-def _island_sizes(xy, parameters, good, near, limit):  # type: ignore[no-untyped-def]
-    """The number of good points (n,) that each good point hangs together with by mutual agreement; 0 of the others."""
-    n = len(xy)
-    parent = np.arange(n)
-    for k in range(n):
-        if not good[k]:
-            continue
+def _hangs_together(xy, parameters, good, near, limit, k, found, most):  # type: ignore[no-untyped-def]
+    """The number of good points that point k hangs together with by mutual agreement, ``most`` if more.
+
+    found : (at least most,) scratch.
+    """
+    found[0], count, at = k, 1, 0
+    while at < count < most:
         for slot in range(near.shape[1]):
-            source = near[k, slot]
-            if source >= 0 and good[source]:
-                u = _expected(xy, parameters, source, k, 0) - parameters[k, 0]
-                v = _expected(xy, parameters, source, k, 6) - parameters[k, 6]
-                if u * u + v * v <= limit * limit:
-                    parent[_root(parent, k)] = _root(parent, source)
-    count = np.zeros(n, np.int64)
-    for k in range(n):
+            other, new = near[found[at], slot], True
+            if other < 0 or not good[other]:
+                continue
+            for m in range(count):
+                new &= found[m] != other
+            if new and _agree(xy, parameters, found[at], other, limit):
+                found[count] = other
+                count += 1
+                if count == most:
+                    break
+        at += 1
+    return count
+
+
+@nb.njit(cache=True, nogil=True)
+def _islands(xy, parameters, good, near, limit, least):  # type: ignore[no-untyped-def]
+    """Good points (n,) that hang together with fewer than ``least``, themselves included; none where nothing hangs
+    together with four times as many."""
+    out, many = np.zeros(len(xy), np.bool_), False
+    found = np.empty(4 * least, np.int64)
+    for k in range(len(xy)):
         if good[k]:
-            count[_root(parent, k)] += 1
-    out = np.zeros(n, np.int64)
-    for k in range(n):
-        if good[k]:
-            out[k] = count[_root(parent, k)]
-    return out
+            most = least if many else len(found)
+            count = _hangs_together(xy, parameters, good, near, limit, k, found, most)
+            many |= count == len(found)
+            out[k] = count < least
+    return out & many
 
 
 def local_fit(
-    xy: Array, parameters: Array, good: NDArray[np.bool_], wanted: NDArray[np.int64], count: int = 12
+    xy: Array,
+    parameters: Array,
+    good: NDArray[np.bool_],
+    near: NDArray[np.int64],
+    wanted: NDArray[np.int64],
+    count: int = 12,
 ) -> Array:
-    """Parameters (k, 12) of wanted points from an affine least-squares fit of their nearest good points."""
+    """Parameters (k, 12) of wanted points from an affine least-squares fit of so many good points near them.
+
+    near : (n, 8), neighbours; they lead from point to point. NaN where they lead to fewer than six good ones.
+    """
     out = np.full((len(wanted), parameters.shape[1]), np.nan)
-    source = np.flatnonzero(good)
-    if len(source) < 6 or not len(wanted):
-        return out
-    _, index = cKDTree(xy[source]).query(xy[wanted], k=min(count, len(source)))
-    pick = source[index]
-    d = xy[pick] - xy[wanted][:, None]
-    A = np.concatenate([np.ones((*d.shape[:2], 1)), d], axis=2)
-    fit = np.linalg.pinv(A) @ parameters[pick][:, :, [0, 6]]
-    out[:] = 0.0
-    out[:, [0, 1, 2]], out[:, [6, 7, 8]] = fit[:, :, 0], fit[:, :, 1]
+    _fits(xy, parameters, good, near, wanted, count, out)
     return out
+
+
+@nb.njit(cache=True, nogil=True)
+def _ring_by_ring(good, near, k, count, seen, stamp):  # type: ignore[no-untyped-def]
+    """Good points around point k, from neighbour to neighbour until at least ``count`` are found.
+
+    seen : (n,), what is not ``stamp`` has not been looked at; filled.
+    """
+    reached, picked = [np.int64(k)], [np.int64(k)]
+    picked.pop()
+    seen[k] = stamp
+    begin = 0
+    while len(picked) < count and begin < len(reached):
+        end = len(reached)
+        for at in range(begin, end):
+            for slot in range(near.shape[1]):
+                other = near[reached[at], slot]
+                if other >= 0 and seen[other] != stamp:
+                    seen[other] = stamp
+                    reached.append(other)
+                    if good[other]:
+                        picked.append(other)
+        begin = end
+    return np.array(picked)
+
+
+@nb.njit(cache=True, nogil=True)
+def _fits(xy, parameters, good, near, wanted, count, out):  # type: ignore[no-untyped-def]
+    """The affine fits of ``local_fit``: the nearest of the points that are found ring by ring, by normal equations."""
+    seen = np.full(len(xy), -1, np.int64)
+    for w in range(len(wanted)):
+        picked = _ring_by_ring(good, near, wanted[w], count, seen, w)
+        if len(picked) < 6:
+            continue
+        off = xy[picked] - xy[wanted[w]]
+        square = off[:, 0] ** 2 + off[:, 1] ** 2
+        nearest = np.argsort(square, kind="mergesort")[:count]
+        side = math.sqrt(np.mean(square[nearest]))
+        N, b = np.zeros((3, 3)), np.zeros((3, 2))
+        for at in nearest:
+            row = (1.0, off[at, 0] / side, off[at, 1] / side)
+            for i in range(3):
+                for j in range(3):
+                    N[i, j] += row[i] * row[j]
+                b[i, 0] += row[i] * parameters[picked[at], 0]
+                b[i, 1] += row[i] * parameters[picked[at], 6]
+        for i in range(3):
+            N[i, i] += 1e-9 * len(nearest)  # points in a row tell nothing across it: no gradient is taken there
+        fit = np.linalg.solve(N, b)
+        out[w] = 0.0
+        for axis in range(2):
+            out[w, 6 * axis] = fit[0, axis]
+            out[w, 6 * axis + 1], out[w, 6 * axis + 2] = fit[1, axis] / side, fit[2, axis] / side

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +16,7 @@ from processing.errors import InputError
 
 Array = NDArray[np.float64]
 Levels = NDArray[np.floating]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,7 @@ class Reference:
     degree: int
     precision: type
     grey_range: float
+    _kept: dict[Hashable, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -55,6 +59,13 @@ class Reference:
     def coef(self) -> Levels:
         """Padded coefficients of the box; only points between the pixels need them."""
         return coefficients(self.image, self.degree, self.box, self.precision)
+
+    def once(self, key: Hashable, make: Callable[[], T]) -> T:
+        """What ``make`` finds in this image, made when first asked for: of one reference many images are matched."""
+        if key not in self._kept:
+            self._kept[key] = make()
+        kept: T = self._kept[key]
+        return kept
 
 
 @dataclass(frozen=True)

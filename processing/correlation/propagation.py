@@ -39,6 +39,7 @@ class Field:
     region : the part of the current image in use, chosen by the first start values, grown when a point lies beyond.
     filtering : seconds spent on filtering it. bare : (n,) bool, points without texture; None to look for them.
     alone : points are refined from start values of their own; none has neighbours.
+    jump, stale : (n,), what the neighbours' judgement keeps, see ``inconsistent``.
     """
 
     reference: Reference
@@ -57,6 +58,8 @@ class Field:
     iterations: NDArray[np.int64] = field(init=False)
     sigma: Array = field(init=False)
     tried: NDArray[np.bool_] = field(init=False)
+    jump: Array = field(init=False)
+    stale: NDArray[np.bool_] = field(init=False)
 
     def __post_init__(self) -> None:
         n = len(self.xy)
@@ -67,6 +70,7 @@ class Field:
         self.iterations = np.zeros(n, np.int64)
         self.sigma = np.full((n, 2), np.nan)
         self.tried = np.zeros((n, COUNT), bool)
+        self.jump, self.stale = np.full(n, np.nan), np.ones(n, bool)
         if self.bare is None:
             self.bare = bare_points(self.reference, self.xy, self.settings)
         self.status[self.bare] = Status.NO_TEXTURE
@@ -107,6 +111,7 @@ class Field:
         self.parameters[index] = np.where(keep[:, None], found, np.nan)
         self.zncc[index] = np.where(keep, zncc, np.nan)
         self.sigma[index] = np.where(keep[:, None], sigma, np.nan)
+        self.stale[index] = True
         if self.progress is not None:
             self.progress(int(self.good.sum()), len(self.xy))
         return keep
@@ -150,6 +155,7 @@ class Field:
             other.zncc[take],
         )
         self.iterations[to], self.sigma[to] = other.iterations[take], other.sigma[take]
+        self.stale[to] = True
 
     def propagate(self) -> None:
         """Waves from the good points until no point has an untried good neighbour."""
@@ -187,7 +193,7 @@ class Field:
             index = np.flatnonzero(~self.good & (self.status != Status.NO_TEXTURE) & self._has_good_neighbour())
             if not len(index):
                 return
-            start = local_fit(self.xy, self.parameters, self.good, index)
+            start = local_fit(self.xy, self.parameters, self.good, self.near, index)
             usable = np.isfinite(start).all(axis=1)
             if not usable.any() or not self.attempt(index[usable], start[usable]).any():
                 return
@@ -196,12 +202,13 @@ class Field:
     def reject_outliers(self) -> bool:
         """Points that contradict their neighbours become lost, until none does. True if any did."""
         for k in range(5):
-            bad = inconsistent(self.xy, self.parameters, self.good, self.near)
+            bad = inconsistent(self.xy, self.parameters, self.good, self.near, self.jump, self.stale)
             if not bad.any():
                 return k > 0
             self.status[bad] = Status.INCONSISTENT
             self.parameters[bad], self.zncc[bad], self.sigma[bad] = np.nan, np.nan, np.nan
             self.tried[bad] = False  # another neighbour may lead elsewhere
+            self.stale[bad] = True
         return True
 
     def _has_good_neighbour(self) -> NDArray[np.bool_]:
@@ -211,27 +218,32 @@ class Field:
 def bare_points(reference: Reference, xy: Array, settings: CorrelationSettings) -> NDArray[np.bool_]:
     """Points (n,) with clearly too little texture about them, seen at once for all: no start value is sought there.
 
-    The weaker eigenvalue of the structure tensor over the square about the point, from a sample of its pixels; the
-    kernel judges the subset itself.
+    The kernel judges the subset itself.
     """
-    thin = max(settings.radius // 8, 1)
-    size = (2 * (settings.radius // thin) + 1,) * 2
+    weakest, thin = reference.once(("texture", settings.radius), lambda: _texture(reference, settings.radius))
+    at = np.rint((xy - reference.origin) / thin).astype(np.int64)
+    h, w = weakest.shape
+    column, row = np.clip(at[:, 0], 0, w - 1), np.clip(at[:, 1], 0, h - 1)
+    limit = 0.7 * settings.texture_min * reference.grey_range / 255.0
+    return np.asarray(weakest[row, column] < limit**2)
+
+
+def _texture(reference: Reference, radius: int) -> tuple[NDArray[np.float32], int]:
+    """The weaker eigenvalue of the structure tensor over the square about every so many pixels of the box, from a
+    sample of its pixels; and how many pixels."""
+    thin = max(radius // 8, 1)
+    size = (2 * (radius // thin) + 1,) * 2
     sampled = np.s_[::thin, ::thin]
     inside = reference.mask[sampled].astype(np.float32)
     gx, gy = (slope[sampled].astype(np.float32) * inside for slope in reference.slopes)
-    at = np.rint((xy - reference.origin) / thin).astype(np.int64)
-    h, w = inside.shape
-    column, row = np.clip(at[:, 0], 0, w - 1), np.clip(at[:, 1], 0, h - 1)
 
-    def mean(values: NDArray[np.float32]) -> Array:
-        filtered = cv2.boxFilter(values, -1, size, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray(filtered[row, column], dtype=np.float64)
+    def mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.asarray(cv2.boxFilter(values, -1, size, borderType=cv2.BORDER_CONSTANT))
 
-    share = np.maximum(mean(inside), 1e-6)
-    xx, xy_, yy = mean(gx * gx) / share, mean(gx * gy) / share, mean(gy * gy) / share
-    weakest = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy_**2)
-    limit = 0.7 * settings.texture_min * reference.grey_range / 255.0
-    return np.asarray(weakest < limit**2)
+    share = np.maximum(mean(inside), np.float32(1e-6))
+    half_trace, half = mean(gx * gx), mean(gy * gy)
+    half_trace, half = 0.5 * (half_trace + half), 0.5 * (half_trace - half)
+    return (half_trace - np.sqrt(half * half + mean(gx * gy) ** 2)) / share, thin
 
 
 def _degenerate(parameters: Array) -> NDArray[np.bool_]:

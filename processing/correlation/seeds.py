@@ -43,10 +43,11 @@ def spread(xy: Array, count: int = _SEEDS) -> NDArray[np.int64]:
 def flow_starts(reference: Reference, current: Current, xy: Array, radius: int) -> Array:
     """Start values (n, 12) from dense inverse search flow (Kroeger et al. 2016) on a reduced region."""
     h, w = reference.mask.shape
-    scale = min(1.0, max(_FLOW_SIDE / max(h, w), 0.25))
+    scale = _flow_scale(max(h, w))
     x0, y0 = (np.maximum(reference.origin - _FLOW_MARGIN, 0)).astype(int)
     x1, y1 = (reference.origin + np.array([w, h]) + _FLOW_MARGIN).astype(int)
-    ref, cur = (_reduced(image[y0:y1, x0:x1], scale) for image in (reference.image, current.image))
+    ref = reference.once(("levelled", scale), lambda: _reduced(reference.image[y0:y1, x0:x1], scale))
+    cur = _reduced(current.image[y0:y1, x0:x1], scale)
     height, width = min(ref.shape[0], cur.shape[0]), min(ref.shape[1], cur.shape[1])
     if min(height, width) < 16:
         return np.full((len(xy), 12), np.nan)
@@ -62,6 +63,12 @@ def flow_starts(reference: Reference, current: Current, xy: Array, radius: int) 
     d_dx, d_dy = (right - left) * scale / (2 * reach), (down - up) * scale / (2 * reach)
     out[:, [0, 6]], out[:, [1, 7]], out[:, [2, 8]] = centre, d_dx, d_dy
     return out
+
+
+def _flow_scale(side: int) -> float:
+    """By what a region with such a longer side, px, is reduced; where to about half or less, by a whole number."""
+    times = min(max(side / _FLOW_SIDE, 1.0), 4.0)
+    return 1.0 / (round(times) if times > 1.5 else times)  # averages over whole pixels cost a tenth
 
 
 def search_starts(reference: Reference, current: Current, xy: Array, radius: int) -> Array:
