@@ -54,7 +54,12 @@ def predicted(xy: Array, parameters: Array, source: NDArray[np.int64], target: N
 
 
 def inconsistent(
-    xy: Array, parameters: Array, good: NDArray[np.bool_], near: NDArray[np.int64], jump: Array, stale: NDArray[np.bool_]
+    xy: Array,
+    parameters: Array,
+    good: NDArray[np.bool_],
+    near: NDArray[np.int64],
+    jump: Array,
+    stale: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
     """Good points that contradict the median of what their good neighbours predict, and small islands. (n,) bool.
 

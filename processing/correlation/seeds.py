@@ -53,11 +53,13 @@ def flow_starts(reference: Reference, current: Current, xy: Array, radius: int) 
         return np.full((len(xy), 12), np.nan)
     flow_search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     flow = flow_search.calc(ref[:height, :width], cur[:height, :width], np.zeros((height, width, 2), np.float32))
-    flow = cv2.GaussianBlur(flow, (0, 0), max(0.25 * radius * scale, 0.5)) / scale
+    smooth = np.float32(1.0 / scale) * cv2.GaussianBlur(flow, (0, 0), max(0.25 * radius * scale, 0.5)).astype(
+        np.float32
+    )
     at = _reduced_position(xy - (x0, y0), scale)
     reach = max(0.7 * radius * scale, 1.0)
     centre, left, right, up, down = (
-        _sample(flow, at + np.array(shift) * reach) for shift in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1))
+        _sample(smooth, at + np.array(shift) * reach) for shift in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1))
     )
     out = np.zeros((len(xy), 12))
     d_dx, d_dy = (right - left) * scale / (2 * reach), (down - up) * scale / (2 * reach)
