@@ -59,6 +59,7 @@ from processing.correlation.subset import (
     moments,
     normal_matrix,
     pack,
+    take,
     template,
     well_inside,
 )
@@ -69,7 +70,11 @@ N_PARAMETERS = 12
 _F, _U = np.float32, np.uint64
 _L = np.uint64(LANES)
 _LAST_DIGIT = 1e-5  # px; steps below it that shrink no more are the rounding of single precision
-_CAUTION = 4.0  # the steps may come to shrink half as fast as the last one did
+_CAUTION = 2.0  # the steps may come to shrink half as fast as the last one did, or as those of other points
+_SHOWN = 4  # points of a chunk that must have made two steps before others may stop after one
+_ALIKE = 2.0  # times their 1 - ZNCC that such a point may have
+_HOPELESS = 6  # steps after which it is foretold whether a point will be there in time
+_SPAN = 3  # steps over which that is judged
 _CHUNK = 64  # points that share their scratch memory
 _SURE = 0.9  # ZNCC of a match that others may follow
 _PAD = PAD
@@ -251,16 +256,71 @@ def _length(d, radius):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
+def _foretold(moved, previous, second, unlike, shown):  # type: ignore[no-untyped-def]
+    """Square of the next step's length, after one of square ``moved`` and before that ``previous``, 0 for none.
+
+    Steps shrink as the last two tell. After a single one they shrink as those of other points of the same images did,
+    where this one's 1 - ZNCC, ``unlike``, is like theirs. second : whether it was the point's second step. shown : (3,)
+    sums over those points: their number, by what factor their second step was shorter, and their 1 - ZNCC; brought up
+    to date.
+    """
+    if previous == 0.0:
+        if shown[0] < _SHOWN or unlike * shown[0] > _ALIKE * shown[2]:
+            return moved
+        shrinking = shown[1] / shown[0]
+    else:
+        shrinking = math.sqrt(moved / previous)
+        if second:
+            shown[0] += 1.0
+            shown[1] += min(shrinking, 1.0)
+            shown[2] += unlike
+    return moved * min(_CAUTION * shrinking, 1.0) ** 2
+
+
+@nb.njit(cache=True, nogil=True)
+def _keep(kept, size, H, sum_J, sum_fJ, mean_f, norm_f, pixels):  # type: ignore[no-untyped-def]
+    """What does not depend on the current image, written to a row of ``width_of_subset`` numbers."""
+    at = 3
+    kept[0], kept[1], kept[2] = mean_f, norm_f, pixels
+    for i in range(size):
+        kept[at], kept[at + 1] = sum_J[i], sum_fJ[i]
+        at += 2
+        for j in range(i + 1):
+            kept[at] = H[i, j]
+            at += 1
+
+
+@nb.njit(cache=True, nogil=True)
+def _recall(kept, size, H, sum_J, sum_fJ):  # type: ignore[no-untyped-def]
+    """The same read. Returns the mean of f, its norm about that, and the number of pixels."""
+    at = 3
+    for i in range(size):
+        sum_J[i], sum_fJ[i] = kept[at], kept[at + 1]
+        at += 2
+        for j in range(i + 1):
+            H[i, j] = kept[at]
+            at += 1
+    return kept[0], kept[1], kept[2]
+
+
+def width_of_subset(order: int) -> int:
+    """Numbers of a subset that do not depend on the current image."""
+    size = 6 * order
+    return 3 + 2 * size + size * (size + 1) // 2
+
+
+@nb.njit(cache=True, nogil=True)
 def _refine_point(  # type: ignore[no-untyped-def]
     image, gx, gy, coef_ref, stride_ref, mask, shape_ref, coef, shape, x_ref, y_ref, x_cur, y_cur, p,
     corner, corner_f, offset, uncut, strips, radius, terms, quintic, tolerance, max_iterations, texture, noise,
-    px, bits, place, cell, bend, lanes, H, moment, vectors, A, B,
+    kept, known, row_kept, shown, px, bits, place, cell, bend, lanes, H, moment, vectors, A, B,
 ):  # fmt: skip
     """IC-GN of one subset from the parameters p (12,), refined in place.
 
     (x_ref, y_ref) and (x_cur, y_cur) : the centre in the two images' own crops; corner, uncut, strips : the template,
     corner_f the same as floats, filled up to a multiple of LANES; offset : (n,) of lane 0 from the centre in the
-    reference's crop; the last line is scratch. Returns status, ZNCC,
+    reference's crop; kept, known : what was found of subsets before, this one's in row ``row_kept``, -1 for none;
+    shown : (3,), how steps have shrunk so far, see ``_foretold``; the rest is scratch. Returns status, ZNCC,
     iterations, sigma of u and of v (px).
     """
     n, size, second, kind = corner.shape[1], 2 * terms, terms == 6, px.dtype.type
@@ -273,25 +333,36 @@ def _refine_point(  # type: ignore[no-untyped-def]
         pack(
             image, gx, gy, coef_ref, stride_ref, mask, shape_ref, x_ref, y_ref, radius, quintic, corner, uncut, px, bits
         )
-    sum_f, sum_ff, pixels = moments(
-        direct, second,
-        image, gx, gy, mask, row * shape_ref[1] + column, offset, level, uncut, px, bits, corner_f, strips, lanes,
-        moment,
-    )  # fmt: skip
-    if pixels < max(0.15 * (2 * radius + 1) ** 2, 6 * terms):
-        return NO_TEXTURE, np.nan, 0, np.nan, np.nan
-    mean_f = sum_f / pixels
-    norm_f = math.sqrt(max(sum_ff - pixels * mean_f * mean_f, 0.0))
-    normal_matrix(moment, mean_f, terms, H, sum_J, sum_fJ)
-    half_trace = 0.5 * (H[0, 0] + H[terms, terms])
-    spread = math.sqrt((0.5 * (H[0, 0] - H[terms, terms])) ** 2 + H[terms, 0] ** 2)
-    if not half_trace - spread > pixels * texture * texture or not norm_f > 0.0 or not cholesky(H, size):
-        return NO_TEXTURE, np.nan, 0, np.nan, np.nan
+    at_centre = row * shape_ref[1] + column
+    if row_kept >= 0 and known[row_kept]:
+        if direct:
+            take(image, gx, gy, mask, at_centre, offset, level, uncut, px, bits)
+        mean_f, norm_f, pixels = _recall(kept[row_kept], size, H, sum_J, sum_fJ)
+    else:
+        sum_f, sum_ff, count = moments(
+            direct, second,
+            image, gx, gy, mask, at_centre, offset, level, uncut, px, bits, corner_f, strips, lanes,
+            moment,
+        )  # fmt: skip
+        pixels = float(count)
+        if pixels < max(0.15 * (2 * radius + 1) ** 2, 6 * terms):
+            return NO_TEXTURE, np.nan, 0, np.nan, np.nan
+        mean_f = sum_f / pixels
+        norm_f = math.sqrt(max(sum_ff - pixels * mean_f * mean_f, 0.0))
+        normal_matrix(moment, mean_f, terms, H, sum_J, sum_fJ)
+        half_trace = 0.5 * (H[0, 0] + H[terms, terms])
+        spread = math.sqrt((0.5 * (H[0, 0] - H[terms, terms])) ** 2 + H[terms, 0] ** 2)
+        if not half_trace - spread > pixels * texture * texture or not norm_f > 0.0 or not cholesky(H, size):
+            return NO_TEXTURE, np.nan, 0, np.nan, np.nan
+        if row_kept >= 0:
+            _keep(kept[row_kept], size, H, sum_J, sum_fJ, mean_f, norm_f, pixels)
+            known[row_kept] = True
 
     stride, first_tap = _U(shape[1]), 2 if quintic else 1
     last_digit = _LAST_DIGIT if px.itemsize == 4 else 0.0
     about = (level + mean_f) * (14400.0 if quintic else 36.0)  # in the scale of the interpolated g
-    status, zncc, iterations, previous = NO_CONVERGENCE, np.nan, 0, np.inf
+    status, zncc, iterations, previous = NO_CONVERGENCE, np.nan, 0, 0.0
+    limit, earlier = tolerance * tolerance, (np.inf, np.inf)
     for _ in range(max_iterations):
         iterations += 1
         if not _inside(shape, x_cur, y_cur, p, radius + LANES) and not _stays(shape, x_cur, y_cur, p, corner, bits):
@@ -318,13 +389,16 @@ def _refine_point(  # type: ignore[no-untyped-def]
             break
         if not (compose_inverse(p, d, A, B) if second else compose_inverse_affine(p, d)):
             break
-        left = moved  # square of the next step, as the steps shrink
-        if iterations > 1:
-            left *= min(_CAUTION * moved / previous, 1.0)
-        if left < tolerance * tolerance or previous <= moved < last_digit * last_digit:
+        left = _foretold(moved, previous, iterations == 2, 1.0 - zncc, shown)
+        if left < limit or 0.0 < previous <= moved < last_digit * last_digit:
             status = GOOD
             zncc = min(zncc + 0.5 * gain / (norm_f * norm_f), 1.0)  # where the last step leads
             break
+        if iterations >= _HOPELESS and moved >= last_digit * last_digit:
+            shrinking = math.log(earlier[1] / moved) / _SPAN
+            if not iterations + math.log(moved / limit) / shrinking < max_iterations:
+                break
+        earlier = (previous, earlier[0])
         previous = moved
     if status != GOOD:
         return status, zncc, iterations, np.nan, np.nan
@@ -364,16 +438,17 @@ def _scratch(rows, columns, kind):  # type: ignore[no-untyped-def]
 def refine(  # type: ignore[no-untyped-def]
     image, gx, gy, coef_ref, mask, origin_ref, coef, origin_cur, xy, parameters, known,
     radius, circle, terms, quintic, tolerance, max_iterations, texture, noise, follow,
-    status, zncc, iterations, sigma,
+    kept, known_subset, row_kept, status, zncc, iterations, sigma,
 ):  # fmt: skip
-    """IC-GN of many subsets in parallel; each is independent of the others, so of the number of threads too.
+    """IC-GN of many subsets in parallel; chunks of them are independent of one another, so of the number of threads.
 
     image, gx, gy, mask : (h, w) crop of the reference at origin_ref (x, y), coef_ref its coefficients, padded.
     coef : padded coefficients of the crop of the current image at origin_cur.
     xy : (n, 2) px. parameters : (n, 12), start values in and results out. known : (n,) bool, points to refine.
     follow : px; a point no farther from the one before it starts from that one's result where it is a good match and
-    agrees with the point's own start value; 0 never. status, zncc, iterations (n,) and sigma (n, 2) are filled where
-    known.
+    agrees with the point's own start value; 0 never. kept : (N, width_of_subset), what was found of N subsets of this
+    reference before, and known_subset : (N,) bool, of which; both filled; row_kept : (n,), each point's row, -1 for
+    none. status, zncc, iterations (n,) and sigma (n, 2) are filled where known.
     """
     corner, uncut, strips = template(radius, circle)
     flat_ref, flat, n = coef_ref.ravel(), coef.ravel(), corner.shape[1]
@@ -387,7 +462,7 @@ def refine(  # type: ignore[no-untyped-def]
         bits, cell, bend = np.empty(n, BITS), np.empty((3, m), np.int32), np.empty(2, coef.dtype)
         H, moment, vectors = np.empty((2 * terms, 2 * terms)), np.empty((7, 15)), np.empty((5, 16))
         A, B = np.empty((6, 6)), np.empty((6, 6))
-        before = -1
+        before, shown = -1, np.zeros(3)
         for k in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, xy.shape[0])):
             if known[k]:
                 if before >= 0:
@@ -397,6 +472,7 @@ def refine(  # type: ignore[no-untyped-def]
                     xy[k, 0] - origin_ref[0], xy[k, 1] - origin_ref[1], xy[k, 0] - origin_cur[0],
                     xy[k, 1] - origin_cur[1], parameters[k], corner, corner_f, offset, uncut, strips,
                     radius, terms, quintic, tolerance, max_iterations, texture, noise,
+                    kept, known_subset, row_kept[k], shown,
                     px, bits, place, cell, bend, lanes, H, moment, vectors, A, B,
                 )  # fmt: skip
                 status[k] = result[0]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from hashlib import sha256
 
 import cv2
 import numpy as np
@@ -28,14 +29,26 @@ Progress = Callable[[int, int], None]
 _LEVELS = (0.9, 0.8, 0.6)  # reliability in steps, ZNCC; the last one is settings.zncc_min
 _RETRIES = 3
 _PATIENCE = 15  # iterations of a point that failed before
+_WORTH_KEEPING = 500  # points
+_SETS = 2  # of points of one reference: a lattice and all
 _STRETCH = 4.0  # largest stretch and compression of a subset between two images
+
+
+class Subsets:
+    """What a correlation finds of n subsets of the reference alone: found (n, ...), as ``kernels`` leave it, where
+    known (n,) bool."""
+
+    def __init__(self, n: int, order: int) -> None:
+        self.found = np.empty((n, kernels.width_of_subset(order)))
+        self.known = np.zeros(n, bool)
 
 
 @dataclass
 class Field:
     """The state of all points while they are being matched; arrays over n points.
 
-    parameters (n, 12) as in ``kernels``; tried : (n, 8) bool, neighbours a start value was taken from.
+    parameters (n, 12) as in ``kernels``; tried : (n, 8) bool, neighbours a start value was taken from;
+    fitted : (n,), which neighbours were good when a start value was fitted to the points around, as bits.
     region : the part of the current image in use, chosen by the first start values, grown when a point lies beyond.
     filtering : seconds spent on filtering it. bare : (n,) bool, points without texture; None to look for them.
     alone : points are refined from start values of their own; none has neighbours.
@@ -58,8 +71,10 @@ class Field:
     iterations: NDArray[np.int64] = field(init=False)
     sigma: Array = field(init=False)
     tried: NDArray[np.bool_] = field(init=False)
+    fitted: NDArray[np.int64] = field(init=False)
     jump: Array = field(init=False)
     stale: NDArray[np.bool_] = field(init=False)
+    subsets: Subsets | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         n = len(self.xy)
@@ -69,11 +84,13 @@ class Field:
         self.zncc = np.full(n, np.nan)
         self.iterations = np.zeros(n, np.int64)
         self.sigma = np.full((n, 2), np.nan)
-        self.tried = np.zeros((n, COUNT), bool)
+        self.tried, self.fitted = np.zeros((n, COUNT), bool), np.zeros(n, np.int64)
         self.jump, self.stale = np.full(n, np.nan), np.ones(n, bool)
         if self.bare is None:
             self.bare = bare_points(self.reference, self.xy, self.settings)
         self.status[self.bare] = Status.NO_TEXTURE
+        if not self.alone:
+            self.subsets = _subsets(self.reference, self.xy, self.settings)
 
     @property
     def good(self) -> NDArray[np.bool_]:
@@ -91,13 +108,14 @@ class Field:
         part = self.region if self.region is not None else self.current.around(*self._reached(start, index))
         self._filter(part)
         status, zncc, iterations, sigma, found = refine(
-            self.reference, part, self.xy[index], start, self._patient(index), follow
+            self.reference, part, self.xy[index], start, self._patient(index), follow, self._kept(index)
         )
         beyond = np.flatnonzero(status == Status.OUTSIDE)
         if part is not self.current and len(beyond):  # of the region, but perhaps not of the image
             part = self.current
             self._filter(part)
-            again = refine(self.reference, part, self.xy[index[beyond]], start[beyond], self.settings)
+            kept = self._kept(index[beyond])
+            again = refine(self.reference, part, self.xy[index[beyond]], start[beyond], self.settings, kept=kept)
             status[beyond], zncc[beyond], iterations[beyond], sigma[beyond], found[beyond] = again
         self.region = part
         limit = self.settings.zncc_min if zncc_min is None else zncc_min
@@ -115,6 +133,9 @@ class Field:
         if self.progress is not None:
             self.progress(int(self.good.sum()), len(self.xy))
         return keep
+
+    def _kept(self, index: NDArray[np.int64]) -> tuple[Subsets, NDArray[np.int64]] | None:
+        return None if self.subsets is None else (self.subsets, index)
 
     def _patient(self, index: NDArray[np.int64]) -> CorrelationSettings:
         """The settings for points (k,): where none has been matched from elsewhere before, fewer iterations will tell.
@@ -188,11 +209,18 @@ class Field:
         return True
 
     def retry_from_fit(self) -> None:
-        """Lost points once more, from an affine fit of the good points around them; then from their new neighbours."""
+        """Lost points once more, from an affine fit of the good points around them; then from their new neighbours.
+
+        Not those that failed so before and whose neighbours are good or lost as they were then.
+        """
         for _ in range(2):
-            index = np.flatnonzero(~self.good & (self.status != Status.NO_TEXTURE) & self._has_good_neighbour())
+            beside = self._good_neighbours()
+            index = np.flatnonzero(
+                ~self.good & (self.status != Status.NO_TEXTURE) & (beside > 0) & (beside != self.fitted)
+            )
             if not len(index):
                 return
+            self.fitted[index] = beside[index]
             start = local_fit(self.xy, self.parameters, self.good, self.near, index)
             usable = np.isfinite(start).all(axis=1)
             if not usable.any() or not self.attempt(index[usable], start[usable]).any():
@@ -211,8 +239,25 @@ class Field:
             self.stale[bad] = True
         return True
 
-    def _has_good_neighbour(self) -> NDArray[np.bool_]:
-        return np.asarray(((self.near >= 0) & self.good[self.near]).any(axis=1))
+    def _good_neighbours(self) -> NDArray[np.int64]:
+        """Which of its neighbours are good, as bits of a number. (n,)."""
+        return np.asarray(((self.near >= 0) & self.good[self.near]) @ (1 << np.arange(COUNT)))
+
+
+def _subsets(reference: Reference, xy: Array, settings: CorrelationSettings) -> Subsets | None:
+    """What is known of the subsets about these points, kept with the reference for the next image; None for a few.
+
+    The last sets of points that were asked for are kept.
+    """
+    if len(xy) < _WORTH_KEEPING:
+        return None
+    sets: dict[tuple[object, ...], Subsets] = reference.once("subsets", dict)
+    key = (sha256(xy.tobytes()).digest(), settings.radius, settings.order, settings.subset, settings.texture_min)
+    found = sets.pop(key, None) or Subsets(len(xy), settings.order)
+    while len(sets) >= _SETS:
+        sets.pop(next(iter(sets)))
+    sets[key] = found
+    return found
 
 
 def bare_points(reference: Reference, xy: Array, settings: CorrelationSettings) -> NDArray[np.bool_]:
@@ -262,11 +307,13 @@ def refine(
     start: Array,
     settings: CorrelationSettings,
     follow: bool = False,
+    kept: tuple[Subsets, NDArray[np.int64]] | None = None,
 ) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array, Array]:
     """IC-GN of points xy (n, 2) from start values (n, 12), NaN rows left out.
 
     Returns status (n,), ZNCC (n,), iterations (n,), sigma (n, 2) px and parameters (n, 12), all as the kernel left
     them: nothing is judged here. follow : a point beside one just matched starts from it, if it agrees.
+    kept : what is known of subsets of the reference, and which of them each point's (n,) is.
     """
     n, order = len(xy), _tiles(xy, settings)
     xy, parameters = np.ascontiguousarray(xy[order], dtype=np.float64), np.array(start[order], dtype=np.float64)
@@ -275,6 +322,7 @@ def refine(
     zncc, sigma = np.full(n, np.nan), np.full((n, 2), np.nan)
     iterations = np.zeros(n, np.int64)
     between = bool(np.any(xy != np.rint(xy)))
+    subsets, row = kept or (Subsets(0, settings.order), np.full(n, -1))
     kernels.refine(
         reference.grey,
         *reference.slopes,
@@ -295,6 +343,9 @@ def refine(
         settings.texture_min * reference.grey_range / 255.0,
         settings.noise or 0.0,
         1.6 * settings.step if follow else 0.0,
+        subsets.found,
+        subsets.known,
+        row[order],
         status,
         zncc,
         iterations,
