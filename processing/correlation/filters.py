@@ -14,8 +14,8 @@ from processing.correlation.lanes import LANES, load, number, pointer, ramp, sto
 
 _U = np.uint64
 _L = np.uint64(LANES)
-BLOCK = 4 * LANES  # columns that are summed at once
-_ROWS = 32  # rows that one thread takes at a time
+_BLOCK = 4 * LANES  # columns that are summed at once
+_COLUMNS = 64  # that one thread takes at a time: 2000 rows of them are half a megabyte
 
 
 @nb.njit(cache=True, nogil=True)
@@ -28,7 +28,7 @@ def mirrored(at, count):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True, cache=True, fastmath=FAST)
 def _block(source, first, stride, taps, count, out, to):  # type: ignore[no-untyped-def]
-    """BLOCK sums of ``count`` taps, the first over source[first ...], the next ``stride`` further, to out[to ...]."""
+    """_BLOCK sums of ``count`` taps, the first over source[first ...], the next ``stride`` further, to out[to ...]."""
     a = b = c = d = ramp(source) * np.float32(0)
     for k in range(_U(count)):
         at, tap = first + k * stride, number(taps, k)
@@ -42,46 +42,38 @@ def _block(source, first, stride, taps, count, out, to):  # type: ignore[no-unty
     store(out, to + _L + _L + _L, d)
 
 
-@nb.njit(nogil=True, cache=True, parallel=True)
-def along_rows(image, taps, left, top, out):  # type: ignore[no-untyped-def]
-    """out (h, w), w a multiple of BLOCK: taps (odd,) centred on the pixels from column ``left`` and row ``top`` on.
-
-    The rows lie in the image, the columns need not.
-    """
-    rows, width = out.shape
-    reach, columns = len(taps) // 2, image.shape[1]
-    for chunk in nb.prange((rows + _ROWS - 1) // _ROWS):
-        line = np.empty(width + 2 * reach, out.dtype)
-        for i in range(chunk * _ROWS, min((chunk + 1) * _ROWS, rows)):
-            begin = left - reach
-            here = image[top + i]
-            low, high = min(max(-begin, 0), len(line)), min(max(columns - begin, 0), len(line))
-            for k in range(low):
-                line[k] = here[mirrored(begin + k, columns)]
-            inner, shown = line[low:high], here[begin + low : begin + high]
-            for m in range(_U(len(inner))):
-                inner[m] = shown[m]
-            for k in range(max(high, low), len(line)):
-                line[k] = here[mirrored(begin + k, columns)]
-            for j in range(0, width, BLOCK):
-                _block(pointer(line), _U(j), _U(1), pointer(taps), len(taps), pointer(out[i]), _U(j))
+@nb.njit(nogil=True, cache=True)
+def _line(row, begin, line):  # type: ignore[no-untyped-def]
+    """line (m,) becomes the row of an image from column ``begin`` on."""
+    if begin >= 0 and begin + len(line) <= len(row):
+        shown = row[begin : begin + len(line)]
+        for k in range(_U(len(line))):
+            line[k] = shown[k]
+    else:
+        for k in range(len(line)):
+            line[k] = row[mirrored(begin + k, len(row))]
 
 
 @nb.njit(nogil=True, cache=True, parallel=True)
-def along_columns(source, taps, first, out):  # type: ignore[no-untyped-def]
-    """out (h, w): taps (odd,) over rows of the source (any, at least w rounded up to BLOCK), row i's from i + first on.
+def separable(image, along_x, along_y, left, top, out):  # type: ignore[no-untyped-def]
+    """out (h, w): taps along x and along y, odd in number, centred on the pixels of an image from (left, top) on.
 
-    A row that the source has not is not asked for.
+    A few columns at a time, so that what is filtered along x stays in the cache until it has been filtered along y.
     """
     rows, width = out.shape
-    stride = _U(source.shape[1])
-    for chunk in nb.prange((rows + _ROWS - 1) // _ROWS):
-        spare = np.empty(BLOCK, out.dtype)
-        for j in range(0, width, BLOCK):
-            for i in range(chunk * _ROWS, min((chunk + 1) * _ROWS, rows)):
-                if j + BLOCK <= width:
-                    _block(pointer(source[first + i]), _U(j), stride, pointer(taps), len(taps), pointer(out[i]), _U(j))
-                else:
-                    _block(pointer(source[first + i]), _U(j), stride, pointer(taps), len(taps), pointer(spare), _U(0))
-                    for k in range(j, width):
-                        out[i, k] = spare[k - j]
+    reach_x, reach_y = len(along_x) // 2, len(along_y) // 2
+    for block in nb.prange((width + _COLUMNS - 1) // _COLUMNS):
+        first = block * _COLUMNS
+        line, spare = np.empty(_COLUMNS + 2 * reach_x, out.dtype), np.empty(_COLUMNS, out.dtype)
+        part = np.empty((rows + 2 * reach_y, _COLUMNS), out.dtype)
+        for i in range(len(part)):
+            _line(image[mirrored(top - reach_y + i, image.shape[0])], left + first - reach_x, line)
+            for j in range(0, _COLUMNS, _BLOCK):
+                _block(pointer(line), _U(j), _U(1), pointer(along_x), len(along_x), pointer(part[i]), _U(j))
+        whole = first + _COLUMNS <= width
+        for i in range(rows):
+            to = out[i, first:] if whole else spare
+            for j in range(0, _COLUMNS, _BLOCK):
+                _block(pointer(part[i]), _U(j), _U(_COLUMNS), pointer(along_y), len(along_y), pointer(to), _U(j))
+            if not whole:
+                out[i, first:] = spare[: width - first]

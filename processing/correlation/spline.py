@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.correlation.filters import BLOCK, along_columns, along_rows, mirrored
+from processing.correlation.filters import separable
 
 Array = NDArray[np.float64]
 Levels = NDArray[np.floating]
@@ -52,8 +52,7 @@ def coefficients(image: NDArray, degree: int, box: Box | None = None, precision:
     kind = np.dtype(precision or image.dtype)
     taps = prefilter_taps(degree, kind.char).astype(kind)
     out = np.empty((y1 - y0 + 2 * PAD, x1 - x0 + 2 * PAD), kind)
-    filtered = _rows_about(image, taps, (x0 - PAD, y0 - PAD, x1 + PAD, y1 + PAD), len(taps) // 2)
-    along_columns(filtered, taps, 0, out)
+    separable(image, taps, taps, x0 - PAD, y0 - PAD, out)
     return out
 
 
@@ -65,25 +64,7 @@ def gradients(
     x0, y0, x1, y1 = box or (0, 0, image.shape[1], image.shape[0])
     kind = np.dtype(precision or image.dtype)
     slope, one = gradient_taps(degree, kind.char).astype(kind), np.ones(1, kind)
-    along_x = _rows_about(image, slope, (x0, y0, x1, y1), 0)
-    along_y = np.empty((y1 - y0, x1 - x0), kind)
-    along_columns(_rows_about(image, one, (x0, y0, x1, y1), len(slope) // 2), slope, 0, along_y)
-    return np.ascontiguousarray(along_x[:, : x1 - x0]), along_y
-
-
-def _rows_about(image: NDArray, taps: Levels, box: Box, reach: int) -> Levels:
-    """The box and ``reach`` rows above and below it, filtered along the rows, both as mirrored beyond the image.
-
-    (y1 - y0 + 2 reach, x1 - x0 rounded up to a multiple of BLOCK)."""
-    (height, _), (x0, y0, x1, y1) = image.shape, box
-    first, last = y0 - reach, y1 + reach
-    low, high = max(first, 0), min(last, height)
-    out = np.empty((last - first, -(-(x1 - x0) // BLOCK) * BLOCK), taps.dtype)
-    along_rows(image, taps, x0, low, out[low - first : high - first])
-    for row in (*range(first, low), *range(high, last)):
-        shown = mirrored(row, height)
-        if low <= shown < high:
-            out[row - first] = out[shown - first]
-        else:
-            along_rows(image, taps, x0, shown, out[row - first : row - first + 1])
-    return out
+    along_x, along_y = np.empty((y1 - y0, x1 - x0), kind), np.empty((y1 - y0, x1 - x0), kind)
+    separable(image, slope, one, x0, y0, along_x)
+    separable(image, one, slope, x0, y0, along_y)
+    return along_x, along_y
