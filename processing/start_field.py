@@ -41,7 +41,7 @@ def match_from_lattice(
     if known.sum() < _FEWEST:
         return correlate(reference, current, xy, settings, start=start)
     part = _about(current, xy, chosen[known], start, settings)
-    coarse = correlate(reference, part, xy[chosen], replace(settings, step=spacing), start=start[chosen])
+    coarse = correlate(reference, part, xy[chosen], replace(settings, step=spacing), start=start[chosen], follow=True)
     dense = between(coarse, xy, spacing, settings.order)
     if not np.isfinite(dense).all(axis=1).any():
         return correlate(reference, current, xy, settings, start=start)

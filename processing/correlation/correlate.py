@@ -78,6 +78,7 @@ def correlate(
     settings: CorrelationSettings,
     *,
     start: Array | None = None,
+    follow: bool = False,
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Correlation:
@@ -86,6 +87,7 @@ def correlate(
     xy : (n, 2) px, whole or fractional, inside the reference's mask. start : (n, 6) u v ux uy vx vy, or (n, 12) with
     the second derivatives uxx uxy uyy vxx vxy vyy after them; NaN where unknown: the other points are reached by
     propagation. Without start values they are found in the images. First order holds second derivatives as given.
+    follow : start values are less sure than what a match tells of the point beside it, and give way where they agree.
     threads : cores to use, all by default; the result does not depend on it. progress(done, total) is called after
     every wave. Call it from one thread at a time: it is parallel inside.
     """
@@ -99,7 +101,7 @@ def correlate(
         if start is None:
             _match_automatically(points, seconds)
         else:
-            _match_from(points, _parameters(start, len(xy)), seconds)
+            _match_from(points, _parameters(start, len(xy)), seconds, follow)
     seconds["prepare"] += points.filtering
     seconds["refine"] -= points.filtering
     return _result(points, seconds)
@@ -201,12 +203,12 @@ def _try_seeds(points: Field, seeds: NDArray[np.int64], start: Array) -> Field:
     return trial
 
 
-def _match_from(points: Field, start: Array, seconds: dict[str, float]) -> None:
+def _match_from(points: Field, start: Array, seconds: dict[str, float], follow: bool) -> None:
     began = time.perf_counter()
     given = np.flatnonzero(np.isfinite(start).all(axis=1))
     if not len(given):
         raise InputError("no point has a start value; leave them out to have them found")
-    points.attempt(given, start[given])
+    points.attempt(given, start[given], follow=follow)
     seconds["refine"] += time.perf_counter() - began
     _carry_on(points, seconds)
 

@@ -61,7 +61,7 @@ def inconsistent(
     jump: Array,
     stale: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """Good points that contradict the median of what their good neighbours predict, and small islands. (n,) bool.
+    """Good points that contradict the median of what their good neighbours predict; if none does, small islands. (n,).
 
     The median of affine predictions is the robust local fit: half the neighbours may be wrong.
     jump : (n,) px, how far each lies from that median, as this function left it; stale : (n,) bool, what has changed
@@ -73,7 +73,9 @@ def inconsistent(
     scatter = 1.4826 * np.median(jump[known]) if known.any() else 0.0
     limit = max(_LEAST_JUMP, _SCATTERS * scatter)
     bad = known & (jump > limit)
-    return bad | _islands(xy, parameters, good & ~bad, near, 2.0 * limit, _LEAST_ISLAND)
+    if bad.any():
+        return bad
+    return _islands(xy, parameters, good, near, 2.0 * limit, _LEAST_ISLAND)
 
 
 @nb.njit(cache=True, nogil=True)

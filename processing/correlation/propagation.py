@@ -28,6 +28,7 @@ Progress = Callable[[int, int], None]
 
 _LEVELS = (0.9, 0.8, 0.6)  # reliability in steps, ZNCC; the last one is settings.zncc_min
 _RETRIES = 3
+_DRIFTING = 0.9  # ZNCC of a point that twice did not converge from which on it is not started elsewhere
 _PATIENCE = 15  # iterations of a point that failed before
 _WORTH_KEEPING = 500  # points
 _SETS = 2  # of points of one reference: a lattice and all
@@ -52,6 +53,8 @@ class Field:
     region : the part of the current image in use, chosen by the first start values, grown when a point lies beyond.
     filtering : seconds spent on filtering it. bare : (n,) bool, points without texture; None to look for them.
     alone : points are refined from start values of their own; none has neighbours.
+    drifting : (n,) bool, points that look alike but whose steps do not end, from two start values: at the rim of what
+    both images show they drift to the same place from any.
     jump, stale : (n,), what the neighbours' judgement keeps, see ``inconsistent``.
     """
 
@@ -72,6 +75,7 @@ class Field:
     sigma: Array = field(init=False)
     tried: NDArray[np.bool_] = field(init=False)
     fitted: NDArray[np.int64] = field(init=False)
+    drifting: NDArray[np.bool_] = field(init=False)
     jump: Array = field(init=False)
     stale: NDArray[np.bool_] = field(init=False)
     subsets: Subsets | None = field(init=False, default=None)
@@ -85,6 +89,7 @@ class Field:
         self.iterations = np.zeros(n, np.int64)
         self.sigma = np.full((n, 2), np.nan)
         self.tried, self.fitted = np.zeros((n, COUNT), bool), np.zeros(n, np.int64)
+        self.drifting = np.zeros(n, bool)
         self.jump, self.stale = np.full(n, np.nan), np.ones(n, bool)
         if self.bare is None:
             self.bare = bare_points(self.reference, self.xy, self.settings)
@@ -125,6 +130,8 @@ class Field:
         far = (status == Status.GOOD) & (jump > max(self.settings.step, 5))
         status = np.where(far | ((status == Status.GOOD) & _degenerate(found)), Status.INCONSISTENT, status)
         keep = status == Status.GOOD
+        repeated = self.iterations[index] > 0
+        self.drifting[index] = repeated & (status == Status.NO_CONVERGENCE) & (zncc > _DRIFTING)
         self.status[index], self.iterations[index] = status, iterations
         self.parameters[index] = np.where(keep[:, None], found, np.nan)
         self.zncc[index] = np.where(keep, zncc, np.nan)
@@ -191,7 +198,7 @@ class Field:
     def _wave(self, level: float) -> bool:
         """One wave from neighbours at least this reliable; false if there was nothing to do."""
         reliable = self.good & (np.nan_to_num(self.zncc, nan=-1.0) >= level)
-        index = np.flatnonzero(~self.good & (self.status != Status.NO_TEXTURE))
+        index = np.flatnonzero(self._open())
         index = index[self.tried[index].sum(axis=1) < _RETRIES]
         offer = (self.near[index] >= 0) & reliable[self.near[index]] & ~self.tried[index]
         offered = offer.any(axis=1)
@@ -215,9 +222,7 @@ class Field:
         """
         for _ in range(2):
             beside = self._good_neighbours()
-            index = np.flatnonzero(
-                ~self.good & (self.status != Status.NO_TEXTURE) & (beside > 0) & (beside != self.fitted)
-            )
+            index = np.flatnonzero(self._open() & (beside > 0) & (beside != self.fitted))
             if not len(index):
                 return
             self.fitted[index] = beside[index]
@@ -238,6 +243,10 @@ class Field:
             self.tried[bad] = False  # another neighbour may lead elsewhere
             self.stale[bad] = True
         return True
+
+    def _open(self) -> NDArray[np.bool_]:
+        """Points not matched that another start value may help. (n,)."""
+        return ~self.good & (self.status != Status.NO_TEXTURE) & ~self.drifting
 
     def _good_neighbours(self) -> NDArray[np.int64]:
         """Which of its neighbours are good, as bits of a number. (n,)."""
