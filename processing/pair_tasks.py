@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.camera import Camera
-from processing.correlation import CorrelationSettings, Reference, prepare_reference
+from processing.correlation import CorrelationSettings, Reference, prepare_reference, reference_bytes
 from processing.errors import ComputationError
 from processing.images import read_mask
 from processing.in_time import CameraGrid, Followed, Own, Places, Shared, camera_grid, follow, places
@@ -183,8 +183,7 @@ def _prepared(
 
     def size(value: tuple[CameraGrid, Reference]) -> int:
         grid, reference = value
-        filtered = reference.grey.nbytes + sum(slope.nbytes for slope in reference.slopes) + reference.mask.nbytes
-        return int(filtered + grid.region.nbytes + grid.xy.nbytes + reference.image.nbytes)
+        return reference_bytes(reference, len(grid.xy), settings) + grid.region.nbytes + grid.xy.nbytes
 
     return kept.get(("reference", camera.id, *map(str, pairs)), make, size)
 

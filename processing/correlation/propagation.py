@@ -269,6 +269,12 @@ def _subsets(reference: Reference, xy: Array, settings: CorrelationSettings) -> 
     return found
 
 
+def reference_bytes(reference: Reference, n: int, settings: CorrelationSettings) -> int:
+    """The most that a reference takes in memory once n points of it have been followed into other images."""
+    filtered = reference.mask.size * (3 * np.dtype(reference.precision).itemsize + 1)
+    return int(reference.image.nbytes + filtered + _SETS * n * (8 * kernels.width_of_subset(settings.order) + 1))
+
+
 def bare_points(reference: Reference, xy: Array, settings: CorrelationSettings) -> NDArray[np.bool_]:
     """Points (n,) with clearly too little texture about them, seen at once for all: no start value is sought there.
 

@@ -117,6 +117,66 @@ def test_the_default_tolerance_leaves_a_tenth_of_itself(speckle, order, figures)
     assert np.sqrt(np.mean(left**2)) < 0.1 * settings.tolerance
 
 
+@pytest.mark.parametrize("order", [1, 2])
+def test_points_that_begin_near_their_match_save_an_iteration(speckle, order, figures):
+    """The end is then foretold from how the steps of other points shrank; by two steps of their own it takes two."""
+    settings = CorrelationSettings(20, 4, order)
+    reference, current = np.rint(speckle), warped(speckle, GENTLE, (3.3, -1.7))
+    mask = np.zeros((SIZE, SIZE), bool)
+    mask[40:160, 40:160] = True
+    xy = grid(mask, settings.step)[0]
+    start = np.zeros((len(xy), 12))
+    start[:, [0, 6]] = (xy - (SIZE - 1) / 2) @ GENTLE.T + [3.3, -1.7]
+    start[:, [1, 2, 7, 8]] = GENTLE.ravel()
+    start[:, [0, 6]] += np.random.default_rng(0).normal(0.0, 0.01, (len(xy), 2))
+    found, iterations = [], []
+    for tolerance in (settings.tolerance, 1e-6):
+        finer = replace(settings, tolerance=tolerance)
+        prepared = prepare_reference(reference, None, finer), prepare_current(current, None, finer)
+        status, _, made, _, parameters = refine(*prepared, xy, start, finer)
+        assert (status == 0).all()
+        found.append(parameters[:, [0, 6]])
+        iterations.append(made)
+    left = found[0] - found[1]
+    figures(
+        f"left after {iterations[0].mean():.2f} iterations, order {order}: 1e-3 px", f"{1e3 * left.std():.3f}", "0.1"
+    )
+    assert iterations[0].mean() < (1.3 if order == 1 else 1.8)
+    assert np.abs(left).max() < settings.tolerance
+    assert np.sqrt(np.mean(left**2)) < 0.1 * settings.tolerance
+
+
+@pytest.mark.parametrize(("order", "off"), [(1, 0.0), (2, 0.0), (1, 0.25)])
+def test_a_reference_used_again_gives_the_same_matches_to_the_last_digit(speckle, order, off):
+    settings = CorrelationSettings(14, 5, order)
+    mask = np.zeros((SIZE, SIZE), bool)
+    mask[20:180, 20:180] = True
+    mask[60:75, 60:75] = False
+    xy = grid(mask, settings.step)[0] + off
+    images = [warped(speckle, GENTLE, shift) for shift in ((3.3, -1.7), (-2.2, 0.4))]
+    used = prepare_reference(np.rint(speckle), mask, settings)
+    for image in images:
+        current = prepare_current(image, None, settings)
+        again = correlate(used, current, xy, settings)
+        once = correlate(prepare_reference(np.rint(speckle), mask, settings), current, xy, settings)
+        assert again.good.mean() > 0.95
+        for name in ("uv", "gradient", "curvature", "zncc", "sigma", "status", "iterations"):
+            np.testing.assert_array_equal(getattr(again, name), getattr(once, name))
+
+
+def test_points_that_resemble_nothing_are_soon_given_up(speckle):
+    other = np.random.default_rng(9).normal(size=(SIZE, SIZE))
+    other = np.rint(120.0 + 450.0 * cv2.GaussianBlur(other, (0, 0), 1.6))
+    settings = CorrelationSettings(14, 5, 1)
+    prepared = prepare_reference(np.rint(speckle), None, settings), prepare_current(other, None, settings)
+    mask = np.zeros((SIZE, SIZE), bool)
+    mask[40:160, 40:160] = True
+    xy = grid(mask, settings.step)[0]
+    status, zncc, iterations, _, _ = refine(*prepared, xy, np.zeros((len(xy), 12)), settings)
+    assert not ((status == 0) & (zncc > settings.zncc_min)).any()
+    assert iterations.mean() < 0.3 * settings.max_iterations
+
+
 @pytest.mark.parametrize("interpolation", ["cubic", "quintic"])
 @pytest.mark.parametrize("radius", [10, 16, 20])
 def test_bias_and_scatter_of_shifts_stay_at_the_bound(radius, interpolation, figures):
