@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,14 +28,15 @@ from processing.pairs_surface import Merging, merge_surfaces, pairs_surface
 from processing.progress import Report, Stages, silent
 from processing.results import Results, write_results
 from processing.ring import Ring, calibrate_ring, control_points
-from processing.ring_surface import RingSurface, surface_of_tracks
-from processing.ring_tasks import ring_job
 from processing.session import Capture, Session, new_run, read_session
 from processing.settings import CalibrationGroup, Settings
 from processing.stated_uncertainty import camera_covariance, with_uncertainty
 from processing.surface import PairSurface, pair_surface
 from processing.sweep import Search
 from processing.tasks import Executor, LocalExecutor, Ran, Task, tidy, work_folder
+
+if TYPE_CHECKING:
+    from processing.ring_surface import RingSurface
 
 Calibrate = Callable[[Session, CalibrationGroup, Callable[[float, str], None]], Ring]
 
@@ -249,6 +250,9 @@ def _whole_ring(
     executor: Executor | None,
 ) -> RingSurface:
     """One surface from all cameras that have a reference image, as tasks."""
+    from processing.ring_surface import surface_of_tracks  # loaded where it is asked for: pairs need none of it
+    from processing.ring_tasks import ring_job
+
     cameras = [each.camera for each in ring.cameras.values() if each.camera.id in steps[0].images]
     job = ring_job(session, cameras, pairs, steps, _search(session, settings), settings)
     _run(job.tasks, executor, stages, session)

@@ -37,8 +37,9 @@ from processing.calibration.survey import Sight, sight, survey
 from processing.errors import ComputationError, InputError
 from processing.images import read_gray
 from processing.rig import Rig, Target
-from processing.session import Session
+from processing.session import Capture, Session
 from processing.settings import CalibrationGroup
+from processing.step_images import Digests
 
 log = logging.getLogger(__name__)
 
@@ -83,14 +84,15 @@ def calibrate_ring(
         for camera in session.rig.cameras
         if camera.id not in target.images
     )
-    rig, turned = _surveyed(session, {id_: target.images[id_] for id_ in taking_part})
+    digests = Digests(session)
+    rig, turned = _surveyed(session, target, taking_part, digests)
     warnings = (*warnings, *turned)
     done = 0
     calibrated: dict[str, CameraCalibration] = {}
     keys: list[str] = []
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         futures = {
-            id_: pool.submit(_calibrated, replace(session, rig=rig), id_, target.images[id_], settings)
+            id_: pool.submit(_calibrated, replace(session, rig=rig), id_, target, settings, digests)
             for id_ in taking_part
         }
         for id_, future in futures.items():
@@ -110,20 +112,20 @@ def control_points(first: CameraCalibration, second: CameraCalibration) -> Recon
     return pair_quality(first, second)[0]
 
 
-def _surveyed(session: Session, images: dict[str, Path]) -> tuple[Rig, tuple[str, ...]]:
+def _surveyed(session: Session, seen_in: Capture, ids: list[str], digests: Digests) -> tuple[Rig, tuple[str, ...]]:
     """The rig with the azimuths at which the cameras stand, from the session's folder if they are there; sentences."""
     target = session.rig.target
-    cameras = {camera.id: camera for camera in session.rig.cameras if camera.id in images}
+    cameras = {camera.id: camera for camera in session.rig.cameras if camera.id in ids}
     digest = hashlib.sha256(f"{_VERSION} {target} {list(cameras.values())}".encode())
-    for path in images.values():
-        digest.update(hashlib.sha256(path.read_bytes()).digest())
+    for id_ in ids:
+        digest.update(bytes.fromhex(digests.image(seen_in, id_) or ""))
     kept = session.path / "calibration" / f"survey-{digest.hexdigest()[:16]}.json"
     if kept.is_file():
         values = json.loads(kept.read_text(encoding="utf-8"))
     else:
 
         def seen(id_: str) -> Sight:
-            image = read_gray(images[id_])
+            image = read_gray(seen_in.images[id_])
             return sight(image, find_dots(image, target), cameras[id_], target)
 
         with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
@@ -151,19 +153,19 @@ def _judged(rig: Rig, ring: Ring) -> Ring:
 
 
 def _calibrated(
-    session: Session, camera_id: str, target: Path, settings: CalibrationGroup
+    session: Session, camera_id: str, target: Capture, settings: CalibrationGroup, digests: Digests
 ) -> tuple[CameraCalibration, str]:
     """One camera's calibration and its key, from the session's folder if it is there, else made and kept."""
-    boards = {
-        capture.id: capture.images[camera_id] for capture in session.of_kind("board") if camera_id in capture.images
-    }
+    captures = [capture for capture in session.of_kind("board") if camera_id in capture.images]
+    boards = {capture.id: capture.images[camera_id] for capture in captures}
     lens_file = session.rig.camera(camera_id).intrinsics
-    key = _key(session, camera_id, [target, *boards.values()], settings)
+    seen = [digests.image(capture, camera_id) or "" for capture in (target, *captures)]
+    key = _key(session, camera_id, seen, settings)
     kept = session.path / "calibration" / f"{camera_id}-{key}.json"
     if kept.is_file():
         return CameraCalibration.from_dict(json.loads(kept.read_text(encoding="utf-8"))), key
     looked_at = boards if settings.distortion and lens_file is None else {}
-    images = _of_one_size(camera_id, [target, *looked_at.values()])
+    images = _of_one_size(camera_id, [target.images[camera_id], *looked_at.values()])
     calibration = calibrate_camera(
         session.rig,
         camera_id,
@@ -237,12 +239,13 @@ def _of_one_size(camera_id: str, paths: list[Path]) -> list[NDArray]:
     return images
 
 
-def _key(session: Session, camera_id: str, images: list[Path], settings: CalibrationGroup) -> str:
+def _key(session: Session, camera_id: str, images: list[str], settings: CalibrationGroup) -> str:
+    """Of everything that a camera's calibration depends on. images : SHA-256 of the target's and the boards', hex."""
     digest = hashlib.sha256()
     alone = f"{settings.distortion} {settings.drop_percentile} {settings.terms} {settings.radial_terms}"
     alone += f" {settings.tangential} {settings.skew}"
     digest.update(f"{_VERSION} {camera_id} {session.rig.target} {session.rig.board} {alone}".encode())
     digest.update(repr(session.rig.camera(camera_id)).encode())
     for image in images:
-        digest.update(hashlib.sha256(image.read_bytes()).digest())
+        digest.update(bytes.fromhex(image))
     return digest.hexdigest()[:16]

@@ -11,7 +11,6 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from processing.calibration import dlt
 from processing.calibration.target import DotObservations
@@ -41,6 +40,8 @@ def read_labels(image: NDArray[np.generic], dots: DotObservations, target: Targe
 
     image : grey, as the dots were found in it. below : under the lowest row in place of above the highest.
     """
+    from scipy.ndimage import gaussian_filter  # not loaded where the calibration is kept
+
     grey = np.asarray(image, dtype=np.float32)
     camera = Camera("", dlt.to_projection(dlt.solve_dlt(dots.xyz, dots.px)), (1, 1))
     bend = _Bend(dots, target, dots.px - camera.project(dots.xyz))

@@ -16,7 +16,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
 
 from processing.calibration import dlt, lattice
@@ -402,6 +401,7 @@ def _try(
 
 def _find_bend(dots: Dots, xyz: Array) -> float:
     """The bend after which a camera without distortion agrees best with the dots."""
+    from scipy.optimize import minimize_scalar  # takes longer to load than a kept calibration to read
 
     def misfit(bend: float) -> float:
         px = _straightened(dots, bend).px
