@@ -288,6 +288,8 @@ def compute_fields(
     pair: NDArray[np.int64],
     window: StrainWindow | None = None,
     scatter: WindowScatter | None = None,
+    found: Deformation | None = None,
+    both_tensors: bool = True,
 ) -> StepFields:
     """All arrays of one step.
 
@@ -297,8 +299,10 @@ def compute_fields(
     to_reference : the motion that takes the step back onto the reference.
     window : the windows of the triangles, for strain over a window beside that of each triangle.
     scatter : of the windows, for its standard deviations where those of the displacements are known.
+    found : the deformation from one to the other, where it is known.
+    both_tensors : the Euler-Almansi tensor too, which no field follows from.
     """
-    found = deformation(reference, current, faces)
+    found = deformation(reference, current, faces) if found is None else found
     known = certainty.fields()
     point = {
         "displacement": current - reference,
@@ -306,7 +310,7 @@ def compute_fields(
         **known.point,
     }
     face = {
-        **_of_deformation(found),
+        **_of_deformation(found, both_tensors),
         **_linear(found, to_reference),
         "isotropy": found.isotropy,
         "area": found.area,
@@ -316,16 +320,17 @@ def compute_fields(
     }
     if window is not None:
         over = window.deformation(current, reference)
-        face |= {f"window_{name}": values for name, values in _of_deformation(over).items()}
+        face |= {f"window_{name}": values for name, values in _of_deformation(over, both_tensors).items()}
         if scatter is not None and certainty.sigma_displacement is not None:
             sigma = scatter.stretch_sigma(over, certainty.sigma_displacement)
             face["window_sigma_lambda1"], face["window_sigma_lambda2"] = sigma.T
     return StepFields(point, face)
 
 
-def _of_deformation(found: Deformation) -> dict[str, Array]:
+def _of_deformation(found: Deformation, both_tensors: bool) -> dict[str, Array]:
     names = ("J", "lambda1", "lambda2", "E1", "E2", *_DIRECTIONS)
-    return {**{name: getattr(found, name) for name in names}, "E_tensor": _six(found.E), "e_tensor": _six(found.e)}
+    tensors = {"E_tensor": _six(found.E)} | ({"e_tensor": _six(found.e)} if both_tensors else {})
+    return {**{name: getattr(found, name) for name in names}, **tensors}
 
 
 def _linear(found: Deformation, to_reference: RigidMotion) -> dict[str, Array]:

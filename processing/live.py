@@ -10,19 +10,17 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from processing.errors import InputError
-from processing.merging import Merged
-from processing.pairs_surface import at_reference, merge_surfaces
+from processing.merging import Merged, merge
+from processing.pairs_surface import FollowedPair
 from processing.pipeline import track
 from processing.progress import Report, Stages, silent
-from processing.results import write_results
+from processing.results_writer import write_series
 from processing.ring import Ring, calibrate_ring
 from processing.session import Capture, Session, new_live, read_session
 from processing.settings import CalibrationGroup, Settings
-from processing.surface import PairSurface
 from processing.tasks import Executor, digest, kept
 
 _RING_BYTES = 1 << 20  # about what the cameras and their control points take
@@ -44,17 +42,17 @@ def process_step(
     settings = settings.model_copy(update={"surface": settings.surface.model_copy(update={"method": "pairs"})})
     steps = _reference_and(session, capture_id)
 
-    def merging(surfaces: Sequence[PairSurface], heuristic: str) -> Merged:
-        shape = [at_reference(surface) for surface in surfaces]
-        key = digest("live surface", heuristic, [(each.vertices, each.faces, each.correlation) for each in shape])
-        return kept.get(key, lambda: merge_surfaces(shape, heuristic), _bytes)
+    def merging(pairs: Sequence[FollowedPair], heuristic: str) -> Merged:
+        sheets = [pair.sheet_at_reference for pair in pairs]
+        key = digest("live surface", heuristic, [(each.vertices, each.faces, each.correlation) for each in sheets])
+        return kept.get(key, lambda: merge(sheets, heuristic), _bytes)
 
     tracked = track(session, settings, steps, stages, executor, _calibrated, merging)
     found = {"warnings": list(tracked.warnings), "seconds": round(time.monotonic() - began, 2)}
     stages.at("deform", 0.0)
     with new_live(path, capture_id) as folder:
-        results = replace(tracked.results, matches=(), summary=found)
-        write_results(folder / "results.h5", results, lambda done: stages.at("deform", done))
+        shown = tracked.series.without_matches()
+        write_series(folder / "results.h5", shown, lambda done: stages.at("deform", done), {}, found)
     return session.path / "live" / capture_id
 
 

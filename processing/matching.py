@@ -7,7 +7,7 @@ the calibration and a sweep of proxy cylinders. Later images are matched each to
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -19,21 +19,12 @@ from processing.correlation import CorrelationSettings, Current, Status, grid, p
 from processing.errors import ComputationError
 from processing.in_time import Places
 from processing.region import paint, well_seen
-from processing.results import Matches
 from processing.start_field import lattice_spacing, match_from_lattice
 from processing.sweep import SWEEP_RADII, Search, radii_of, sweep
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class PairMatches:
-    """The matched points of one camera pair and the triangles between them, (m, 3), normals outwards."""
-
-    matches: Matches
-    faces: NDArray[np.int32]
 
 
 @dataclass(frozen=True)
@@ -132,21 +123,6 @@ def at_step(at_reference: StepMatches, seen: tuple[Places | None, Places | None]
         px[camera, shared], sigma[camera, shared] = places.px[shared], places.sigma[shared]
         c_ls[shared] = np.fmax(c_ls[shared], places.c_ls[shared].astype(np.float32))
     return StepMatches(px, sigma, c_ls, status)
-
-
-def collect(pair: tuple[str, str], grid_: Grid, steps: Sequence[StepMatches]) -> PairMatches:
-    """The matches of all steps, the reference first."""
-    matches = Matches(
-        pair,
-        grid_.xy,
-        np.stack([step.px for step in steps]),
-        np.stack([step.c_ls for step in steps]).astype(float),
-        np.stack([step.sigma for step in steps]).astype(float),
-        np.stack([step.status for step in steps]),
-        np.full(len(grid_.xy), -1),
-        steps[0].seconds,
-    )
-    return PairMatches(matches, grid_.faces)
 
 
 def _find_region(stereo: Stereo, image: Image, current: Current, mask: Mask | None) -> tuple[Mask, Array, Array]:

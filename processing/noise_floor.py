@@ -5,36 +5,15 @@ Captures of kind ``static`` are followed as steps right after the reference, the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.results import WHERE_KNOWN, Matches, Results
+from processing.results import Results
 from processing.strain_window import strain_window
 
 Array = NDArray[np.float64]
-
-
-def part(results: Results, steps: Sequence[int]) -> Results:
-    """The same results with some of their steps only, in the order given; the reference, 0, must be the first."""
-    index = list(steps)
-    if not index or index[0] != 0:
-        raise ValueError("results keep their reference, step 0, as the first")
-
-    known: dict[str, Any] = {name: getattr(results, name) for name in WHERE_KNOWN}
-    return replace(
-        results,
-        steps=tuple(results.steps[k] for k in index),
-        vertices=results.vertices[index],
-        correlation=results.correlation[index],
-        sigma_xyz=results.sigma_xyz[index],
-        status=results.status[index],
-        matches=tuple(_part(matches, index) for matches in results.matches),
-        **{name: values[index] for name, values in known.items() if values is not None},
-    )
 
 
 def noise_floor(at_rest: Results) -> dict[str, Any]:
@@ -70,16 +49,6 @@ def noise_floor(at_rest: Results) -> dict[str, Any]:
             for name, label, unit, values in rows
         },
     }
-
-
-def _part(matches: Matches, index: list[int]) -> Matches:
-    return replace(
-        matches,
-        px=matches.px[index],
-        c_ls=matches.c_ls[index],
-        sigma=matches.sigma[index],
-        status=matches.status[index],
-    )
 
 
 def _median(values: Array) -> float:

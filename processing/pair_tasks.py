@@ -18,7 +18,7 @@ from processing.correlation import CorrelationSettings, Reference, prepare_refer
 from processing.errors import ComputationError
 from processing.images import read_mask
 from processing.in_time import CameraGrid, Followed, Own, Places, Shared, camera_grid, follow, places
-from processing.matching import Grid, PairMatches, StepMatches, Stereo, at_step, collect, match_reference
+from processing.matching import Grid, StepMatches, Stereo, at_step, match_reference
 from processing.session import Capture, Session
 from processing.step_images import Digests, step_image
 from processing.sweep import Search
@@ -57,11 +57,6 @@ class PairJob:
         """The pair's name."""
         return f"{self.cameras[0].id}-{self.cameras[1].id}"
 
-    @property
-    def later(self) -> range:
-        """The steps but the reference."""
-        return range(1, len(self.followed[0].steps) + 1)
-
     def at_reference(self) -> tuple[Grid, StepMatches]:
         """The pair's points and their matches at the reference. Raises the ComputationError that this ended with."""
         arrays = read_output(self.reference.output)
@@ -71,12 +66,6 @@ class PairJob:
         """The matches at a later step k."""
         first, second = self.followed
         return at_step(at_reference, (first.places(k, at_reference.px[0]), second.places(k, at_reference.second)))
-
-    def matches(self) -> PairMatches:
-        """The pair's matches at all steps. Raises the ComputationError that the reference ended with."""
-        grid, at_reference = self.at_reference()
-        found = [at_reference, *(self.step(k, at_reference) for k in self.later)]
-        return collect((self.cameras[0].id, self.cameras[1].id), grid, found)
 
 
 def pair_jobs(

@@ -1,9 +1,10 @@
-"""The surfaces of the camera pairs in one set of arrays, merged into one surface or side by side."""
+"""The surfaces of the camera pairs in one set of arrays, merged into one surface or side by side, a step at a time."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,91 +13,189 @@ from numpy.typing import NDArray
 from processing.merging import Merged, Mismatch, Seam, Sheet, merge, mismatches
 from processing.results import Matches, Results
 from processing.ring import Ring
+from processing.series import Shelf, usual
 from processing.session import Capture, Session
 from processing.settings import Settings
-from processing.surface import PairSurface
+from processing.surface import Matched, PairShape, PairStep
 
-Merging = Callable[[Sequence[PairSurface], str], Merged]
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 _MOST = 0.5  # a step at which fewer points of a pair were measured says nothing about single points
 
 
-def merge_surfaces(surfaces: Sequence[PairSurface], heuristic: str) -> Merged:
+@dataclass(frozen=True)
+class FollowedPair:
+    """A pair's surface through F steps, which are read again when they are asked for.
+
+    correlation : (N,) of each point the worst over the steps, NaN if it was lost at one. drift : (F,) px, of
+    `PairStep`. noise : (F, 2) px, of `Series`. seconds : time spent by stage.
+    """
+
+    shape: PairShape
+    at: Callable[[int], tuple[PairStep, Matched]]
+    correlation: Array
+    drift: Array
+    noise: Array
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def sheet(self) -> Sheet:
+        """The reference shape, with the worst correlation over the steps."""
+        return self._sheet(self.correlation)
+
+    @property
+    def sheet_at_reference(self) -> Sheet:
+        """The same as if there were no other step."""
+        return self._sheet(self.shape.at_first.correlation)
+
+    def _sheet(self, correlation: NDArray[Any]) -> Sheet:
+        return Sheet(self.shape.at_first.vertices, self.shape.faces, correlation.astype(float))
+
+
+Merging = Callable[[Sequence[FollowedPair], str], Merged]
+
+
+def follow(shape: PairShape, matched: Callable[[int], Matched], steps: int, shelf: Shelf) -> FollowedPair:
+    """A pair's surface through its steps. matched : of each. shelf : where the points in space are laid aside."""
+    worst = shape.at_first.correlation.astype(float)
+    drift, noise, seconds = np.full(steps, np.nan), np.full((steps, 2), np.nan), Counter[str]()
+    for k in range(steps):
+        found = matched(k)
+        step = shape.step(found) if k else shape.at_first
+        shelf.put((shape.ids, k), (step, found))
+        drift[k], noise[k] = step.drift, usual(found.sigma, step.status)
+        seconds.update(found.seconds)
+        if np.mean(step.status[shape.rows] == 0) >= _MOST:
+            worst = np.maximum(worst, step.correlation)
+    return FollowedPair(shape, lambda k: shelf.get((shape.ids, k)), worst, drift, noise, dict(seconds))
+
+
+def merge_surfaces(pairs: Sequence[FollowedPair], heuristic: str) -> Merged:
     """One surface of the pairs' surfaces."""
-    return merge([_sheet(surface) for surface in surfaces], heuristic)
-
-
-def at_reference(surface: PairSurface) -> PairSurface:
-    """A pair's surface at the reference alone."""
-    vertices, correlation = surface.vertices[:1], surface.correlation[:1]
-    return replace(
-        surface, vertices=vertices, correlation=correlation, sigma=surface.sigma[:1], status=surface.status[:1]
-    )
+    return merge([pair.sheet for pair in pairs], heuristic)
 
 
 def pairs_surface(
     session: Session,
     ring: Ring,
-    surfaces: Sequence[PairSurface],
+    pairs: Sequence[FollowedPair],
     steps: Sequence[Capture],
     settings: Settings,
     merging: Merging = merge_surfaces,
-) -> tuple[Results, dict[str, Any]]:
+) -> tuple[PairsSeries, dict[str, Any]]:
     """The results of all pairs, and how well the pairs agree and how they were merged, as JSON values.
 
     With surface.merge "none" the surfaces stay side by side, one over the other where several pairs saw the body.
     merging : what merges them otherwise, by that name.
     """
-    results = _side_by_side(session, ring, surfaces, steps, settings)
+    names = tuple(step.id for step in steps)
+    beside = _side_by_side(session, ring, pairs, names[0], settings)
     heuristic = settings.surface.merge
     if heuristic == "none":
-        sheets = [_sheet(surface) for surface in surfaces]
-        edge = Seam.mean_edge(sheets)
-        return results, {"heuristic": heuristic, **_agreement(results, mismatches(sheets, Seam().layers * edge))}
-    merged = merging(surfaces, heuristic)
+        sheets = [pair.sheet for pair in pairs]
+        found = mismatches(sheets, Seam().layers * Seam.mean_edge(sheets))
+        series = PairsSeries(names, beside, tuple(pairs), np.arange(len(beside.vertices_ref)))
+        return series, {"heuristic": heuristic, **_agreement(beside, found)}
+    merged = merging(pairs, heuristic)
     figures = {"heuristic": heuristic, "removed": len(merged.removed), "added": merged.added}
-    return _of_merged(results, merged), {**figures, **_agreement(results, merged.mismatch)}
+    series = PairsSeries(names, _of_merged(beside, merged), tuple(pairs), merged.vertex)
+    return series, {**figures, **_agreement(beside, merged.mismatch)}
 
 
-def _sheet(surface: PairSurface) -> Sheet:
-    """The reference shape; the correlation of a point is its worst over the steps, NaN if it was lost at one."""
-    told = np.mean(surface.status == 0, axis=1) >= _MOST
-    told[0] = True
-    return Sheet(surface.vertices[0], surface.faces, surface.correlation[told].max(axis=0))
+@dataclass(frozen=True)
+class PairsSeries:
+    """The steps of the pairs' surfaces in one set of arrays: see `Series`.
+
+    kept : (N,) vertices that are used, of all the pairs' numbered one pair after the other.
+    """
+
+    names: tuple[str, ...]
+    reference: Results
+    pairs: tuple[FollowedPair, ...]
+    kept: Ints
+
+    @property
+    def noise(self) -> list[Array]:
+        """See `Series`."""
+        return [pair.noise for pair in self.pairs]
+
+    def without_matches(self) -> PairsSeries:
+        """See `Series`."""
+        return replace(self, reference=replace(self.reference, matches=()))
+
+    def at(self, step: int) -> Results:
+        """See `Series`."""
+        if not step:
+            return self.reference
+        first, laid = self.reference, [pair.at(step) for pair in self.pairs]
+        found = [one for one, _ in laid]
+        vertices, correlation, sigma = (
+            np.concatenate([getattr(one, name) for one in found])[self.kept]
+            for name in ("vertices", "correlation", "sigma")
+        )
+        status = np.concatenate([one.status[p.shape.rows] for one, p in zip(found, self.pairs, strict=True)])[self.kept]
+        return replace(
+            first,
+            steps=(self.names[0], self.names[step]),
+            vertices=np.stack([first.vertices[0], vertices]),
+            correlation=np.stack([first.correlation[0], correlation]),
+            sigma_xyz=np.stack([first.sigma_xyz[0], sigma]),
+            status=np.stack([first.status[0], status]),
+            matches=tuple(_with_step(own, *each) for own, each in zip(first.matches, laid, strict=False)),
+        )
+
+
+def _with_step(at_first: Matches, step: PairStep, found: Matched) -> Matches:
+    """A pair's matches at the reference and at a step."""
+    return replace(
+        at_first,
+        px=np.stack([at_first.px[0], found.px]),
+        c_ls=np.stack([at_first.c_ls[0], found.c_ls]),
+        sigma=np.stack([at_first.sigma[0], found.sigma]),
+        status=np.stack([at_first.status[0], step.status]),
+    )
 
 
 def _side_by_side(
-    session: Session, ring: Ring, surfaces: Sequence[PairSurface], steps: Sequence[Capture], settings: Settings
+    session: Session, ring: Ring, pairs: Sequence[FollowedPair], reference: str, settings: Settings
 ) -> Results:
-    counts = [surface.vertices.shape[1] for surface in surfaces]
+    """The results of the reference alone."""
+    shapes = [pair.shape for pair in pairs]
+    counts = [len(shape.rows) for shape in shapes]
     offsets = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int)
-    vertices = np.concatenate([surface.vertices for surface in surfaces], axis=1)
+    vertices = np.concatenate([shape.at_first.vertices for shape in shapes])
     return Results(
         rig=session.rig.name,
-        steps=tuple(step.id for step in steps),
+        steps=(reference,),
         cameras=tuple(calibration.camera for calibration in ring.cameras.values()),
-        pairs=tuple(_pair(surface.matches) for surface in surfaces),
-        vertices_ref=vertices[0],
-        vertices=vertices,
-        faces=np.concatenate([s.faces + offset for s, offset in zip(surfaces, offsets, strict=True)]),
-        pair=np.repeat(np.arange(len(surfaces)), [len(surface.faces) for surface in surfaces]),
-        vertex_pair=np.repeat(np.arange(len(surfaces)), counts),
-        correlation=np.concatenate([surface.correlation for surface in surfaces], axis=1),
-        sigma_xyz=np.concatenate([surface.sigma for surface in surfaces], axis=1),
-        status=np.concatenate([surface.status for surface in surfaces], axis=1),
-        matches=tuple(_with_offset(surface, int(offset)) for surface, offset in zip(surfaces, offsets, strict=True)),
+        pairs=tuple(shape.ids for shape in shapes),
+        vertices_ref=vertices,
+        vertices=vertices[None],
+        faces=np.concatenate([shape.faces + offset for shape, offset in zip(shapes, offsets, strict=True)]),
+        pair=np.repeat(np.arange(len(shapes)), [len(shape.faces) for shape in shapes]),
+        vertex_pair=np.repeat(np.arange(len(shapes)), counts),
+        correlation=np.concatenate([shape.at_first.correlation for shape in shapes])[None].astype(float),
+        sigma_xyz=np.concatenate([shape.at_first.sigma for shape in shapes])[None].astype(float),
+        status=np.concatenate([shape.at_first.status[shape.rows] for shape in shapes])[None],
+        matches=tuple(_at_reference(pair, int(offset)) for pair, offset in zip(pairs, offsets, strict=True)),
         settings=settings.to_toml(),
     )
 
 
-def _pair(matches: Matches) -> tuple[str, str]:
-    first, second = matches.cameras
-    return first, second
-
-
-def _with_offset(surface: PairSurface, offset: int) -> Matches:
-    vertex = surface.matches.vertex
-    return replace(surface.matches, vertex=np.where(vertex >= 0, vertex + offset, -1))
+def _at_reference(pair: FollowedPair, offset: int) -> Matches:
+    shape, found = pair.shape, pair.at(0)[1]
+    vertex = shape.vertex
+    return Matches(
+        cameras=shape.ids,
+        xy=shape.xy,
+        px=found.px[None],
+        c_ls=found.c_ls[None].astype(float),
+        sigma=found.sigma[None].astype(float),
+        status=shape.at_first.status[None],
+        vertex=np.where(vertex >= 0, vertex + offset, -1),
+        seconds=pair.seconds,
+    )
 
 
 def _of_merged(results: Results, merged: Merged) -> Results:

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,14 +22,16 @@ from processing.correlation import CorrelationSettings
 from processing.correlation.correlate import load_kernels
 from processing.errors import ComputationError, InputError
 from processing.pair_tasks import PairJob, in_order, pair_jobs
-from processing.pairs_surface import Merging, merge_surfaces, pairs_surface
+from processing.pairs_surface import FollowedPair, Merging, follow, merge_surfaces, pairs_surface
 from processing.progress import Report, Stages, silent
-from processing.results import Results, write_results
+from processing.results import Results
+from processing.results_writer import ResultsWriter, Written, in_turn
 from processing.ring import Ring, calibrate_ring, control_points
+from processing.series import InMemory, Series, Shelf, joined
 from processing.session import Capture, Session, new_run, read_session
 from processing.settings import CalibrationGroup, Settings
-from processing.stated_uncertainty import camera_covariance, with_uncertainty
-from processing.surface import PairSurface, pair_surface
+from processing.stated_uncertainty import Stated, camera_covariance
+from processing.surface import pair_shape
 from processing.sweep import Search
 from processing.tasks import Executor, LocalExecutor, Ran, Task, tidy, work_folder
 
@@ -47,24 +47,14 @@ _WEIGHTS = {"prepare": 0.03, "calibrate": 0.25, "correlate": 0.62, "triangulate"
 
 @dataclass(frozen=True)
 class Tracked:
-    """A surface at some steps, and what is told of it. errors : of the pairs' reconstruction of the control points."""
+    """A surface through some steps, and what is told of it. errors : of the pairs' reconstruction of control points."""
 
-    results: Results
+    series: Series
     ring: Ring
     errors: dict[tuple[str, str], ReconstructionError]
     drift: dict[str, NDArray[np.float64]]
     agreement: dict[str, Any]
     warnings: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Measured:
-    """What a run found before anything is written. errors : of the pairs' reconstruction of the control points."""
-
-    results: Results
-    ring: Ring
-    errors: dict[tuple[str, str], ReconstructionError]
-    found: dict[str, Any]
 
     @property
     def calibration(self) -> dict[str, Any]:
@@ -89,23 +79,18 @@ def process_session(path: Path, settings: Settings, report: Report = silent, exe
     began = time.monotonic()
     stages = Stages(_WEIGHTS, report)
     session = read_session(path)
-    return _keep(session, measure(session, settings, stages, executor), settings, stages, began)
-
-
-def measure(
-    session: Session, settings: Settings, stages: Stages | None = None, executor: Executor | None = None
-) -> Measured:
-    """Everything of a run but the writing of its files. executor : of the tasks; None runs them in this process."""
     steps = _with_captures_at_rest(session)
     tracked = track(session, settings, steps, stages, executor)
-    ring = tracked.ring
-    results = with_uncertainty(tracked.results, camera_covariance(ring.bundle))
-    results, drift, floor = _noise_floor(results, tracked.drift, steps)
-    found = summary.summarise(results, ring, tracked.errors, drift, tracked.agreement, tracked.warnings)
-    found["noise_floor"] = floor
+    stages.at("deform", 0.0)
+    with new_run(session.path) as run:
+        (run.folder / "settings.toml").write_text(settings.to_toml(), encoding="utf-8")
+        (run.folder / "calibration.json").write_text(json.dumps(tracked.calibration), encoding="utf-8")
+        found = _deform(tracked, steps, run.folder / "results.h5", stages, began)
+        (run.folder / "summary.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
+    assert run.final is not None
     for warning in found["warnings"]:
         log.warning("%s", warning)
-    return Measured(results, ring, tracked.errors, found)
+    return run.final
 
 
 def track(
@@ -128,14 +113,54 @@ def track(
     stages.at("calibrate", 0.0)
     ring = calibrate(session, settings.calibration, lambda done, who: stages.at("calibrate", done, who))
     errors, warnings = _usable_pairs(session, ring, steps)
+    series: Series
     if settings.surface.method == "global":
         whole = _whole_ring(session, ring, tuple(errors), steps, settings, stages, executor)
-        results, drift, agreement, more_warnings = whole.results, whole.drift, whole.agreement, whole.warnings
+        series, drift, agreement, more_warnings = InMemory(whole.results), whole.drift, whole.agreement, whole.warnings
     else:
-        surfaces, more_warnings = _surfaces(session, ring, tuple(errors), steps, settings, stages, executor)
-        results, agreement = pairs_surface(session, ring, surfaces, steps, settings, merging)
-        drift = {"-".join(surface.matches.cameras): surface.drift for surface in surfaces}
-    return Tracked(results, ring, errors, drift, agreement, (*ring.warnings, *warnings, *more_warnings))
+        pairs, more_warnings = _pairs(session, ring, tuple(errors), steps, settings, stages, executor)
+        series, agreement = pairs_surface(session, ring, pairs, steps, settings, merging)
+        drift = {"-".join(pair.shape.ids): pair.drift for pair in pairs}
+    return Tracked(series, ring, errors, drift, agreement, (*ring.warnings, *warnings, *more_warnings))
+
+
+def _deform(tracked: Tracked, steps: tuple[Capture, ...], path: Path, stages: Stages, began: float) -> dict[str, Any]:
+    """Deformation and uncertainty of every step, each written when it is found; the summary. path : of the results.
+
+    Of captures at rest, which are not written, the summary tells the noise floor.
+    """
+    series = tracked.series
+    stated = Stated(series.reference, camera_covariance(tracked.ring.bundle), series.noise)
+    kept = [k for k, step in enumerate(steps) if step.kind != "static"]
+    reference = stated.of(series.reference, 0)
+    at_rest = [replace(series.reference, matches=())]
+    figures: list[summary.StepFigures] = []
+    with ResultsWriter(path, reference, [series.names[k] for k in kept]) as file:
+
+        def made(k: int) -> Results | tuple[Written, summary.StepFigures]:
+            results = series.at(k) if k else reference
+            if k not in kept:
+                return replace(results, matches=())
+            last = len(results.steps) - 1
+            motion, found = results.motion(last), results.deformation(last)
+            results = stated.of(results, k, found) if k else reference
+            return file.made(results, motion, found), summary.step_figures(results, motion, found)
+
+        for k, one in enumerate(in_turn(made, range(len(steps)))):
+            if isinstance(one, Results):
+                at_rest.append(one)
+            else:
+                file.write(len(figures), one[0])
+                figures.append(one[1])
+            stages.at("deform", (k + 1) / len(steps))
+        drift = {who: values[kept] for who, values in tracked.drift.items()}
+        found = summary.summarise(
+            reference, figures, tracked.ring, tracked.errors, drift, tracked.agreement, tracked.warnings
+        )
+        found["noise_floor"] = noise_floor.noise_floor(joined(at_rest)) if len(at_rest) > 1 else None
+        found["seconds"] = round(time.monotonic() - began, 2)
+        file.finish(tracked.calibration, found)
+    return found
 
 
 def _specimen_steps(session: Session) -> tuple[Capture, ...]:
@@ -149,18 +174,6 @@ def _with_captures_at_rest(session: Session) -> tuple[Capture, ...]:
     """The steps, and right after the reference, where nothing has moved yet, the captures at rest."""
     steps = _specimen_steps(session)
     return (steps[0], *session.of_kind("static"), *steps[1:])
-
-
-def _noise_floor(
-    results: Results, drift: dict[str, NDArray[np.float64]], steps: tuple[Capture, ...]
-) -> tuple[Results, dict[str, NDArray[np.float64]], dict[str, Any] | None]:
-    """The results and the drift without the captures at rest, and the noise floor that these show."""
-    at_rest = [k for k, step in enumerate(steps) if step.kind == "static"]
-    if not at_rest:
-        return results, drift, None
-    kept = [k for k in range(len(steps)) if k not in at_rest]
-    floor = noise_floor.noise_floor(noise_floor.part(results, [0, *at_rest]))
-    return noise_floor.part(results, kept), {who: values[kept] for who, values in drift.items()}, floor
 
 
 def _usable_pairs(
@@ -188,7 +201,7 @@ def _usable_pairs(
     return usable, tuple(warnings)
 
 
-def _surfaces(
+def _pairs(
     session: Session,
     ring: Ring,
     pairs: tuple[tuple[str, str], ...],
@@ -196,31 +209,33 @@ def _surfaces(
     settings: Settings,
     stages: Stages,
     executor: Executor | None,
-) -> tuple[list[PairSurface], list[str]]:
-    """Every pair matched at every step, as tasks, and triangulated."""
+) -> tuple[list[FollowedPair], list[str]]:
+    """Every pair matched at every step, as tasks, and triangulated; a sentence for each that gave no surface."""
     cameras = {id_: each.camera for id_, each in ring.cameras.items()}
     correlation = CorrelationSettings(**settings.correlation.keywords)
     jobs = pair_jobs(session, cameras, pairs, steps, _search(session, settings), correlation)
     _run(in_order(jobs), executor, stages, session)
-    surfaces: list[PairSurface] = []
-    warnings: list[str] = []
+    shelf = Shelf(work_folder(session.path))
 
-    def surface(job: PairJob) -> PairSurface | str:
+    def followed(job: PairJob) -> FollowedPair | str:
         try:
-            return pair_surface(job.cameras, job.matches(), correlation.step, settings.surface.sigma_max_px)
+            grid, at_first = job.at_reference()
         except ComputationError as error:
             return str(error)
+        shape = pair_shape(job.cameras, grid.xy, grid.faces, at_first, correlation.step, settings.surface.sigma_max_px)
+        return follow(shape, lambda k: job.step(k, at_first) if k else at_first, len(steps), shelf)
 
-    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        for k, made in enumerate(pool.map(surface, jobs), start=1):
-            stages.at("triangulate", k / len(jobs), f"pair {jobs[k - 1].name}")
-            if isinstance(made, str):
-                warnings.append(made)
-            else:
-                surfaces.append(made)
-    if not surfaces:
+    found: list[FollowedPair] = []
+    warnings: list[str] = []
+    for k, made in enumerate(in_turn(lambda k: followed(jobs[k]), range(len(jobs))), start=1):
+        stages.at("triangulate", k / len(jobs), f"pair {jobs[k - 1].name}")
+        if isinstance(made, str):
+            warnings.append(made)
+        else:
+            found.append(made)
+    if not found:
         raise ComputationError(f"{session.path}: no camera pair gave a surface: {'; '.join(warnings)}")
-    return surfaces, warnings
+    return found, warnings
 
 
 def _run(tasks: Sequence[Task], executor: Executor | None, stages: Stages, session: Session) -> None:
@@ -268,18 +283,3 @@ def _search(session: Session, settings: Settings) -> Search:
         reach=settings.surface.reach_mm,
         incidence=settings.surface.incidence_deg,
     )
-
-
-def _keep(session: Session, measured: Measured, settings: Settings, stages: Stages, began: float) -> Path:
-    """Write the run aside and give it its number."""
-    stages.at("deform", 0.0)
-    found, calibration = measured.found, measured.calibration
-    with new_run(session.path) as run:
-        found["seconds"] = round(time.monotonic() - began, 2)
-        results = replace(measured.results, calibration=calibration, summary=found)
-        write_results(run.folder / "results.h5", results, lambda done: stages.at("deform", done))
-        (run.folder / "settings.toml").write_text(settings.to_toml(), encoding="utf-8")
-        (run.folder / "calibration.json").write_text(json.dumps(calibration), encoding="utf-8")
-        (run.folder / "summary.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
-    assert run.final is not None
-    return run.final

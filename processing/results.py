@@ -19,10 +19,7 @@ What follows from the stored arrays is computed when it is read: a step takes ab
 from __future__ import annotations
 
 import json
-import os
 import tomllib
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -37,35 +34,21 @@ from processing.deformation import Deformation, deformation
 from processing.errors import InputError
 from processing.fields import Certainty, Field, StepFields, available, compute_fields
 from processing.fields import field as field_of
-from processing.json_values import plain
 from processing.mesh import Mesh
-from processing.ranges import Extent, Ranges
 from processing.rigid_motion import RigidMotion, motion_to_reference
-from processing.strain_window import StrainWindow, strain_window
+from processing.strain_window import StrainWindow
 from processing.uncertainty.strain import overlap
 from processing.uncertainty.window import WindowScatter, window_scatter
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-StepArrays = tuple[Array, dict[str, NDArray[Any]], dict[str, NDArray[Any]]]
 SCHEMA = 2
 
-#: Arrays kept for every step as they are; the other fields follow from them and from the positions.
-_KEPT = (
-    "displacement", "correlation", "sigma_xyz", "sigma_displacement", "chi2",
-    "J", "lambda1", "lambda2", "E1", "E2", "E_tensor", "direction1_reference", "direction1_current", "isotropy",
-    "linear1", "linear2",
-    "sigma_calibration", "sigma_displacement_calibration", "sigma_lambda_calibration1", "sigma_lambda_calibration2",
-    "face_correlation", "sigma_lambda1", "sigma_lambda2", "window_lambda1", "window_lambda2", "window_E1", "window_E2",
-    "window_sigma_lambda1", "window_sigma_lambda2",
-)  # fmt: skip
 #: Arrays of a result that not every run has, and whether they have a number or a vector a point, or two numbers a face.
 WHERE_KNOWN = {
     "sigma_displacement": "vector", "sigma_lambda": "face", "chi2": "point", "sigma_calibration": "vector",
     "sigma_displacement_calibration": "vector", "sigma_lambda_calibration": "face",
 }  # fmt: skip
-#: Arrays that are the same at every step.
-_CONSTANT = ("area", "pair")
 
 
 @dataclass(frozen=True)
@@ -261,47 +244,8 @@ class Results:
         return np.broadcast_to(mean, sigma.shape)
 
 
-def write_results(path: Path, results: Results, progress: Callable[[float], None] = lambda _: None) -> None:
-    """Compute all fields and write the file; ``path`` must not exist. ``progress`` is told the share done."""
-    window = strain_window(results.mesh, results.window_mm) if results.window_mm > 0 else None
-    scatter = None if window is None else results.scatter(window)
-    steps = range(len(results.steps))
-    with h5py.File(path, "x") as file, ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        group = vtkhdf.create(file, results.faces, len(results.vertices_ref), len(steps))
-        first = results.fields(0, window, scatter=scatter)
-        ranges = Ranges(available(first.names))
-        for name in _CONSTANT:
-            vtkhdf.write_constant(group, "CellData", name, first.face[name].astype(np.float32))
-
-        def found(step: int) -> tuple[StepArrays, Extent]:
-            fields = results.fields(step, window, scatter=scatter) if step else first
-            return _arrays(results, step, fields), ranges.extent(fields)
-
-        at_once = os.cpu_count() or 1  # bounds the memory
-        for start in steps[::at_once]:
-            some = steps[start : start + at_once]
-            for step, (arrays, extent) in zip(some, pool.map(found, some), strict=True):
-                vtkhdf.write_step(group, step, *arrays)
-                ranges.take(extent)
-                progress((step + 1) / len(steps))
-        _write_rest(file.create_group("ringdic"), results, ranges)
-
-
-def _arrays(results: Results, step: int, fields: StepFields) -> StepArrays:
-    """Positions, arrays of the points and of the faces of one step, as they are stored."""
-    current = results.vertices[step]
-    measured = np.isfinite(current).all(axis=1)
-    positions = np.where(measured[:, None], current, results.vertices_ref)
-    flags = {"measured": measured.astype(np.uint8), "status": results.status[step].astype(np.int8)}
-    return positions, {**_kept(fields.point), **flags}, _kept(fields.face)
-
-
 def _at(known: Array | None, step: int | None) -> Array | None:
     return None if known is None or step is None else known[step]
-
-
-def _kept(arrays: dict[str, Array]) -> dict[str, NDArray[np.float32]]:
-    return {name: values.astype(np.float32) for name, values in arrays.items() if name in _KEPT}
 
 
 def read_results(path: Path, matches: bool = True) -> Results:
@@ -414,38 +358,6 @@ def _field_in(path: Path, group: h5py.Group, name: str) -> Field:
             "or export these results with --window 5"
         )
     raise InputError(f"{path}: no field '{name}': the run did not find it")
-
-
-def _write_rest(own: h5py.Group, results: Results, ranges: Ranges) -> None:
-    motions = [results.motion(step) for step in range(len(results.steps))]
-    own.attrs["schema"] = SCHEMA
-    own.attrs["rig"] = results.rig
-    own.attrs["steps"] = json.dumps(results.steps)
-    own.attrs["pairs"] = json.dumps(results.pairs)
-    own.attrs["cameras"] = json.dumps([camera.id for camera in results.cameras])
-    own.attrs["fields"] = json.dumps(ranges.table())
-    own["reference"] = results.vertices_ref
-    own["faces"] = np.asarray(results.faces, dtype=np.int64)
-    own["pair"] = np.asarray(results.pair, dtype=np.int64)
-    own["vertex_pair"] = np.asarray(results.vertex_pair, dtype=np.int64)
-    own["rigid_motion/R"] = np.array([motion.R for motion in motions])
-    own["rigid_motion/t"] = np.array([motion.t for motion in motions])
-    own["settings"] = results.settings
-    own["calibration"] = json.dumps(plain(results.calibration), allow_nan=False)
-    own["summary"] = json.dumps(plain(results.summary), allow_nan=False)
-    cameras = own.create_group("cameras")
-    for camera in results.cameras:
-        group = cameras.create_group(camera.id)
-        group["P"], group["size"] = camera.P, np.array(camera.size)
-        if camera.intrinsics is not None:
-            group["K"], group["distortion"] = camera.intrinsics.K, camera.intrinsics.distortion
-    for k, matches in enumerate(results.matches):
-        group = own.create_group(f"matches/{k}")
-        group.attrs["cameras"] = json.dumps(matches.cameras)
-        group.attrs["seconds"] = json.dumps(matches.seconds)
-        for name in ("xy", "px", "c_ls", "sigma", "status", "vertex"):
-            group[name] = np.asarray(getattr(matches, name))
-    own.require_group("matches")
 
 
 def _open(path: Path) -> h5py.File:

@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,9 @@ from numpy.typing import NDArray
 from processing.calibration.bundle import BundleFit
 from processing.calibration.parameters import PER_CAMERA
 from processing.camera import Camera
+from processing.deformation import Deformation
 from processing.results import Matches, Results
+from processing.series import InMemory, joined
 from processing.uncertainty.calibration import (
     CameraCovariance,
     Shares,
@@ -57,31 +60,57 @@ def with_uncertainty(results: Results, known: CameraCovariance | None) -> Result
 
     known : of the cameras; None where nothing is: then nothing is stated of what the calibration adds.
     """
-    pairwise = any(len(matches.cameras) == 2 for matches in results.matches)
-    if pairwise and results.sigma_displacement is None:
-        results = _with_scatter(results)
-    return results if known is None else _with_calibration(results, known, followed=not pairwise)
+    series = InMemory(results)
+    stated = Stated(series.reference, known, series.noise)
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        parts = pool.map(lambda k: stated.of(series.at(k), k), range(len(results.steps)))
+        return joined(list(parts))
 
 
-def _with_calibration(results: Results, known: CameraCovariance, followed: bool) -> Results:
+class Stated:
+    """What can be stated of the uncertainty of a run's results, a step at a time.
+
+    reference : the results of the reference alone. known : of the cameras, None where nothing is. noise : of `Series`.
+    """
+
+    def __init__(self, reference: Results, known: CameraCovariance | None, noise: Sequence[Array]) -> None:
+        pairwise = any(len(matches.cameras) == 2 for matches in reference.matches)
+        scattered = pairwise and reference.sigma_displacement is None
+        self._scatter = _Scatter(reference, noise) if scattered else None
+        self._calibration = None if known is None else _ByCalibration(reference, known, followed=not pairwise)
+
+    def of(self, results: Results, step: int, found: Deformation | None = None) -> Results:
+        """The same results of a step, see `Series`, completed. found : its deformation, where it is known."""
+        last = len(results.steps) - 1
+        found = results.deformation(last) if found is None else found
+        added: dict[str, Any] = {}
+        if self._scatter is not None:
+            added |= self._scatter.of(results, step, found)
+        if self._calibration is not None:
+            added |= self._calibration.of(results, found)
+        return replace(results, **added)
+
+
+class _ByCalibration:
     """What the uncertain cameras add. followed : cameras followed the points from the projection of the reference."""
-    F, N, M = len(results.steps), len(results.vertices_ref), len(results.faces)
-    position, displacement = np.full((F, N, 3), np.nan), np.full((F, N, 3), np.nan)
-    stretches = np.full((F, M, 2), np.nan)
-    at_first: Shares = shares(results.cameras, results.vertices_ref, _gain(results, 0), known)
-    position[0], displacement[0], stretches[0] = sigma_of(at_first), 0.0, 0.0
-    for step in range(1, F):
-        anchor = (results.vertices_ref, at_first) if followed else None
-        now = shares(results.cameras, results.vertices[step], _gain(results, step), known, anchor)
-        position[step], displacement[step] = sigma_of(now), sigma_of(now - at_first)
-        found = results.deformation(step)
-        stretches[step] = stretch_sigma_by_cameras(found, results.vertices_ref, results.faces, at_first, now)
-    return replace(
-        results,
-        sigma_calibration=position,
-        sigma_displacement_calibration=displacement,
-        sigma_lambda_calibration=stretches,
-    )
+
+    def __init__(self, reference: Results, known: CameraCovariance, followed: bool) -> None:
+        self._known, self._followed = known, followed
+        places = reference.vertices_ref
+        self._at_first: Shares = shares(reference.cameras, places, _gain(reference, 0), known)
+        self._position = sigma_of(self._at_first)
+
+    def of(self, results: Results, found: Deformation) -> dict[str, Array]:
+        """The standard deviations at the reference and at the step of some results, by their names."""
+        N, M = len(results.vertices_ref), len(results.faces)
+        rows = [(self._position, np.zeros((N, 3)), np.zeros((M, 2)))]
+        if len(results.steps) > 1:
+            anchor = (results.vertices_ref, self._at_first) if self._followed else None
+            now = shares(results.cameras, results.vertices[1], _gain(results, 1), self._known, anchor)
+            stretches = stretch_sigma_by_cameras(found, results.vertices_ref, results.faces, self._at_first, now)
+            rows.append((sigma_of(now), sigma_of(now - self._at_first), stretches))
+        names = ("sigma_calibration", "sigma_displacement_calibration", "sigma_lambda_calibration")
+        return {name: np.stack(values) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
 
 
 def _gain(results: Results, step: int) -> Array:
@@ -109,89 +138,83 @@ class _Sources:
     sigma: Array
 
 
-def _with_scatter(results: Results) -> Results:
-    """Standard deviations of displacements and stretches of camera pairs over repeated noise."""
-    F, N, M = len(results.steps), len(results.vertices_ref), len(results.faces)
-    displacement, stretches = np.full((F, N, 3), np.nan), np.full((F, M, 2), np.nan)
-    displacement[0], stretches[0] = 0.0, 0.0
-    group = tomllib.loads(results.settings).get("correlation", {})
-    radius, order = int(group.get("radius_px", 20)), int(group.get("order", 1))
-    cameras = {camera.id: camera for camera in results.cameras}
-    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        pairs = list(pool.map(partial(_Pair.of, results, cameras), range(len(results.matches))))
-        px = np.full((2, N, 2), np.nan)
-        for pair in pairs:
-            px[:, pair.matches.vertex[pair.held]] = pair.px
-        found = pool.map(partial(_step_scatter, results, pairs, px, radius, order), range(1, F))
-        for step, (one, two) in enumerate(found, start=1):
-            displacement[step], stretches[step] = one, two
-    return replace(results, sigma_displacement=displacement, sigma_lambda=stretches)
+class _Scatter:
+    """Standard deviations of displacements and stretches of camera pairs over repeated noise.
+
+    noise : of each pair (F, 2) px, see `Series`. What a camera's own images leave over in the quietest step is noise;
+    motion and light add to the others.
+    """
+
+    def __init__(self, reference: Results, noise: Sequence[Array]) -> None:
+        self._shares = [_share_of_noise(level) for level in noise]
+        group = tomllib.loads(reference.settings).get("correlation", {})
+        self._radius, self._order = int(group.get("radius_px", 20)), int(group.get("order", 1))
+        cameras = {camera.id: camera for camera in reference.cameras}
+        with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+            self._pairs = list(pool.map(partial(_Pair.of, reference, cameras), range(len(reference.matches))))
+        px = np.full((2, len(reference.vertices_ref), 2), np.nan)
+        for pair in self._pairs:
+            px[:, pair.vertex[pair.held]] = pair.px
+        self._px = np.concatenate([px, px])
+
+    def of(self, results: Results, step: int, found: Deformation) -> dict[str, Array]:
+        """The standard deviations at the reference and at the step of some results, by their names."""
+        N = len(results.vertices_ref)
+        displacement, stretches = [np.zeros((N, 3))], [np.zeros((len(results.faces), 2))]
+        if len(results.steps) > 1:
+            parts = _Sources(np.zeros((4, N, 3, 2)), self._px, np.full((4, N, 2), np.nan))
+            for pair, matches, shares_of in zip(self._pairs, results.matches, self._shares, strict=True):
+                _fill(parts, results.vertices[1], pair, matches, shares_of[step])
+            one = np.sqrt(np.einsum("nii->ni", covariance(parts.gain, parts.sigma)))
+            two = stretch_sigma(
+                found, results.vertices_ref, results.faces, parts.gain, parts.px, parts.sigma, self._radius, self._order
+            )
+            one[~np.isfinite(results.vertices[1]).all(axis=1)] = np.nan
+            two[~np.isfinite(found.J)] = np.nan
+            displacement.append(one)
+            stretches.append(two)
+        return {"sigma_displacement": np.stack(displacement), "sigma_lambda": np.stack(stretches)}
 
 
 @dataclass(frozen=True)
 class _Pair:
     """What the steps of a pair have in common.
 
-    cameras, matches : n points. held : rows of those that have a vertex, and px (2, k, 2) their places in the reference
-    images, apart from other pairs'. noise : (2, F, n, 2) px. gain : (2, k, 3, 2) mm a px at the reference.
+    cameras : of n points. vertex : (n,), -1 where one has none. held : (k,) rows of those that have one, and px
+    (2, k, 2) their places in the reference images, apart from other pairs'. gain : (2, k, 3, 2) mm a px at the
+    reference.
     """
 
     cameras: tuple[Camera, ...]
-    matches: Matches
+    vertex: Ints
     held: Ints
     px: Array
-    noise: Array
     gain: Array
 
     @classmethod
     def of(cls, results: Results, cameras: Mapping[str, Camera], k: int) -> _Pair:
-        """Of the k-th matches of some results."""
+        """Of the k-th matches of the results of the reference."""
         matches = results.matches[k]
         own = tuple(cameras[id_] for id_ in matches.cameras)
         held = np.flatnonzero(matches.vertex >= 0)
         gain = position_gain(own, results.vertices_ref[matches.vertex[held]], np.ones((2, len(held), 2)))
         px = matches.px[0][:, held] + np.array([[2 * k * _APART, 0.0], [(2 * k + 1) * _APART, 0.0]])[:, None]
-        noise = np.stack([_noise_in_time(matches, camera) for camera in (0, 1)])
-        return cls(own, matches, held, px, noise, gain)
+        return cls(own, matches.vertex, held, px, gain)
 
 
-def _step_scatter(
-    results: Results, pairs: Sequence[_Pair], px: Array, radius: int, order: int, step: int
-) -> tuple[Array, Array]:
-    """Standard deviations of a step's displacements (N, 3) mm and stretches (M, 2). px : (2, N, 2)."""
-    N = len(results.vertices_ref)
-    parts = _Sources(np.zeros((4, N, 3, 2)), np.concatenate([px, px]), np.full((4, N, 2), np.nan))
-    for pair in pairs:
-        _fill(parts, results, pair, step)
-    found = results.deformation(step)
-    displacement = np.sqrt(np.einsum("nii->ni", covariance(parts.gain, parts.sigma)))
-    stretches = stretch_sigma(
-        found, results.vertices_ref, results.faces, parts.gain, parts.px, parts.sigma, radius, order
-    )
-    displacement[~np.isfinite(results.vertices[step]).all(axis=1)] = np.nan
-    stretches[~np.isfinite(found.J)] = np.nan
-    return displacement, stretches
+def _share_of_noise(level: Array) -> Array:
+    """Of what each step's matches state, (F, 2) px, the share that is noise, (F, 2); NaN where nothing is stated."""
+    later = level.copy()
+    later[0] = np.nan  # the grid itself, or the match between the cameras
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.fmin.reduce(later, axis=0) / later)
 
 
-def _noise_in_time(matches: Matches, camera: int) -> Array:
-    """Standard deviations (F, n, 2) px of one subset's place by the noise of one image, NaN where there is no match.
-
-    What a camera's own images leave over in the quietest step is noise; motion and light add to the others.
-    """
-    stated = np.where((matches.status == 0)[..., None], matches.sigma[:, camera], np.nan) / np.sqrt(_BOTH)
-    level = np.array([np.nanmedian(one) if np.isfinite(one).any() else np.nan for one in stated])
-    level[0] = np.nan  # the grid itself, or the match between the cameras
-    with np.errstate(invalid="ignore"):
-        share = np.nanmin(level) / level if np.isfinite(level).any() else level
-    return np.asarray(stated * share[:, None, None])
-
-
-def _fill(parts: _Sources, results: Results, pair: _Pair, step: int) -> None:
-    """Add the points of one pair."""
-    matches, noise = pair.matches, pair.noise[:, step]
-    usable = (matches.status[step, pair.held] == 0) & np.isfinite(noise[:, pair.held]).all(axis=(0, 2))
-    used = pair.held[usable]
-    who = matches.vertex[used]
-    now = position_gain(pair.cameras, results.vertices[step, who], np.ones((2, len(used), 2)))
+def _fill(parts: _Sources, xyz: Array, pair: _Pair, matches: Matches, share: Array) -> None:
+    """Add the points of one pair. xyz : (N, 3) mm at the step. share : (2,) of what is stated, that is noise."""
+    noise = matches.sigma[1][:, pair.held] / np.sqrt(_BOTH) * share[:, None, None]
+    usable = (matches.status[1, pair.held] == 0) & np.isfinite(noise).all(axis=(0, 2))
+    noise, who = noise[:, usable], pair.vertex[pair.held[usable]]
+    now = position_gain(pair.cameras, xyz[who], np.ones((2, len(who), 2)))
     parts.gain[:, who] = np.concatenate([now[:1], pair.gain[1:, usable], now])
-    parts.sigma[:, who] = np.concatenate([noise[:, used], noise[:, used]])
+    parts.sigma[:, who] = np.concatenate([noise, noise])

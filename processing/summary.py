@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, replace
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.calibration.quality import ReconstructionError
+from processing.deformation import Deformation
 from processing.drift import drift_sentences
 from processing.fields import available
 from processing.measure.window_study import gauge
-from processing.mesh import Mesh
 from processing.results import Results
+from processing.rigid_motion import RigidMotion
 from processing.ring import Ring
 
 Array = NDArray[np.float64]
@@ -29,8 +27,17 @@ ALONE = (
 )
 
 
+@dataclass(frozen=True)
+class StepFigures:
+    """What the summary tells of one step: its row, and the medians of its standard deviations, by cause."""
+
+    row: dict[str, Any]
+    uncertainty: dict[str, Any]
+
+
 def summarise(
-    results: Results,
+    reference: Results,
+    steps: Sequence[StepFigures],
     ring: Ring,
     errors: dict[tuple[str, str], ReconstructionError],
     drift: Mapping[str, Array],
@@ -39,31 +46,38 @@ def summarise(
 ) -> dict[str, Any]:
     """Counts, calibration quality and one row of figures a step, as JSON values; ``table`` is for the terminal.
 
+    reference : the results of the reference alone. steps : all, the reference first.
     drift : (F,) px by pair or camera, the mean vertical residual of each step: cameras that moved between frames.
     agreement : of the surfaces of camera pairs, or of the cameras about the points that all measured together.
     """
-    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        steps = list(pool.map(partial(_step, results), range(len(results.steps))))
     control = {
         "mean_mm": _mean([error.mean for error in errors.values()]),
         "rms_mm": _mean([error.rms for error in errors.values()]),
     }
+    names = tuple(step.row["step"] for step in steps)
+    last = [step for step in steps if step.row["measured"]][-1]
     figures = {
-        "points": len(results.vertices_ref),
-        "faces": len(results.faces),
-        "pairs": len(results.pairs),
-        "area_mm2": round(float(Mesh(results.vertices_ref, results.faces).areas.sum()), 1),
+        "points": len(reference.vertices_ref),
+        "faces": len(reference.faces),
+        "pairs": len(reference.pairs),
+        "area_mm2": round(float(reference.mesh.areas.sum()), 1),
         "control_points": control,
         "cameras": [asdict(row) for row in ring.quality],
         "calibration": _calibration(ring),
         "drift_px": {who: _finite(values) for who, values in drift.items()},
         "agreement": dict(agreement),
-        "strain": _strain(results),
-        "uncertainty": _uncertainty(results, ring),
-        "steps": steps,
-        "warnings": [*warnings, *drift_sentences(drift, results.steps)],
+        "strain": _strain(reference),
+        "uncertainty": {**last.uncertainty, "why": None if ring.bundle is not None else ALONE},
+        "steps": [step.row for step in steps],
+        "warnings": [*warnings, *drift_sentences(drift, names)],
     }
     return {**figures, "table": _table(figures)}
+
+
+def step_figures(results: Results, motion: RigidMotion, found: Deformation) -> StepFigures:
+    """The figures of the last step of some results, by its rigid motion back onto the reference and its deformation."""
+    last = len(results.steps) - 1
+    return StepFigures(_row(results, last, motion, found), _uncertainty(results, last))
 
 
 def _calibration(ring: Ring) -> dict[str, Any]:
@@ -89,20 +103,16 @@ def _strain(results: Results) -> dict[str, float | None]:
     }
 
 
-def _uncertainty(results: Results, ring: Ring) -> dict[str, Any]:
-    """Medians of the standard deviations at the last step that was measured, by noise and by the calibration.
-
-    None for what is not known; ``why`` tells why the calibration's are not.
-    """
-    last = int(np.flatnonzero(np.isfinite(results.vertices[..., 0]).any(axis=1))[-1])
-    arrays = results.certainty(last).fields()
+def _uncertainty(results: Results, step: int) -> dict[str, Any]:
+    """Medians of the standard deviations at a step, by noise and by the calibration; None for what is not known."""
+    arrays = results.certainty(step).fields()
     known = {entry.name: entry for entry in available(arrays.names)}
 
     def row(names: Mapping[str, str]) -> dict[str, float | None]:
         return {what: _median(arrays.scalar(known[n])) if n in known else None for what, n in names.items()}
 
     return {
-        "step": results.steps[last],
+        "step": results.steps[step],
         "noise": row({"position_mm": "sigma", "displacement_mm": "sigma_displacement", "stretch": "sigma_lambda2"}),
         "calibration": row(
             {
@@ -111,15 +121,12 @@ def _uncertainty(results: Results, ring: Ring) -> dict[str, Any]:
                 "stretch": "sigma_lambda_calibration2",
             }
         ),
-        "why": None if ring.bundle is not None else ALONE,
     }
 
 
-def _step(results: Results, step: int) -> dict[str, Any]:
-    measured = np.isfinite(results.vertices[step]).all(axis=1)
-    motion = results.motion(step)
+def _row(results: Results, step: int, motion: RigidMotion, found: Deformation) -> dict[str, Any]:
     current = results.vertices[step]
-    deformed = results.deformation(step)
+    measured = np.isfinite(current).all(axis=1)
     residual = np.linalg.norm(motion.apply(current) - results.vertices_ref, axis=1)
     return {
         "step": results.steps[step],
@@ -132,9 +139,9 @@ def _step(results: Results, step: int) -> dict[str, Any]:
         else None,
         "rigid_rotation_deg": float(np.degrees(motion.angle)),
         "rigid_residual_rms_mm": _rms(residual),
-        "E_magnitude_median": _median(deformed.E_magnitude),
-        "lambda1_median": _median(deformed.lambda1),
-        "lambda2_median": _median(deformed.lambda2),
+        "E_magnitude_median": _median(found.E_magnitude),
+        "lambda1_median": _median(found.lambda1),
+        "lambda2_median": _median(found.lambda2),
     }
 
 

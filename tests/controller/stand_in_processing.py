@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from processing.camera import Camera
-from processing.noise_floor import part
-from processing.results import Results, write_results
+from processing.results import Results
+from processing.results_writer import write_results
+from processing.series import part
 from processing.session import new_live, new_run, read_session
 
 AROUND, ALONG = 60, 16

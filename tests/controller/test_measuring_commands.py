@@ -11,7 +11,8 @@ from typer.testing import CliRunner, Result
 
 from controller.cli import app
 from processing.errors import InputError, RingdicError
-from processing.results import Results, write_results
+from processing.results import Results
+from processing.results_writer import write_results
 
 STRETCH = 1.2
 

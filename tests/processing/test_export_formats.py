@@ -16,7 +16,8 @@ from scipy.io import loadmat
 from processing.errors import InputError
 from processing.evaluation import Evaluation
 from processing.export import FORMATS, export
-from processing.results import Results, read_field, read_summary, write_results
+from processing.results import Results, read_field, read_summary
+from processing.results_writer import write_results
 from processing.strain_window import strain_window
 
 LOST = 4

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from processing.noise_floor import noise_floor, part
+from processing.noise_floor import noise_floor
 from processing.results import Matches, Results
+from processing.series import part
 
 SIGMA, SHIFT, SIDE = 0.002, np.array([0.03, -0.01, 0.02]), 60
 
@@ -51,15 +52,3 @@ def test_a_common_motion_counts_as_moved_and_not_as_noise_of_the_shape() -> None
     assert floor["moved_mm"] == pytest.approx(np.linalg.norm(SHIFT), rel=0.01)
     assert floor["quantities"]["displacement_x"]["rms"] > SHIFT[0] / 2
     assert floor["quantities"]["displacement_rest"]["rms"] == pytest.approx(np.sqrt(3) * SIGMA, rel=0.05)
-
-
-def test_a_part_of_the_steps_keeps_everything_that_belongs_to_them() -> None:
-    whole = sheet_at_rest()
-    kept = part(whole, [0, 2])
-    assert kept.steps == ("reference", "shifted")
-    for name in ("vertices", "correlation", "sigma_xyz", "status", "chi2", "sigma_lambda"):
-        np.testing.assert_array_equal(getattr(kept, name), getattr(whole, name)[[0, 2]])
-    np.testing.assert_array_equal(kept.matches[0].px, whole.matches[0].px[[0, 2]])
-    assert kept.sigma_displacement is None
-    with pytest.raises(ValueError, match="step 0"):
-        part(whole, [1, 2])

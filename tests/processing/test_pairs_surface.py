@@ -5,17 +5,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from processing.camera import Camera
 from processing.mesh import Mesh
-from processing.pairs_surface import pairs_surface
-from processing.results import Matches, Results
+from processing.pairs_surface import FollowedPair, PairsSeries, pairs_surface
+from processing.results import Results
+from processing.series import joined
 from processing.settings import Settings, SurfaceGroup
-from processing.surface import PairSurface
+from processing.surface import PairShape, PairStep
 from processing.topology import Kind, borders, overlap_area
 
 STEPS, PITCH, LOST = 3, 2.0, 7
 
 
-def sheet(pair: tuple[str, str], first: int, above: float, turned: float) -> PairSurface:
+def sheet(pair: tuple[str, str], first: int, above: float, turned: float) -> FollowedPair:
     """A plate of 30 x 20 points at x = first PITCH, moved by (0, 0, step) mm a step; every value tells its vertex."""
     i, j = (axis.ravel() for axis in np.meshgrid(np.arange(30), np.arange(20), indexing="ij"))
     n = len(i)
@@ -33,21 +35,27 @@ def sheet(pair: tuple[str, str], first: int, above: float, turned: float) -> Pai
     c_ls = np.where(status == 0, 0.01 + 1e-4 * np.arange(n), np.nan)
     sigma = np.where(status[..., None] == 0, np.broadcast_to(xyz / 1000, (STEPS, n, 3)), np.nan)
     # One match more than there are vertices: it was lost from the start.
-    vertex = np.append(np.arange(n), -1)
-    matches = Matches(
-        pair,
-        np.vstack([xy, [-9, -9]]),
-        np.zeros((STEPS, 2, n + 1, 2)),
-        np.zeros((STEPS, n + 1)),
-        np.zeros((STEPS, 2, n + 1, 2)),
-        np.zeros((STEPS, n + 1), np.int8),
-        vertex,
-    )
+    matched = SimpleNamespace(px=np.zeros((2, n + 1, 2)), sigma=np.zeros((2, n + 1, 2)), c_ls=np.zeros(n + 1))
+    places = [
+        PairStep(vertices[k], c_ls[k].astype(np.float32), sigma[k].astype(np.float32), np.append(status[k], 5), 0.0)
+        for k in range(STEPS)
+    ]
     faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    return PairSurface(vertices, faces, c_ls, sigma, status, matches, np.zeros(STEPS))
+    cameras = tuple(Camera(id_, np.eye(3, 4), (1, 1)) for id_ in pair)
+    grid = np.vstack([xy, [-9, -9]])
+    shape = PairShape(
+        cameras, grid, np.arange(n), faces, places[0], np.zeros((0, 4, 2), int), vertices[0], matched.sigma, 1.0
+    )
+    worst = c_ls.max(axis=0)
+    return FollowedPair(shape, lambda k: (places[k], matched), worst, np.zeros(STEPS), np.zeros((STEPS, 2)))
 
 
 def run(heuristic: str) -> tuple[Results, dict]:
+    series, figures = series_of(heuristic)
+    return joined([series.at(k) for k in range(STEPS)]), figures
+
+
+def series_of(heuristic: str) -> tuple[PairsSeries, dict]:
     surfaces = [sheet(("A", "B"), 0, 0.0, 0.0), sheet(("B", "C"), 20, 0.1, 0.03)]
     session = SimpleNamespace(rig=SimpleNamespace(name="plates"))
     steps = [SimpleNamespace(id=f"000{k}-specimen") for k in range(STEPS)]

@@ -19,8 +19,8 @@ from processing.results import (
     read_positions,
     read_results,
     read_summary,
-    write_results,
 )
+from processing.results_writer import write_results
 from processing.strain_window import strain_window
 
 LOST = 7

@@ -7,6 +7,8 @@ together and by a pair.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import gettempdir
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,16 +24,18 @@ from processing.camera import Camera, Intrinsics
 from processing.correlation import CorrelationSettings, prepare_reference
 from processing.deformation import deformation
 from processing.in_time import CameraGrid, Places, camera_grid, follow
-from processing.matching import PairMatches, Stereo, at_step, collect, match_reference
+from processing.matching import Grid, StepMatches, Stereo, at_step, match_reference
 from processing.multiview.certainty import Certainty, certainty
 from processing.multiview.motion import Motion, measure_motion
 from processing.multiview.shape import ReferenceShape, reference_shape
 from processing.multiview.tracking import Tracking
+from processing.pairs_surface import follow as follow_pair
 from processing.pairs_surface import pairs_surface
 from processing.results import Results
+from processing.series import Shelf, joined
 from processing.settings import Settings
 from processing.stated_uncertainty import with_uncertainty
-from processing.surface import pair_surface
+from processing.surface import pair_shape
 from processing.sweep import Search
 
 REPEATS = 6
@@ -147,19 +151,20 @@ def measure(cameras: list[Camera], image: Callable[[str, int], np.ndarray]) -> R
 
 def by_pair(cameras: list[Camera], image: Callable[[str, int], np.ndarray], search: Search) -> Results:
     pair = (cameras[0], cameras[1])
-    surface = pair_surface(pair, matched(Stereo(pair, search, CORRELATION), image), CORRELATION.step, 0.05)
+    grid, steps = matched(Stereo(pair, search, CORRELATION), image)
+    shape = pair_shape(pair, grid.xy, grid.faces, steps[0], CORRELATION.step, 0.05)
     calibrated = {camera.id: SimpleNamespace(camera=camera) for camera in cameras}
-    results, _ = pairs_surface(
+    series, _ = pairs_surface(
         SimpleNamespace(rig=SimpleNamespace(name="patch")),
         SimpleNamespace(cameras=calibrated),
-        [surface],
+        [follow_pair(shape, steps.__getitem__, STEPS, Shelf(Path(gettempdir())))],
         [SimpleNamespace(id=str(step)) for step in range(STEPS)],
         Settings(),
     )
-    return with_uncertainty(results, None)
+    return with_uncertainty(joined([series.at(k) for k in range(STEPS)]), None)
 
 
-def matched(stereo: Stereo, image: Callable[[str, int], np.ndarray]) -> PairMatches:
+def matched(stereo: Stereo, image: Callable[[str, int], np.ndarray]) -> tuple[Grid, list[StepMatches]]:
     first, second = stereo.cameras
     grid, found = match_reference(stereo, image(first.id, 0), image(second.id, 0), None)
     own = camera_grid(first.size, CORRELATION.step, [(grid.region, grid.xy[found.good])], [])
@@ -173,7 +178,7 @@ def matched(stereo: Stereo, image: Callable[[str, int], np.ndarray]) -> PairMatc
         at_step(found, (seen(first.id, own, grid.xy, k), seen(second.id, other, found.second, k)))
         for k in range(1, STEPS)
     ]
-    return collect(stereo.ids, grid, [found, *later])
+    return grid, [found, *later]
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,8 @@ from processing.multiview.tube import lattice_faces
 from processing.multiview.views import seen
 from processing.multiview.warps import surface_stencil, warps_to
 from processing.proxy import on_cylinder
-from processing.results import read_results, write_results
+from processing.results import read_results
+from processing.results_writer import write_results
 from processing.ring_surface import ring_surface
 from processing.settings import BEST, CorrelationGroup
 from processing.sweep import Search

@@ -14,7 +14,8 @@ from processing.errors import InputError
 from processing.evaluation import evaluated
 from processing.measure.region import Everything, region_statistics
 from processing.report import write_report
-from processing.results import Results, write_results
+from processing.results import Results
+from processing.results_writer import write_results
 
 RADIUS, AROUND, ALONG = 50.0, 60, 21
 STEPS = ("0001-specimen", "0002-specimen", "0003-specimen")
