@@ -36,7 +36,7 @@ from processing.uncertainty.calibration import (
     stretch_sigma_by_cameras,
 )
 from processing.uncertainty.position import covariance, position_gain
-from processing.uncertainty.strain import stretch_sigma
+from processing.uncertainty.strain import corners_alike, stretch_sigma
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -130,11 +130,10 @@ def _gain(results: Results, step: int) -> Array:
 class _Sources:
     """Independent errors: of a pair's two reference images, and of the step's two images.
 
-    gain : (4, N, 3, 2) mm a px. px : (4, N, 2) places in the reference images. sigma : (4, N, 2) px.
+    gain : (4, N, 3, 2) mm a px. sigma : (4, N, 2) px.
     """
 
     gain: Array
-    px: Array
     sigma: Array
 
 
@@ -148,27 +147,26 @@ class _Scatter:
     def __init__(self, reference: Results, noise: Sequence[Array]) -> None:
         self._shares = [_share_of_noise(level) for level in noise]
         group = tomllib.loads(reference.settings).get("correlation", {})
-        self._radius, self._order = int(group.get("radius_px", 20)), int(group.get("order", 1))
+        radius, order = int(group.get("radius_px", 20)), int(group.get("order", 1))
         cameras = {camera.id: camera for camera in reference.cameras}
         with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
             self._pairs = list(pool.map(partial(_Pair.of, reference, cameras), range(len(reference.matches))))
         px = np.full((2, len(reference.vertices_ref), 2), np.nan)
         for pair in self._pairs:
             px[:, pair.vertex[pair.held]] = pair.px
-        self._px = np.concatenate([px, px])
+        alike = corners_alike(px, reference.faces, radius, order)
+        self._alike = np.concatenate([alike, alike])
 
     def of(self, results: Results, step: int, found: Deformation) -> dict[str, Array]:
         """The standard deviations at the reference and at the step of some results, by their names."""
         N = len(results.vertices_ref)
         displacement, stretches = [np.zeros((N, 3))], [np.zeros((len(results.faces), 2))]
         if len(results.steps) > 1:
-            parts = _Sources(np.zeros((4, N, 3, 2)), self._px, np.full((4, N, 2), np.nan))
+            parts = _Sources(np.zeros((4, N, 3, 2)), np.full((4, N, 2), np.nan))
             for pair, matches, shares_of in zip(self._pairs, results.matches, self._shares, strict=True):
                 _fill(parts, results.vertices[1], pair, matches, shares_of[step])
             one = np.sqrt(np.einsum("nii->ni", covariance(parts.gain, parts.sigma)))
-            two = stretch_sigma(
-                found, results.vertices_ref, results.faces, parts.gain, parts.px, parts.sigma, self._radius, self._order
-            )
+            two = stretch_sigma(found, results.vertices_ref, results.faces, parts.gain, self._alike, parts.sigma)
             one[~np.isfinite(results.vertices[1]).all(axis=1)] = np.nan
             two[~np.isfinite(found.J)] = np.nan
             displacement.append(one)

@@ -8,7 +8,7 @@ import math
 import numba as nb
 import numpy as np
 
-from processing.nearest import among_alike, near
+from processing.nearest import near
 
 
 @nb.njit(cache=True, nogil=True)
@@ -83,17 +83,18 @@ def _count(beside, living, f):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def closer(middles, owner, normals, corners, radius, usual, gap, reach, same_side):  # type: ignore[no-untyped-def]
+def closer(middles, inside, owner, normals, corners, radius, usual, gap, reach, same_side, first, last):  # type: ignore[no-untyped-def]
     """Pairs (P, 2) of triangles of different surfaces that lie over one another or within ``gap`` mm beside.
 
-    middles : centroids (M, 3) in cubes. radius : (M,) mm, from centroid to farthest corner; usual : mm, of most.
+    middles : centroids (M, 3) in cubes. inside : (M,) triangles of usual size that have no other surface near. radius :
+    (M,) mm, from centroid to farthest corner; usual : mm, of most. first, last : of which triangles in the order of the
+    cubes pairs are sought.
     """
     M, widest = len(radius), radius.max()
     found, apart = np.empty(M, np.int64), np.empty(M)
-    pairs, count = np.empty((M, 2), np.int64), 0
+    pairs, count = np.empty((last - first + 1, 2), np.int64), 0
     common = math.hypot(2 * usual + gap, reach)
-    inside = among_alike(middles, owner, common)
-    for k in range(M):
+    for k in range(first, last):
         a, x = middles.order[k], middles.at[k]
         large = radius[a] > usual
         if inside[a] and not large:

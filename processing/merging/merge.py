@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -113,10 +114,11 @@ def merge(
     if not len(mesh.faces):
         return Merged(mesh.faces, owner, np.zeros(0, np.int64), np.zeros(0, np.int64), 0, ())
     edge = Seam.mean_edge(sheets)
-    kept = _without_overlap(mesh, owner, correlation, chosen, seam, edge)
-    old = mesh.faces[kept]
-    faces, pair, added = _joined(mesh, old, owner, sheets, seam, edge)
-    return Merged(faces, pair, np.unique(faces), np.flatnonzero(~kept), added, mismatches(sheets, seam.layers * edge))
+    with ThreadPoolExecutor(1) as pool:  # the mismatches beside what has to go one after the other
+        apart = pool.submit(mismatches, sheets, seam.layers * edge)
+        kept = _without_overlap(mesh, owner, correlation, chosen, seam, edge)
+        faces, pair, added = _joined(mesh, mesh.faces[kept], owner, sheets, seam, edge)
+        return Merged(faces, pair, np.unique(faces), np.flatnonzero(~kept), added, apart.result())
 
 
 def _together(sheets: Sequence[Sheet]) -> tuple[Mesh, Indices, Array]:

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from processing.merging import kernels
 from processing.mesh import Mesh
-from processing.nearest import cubes
+from processing.nearest import among_alike, cubes
 from processing.projection import Projector, sized
 from processing.topology import neighbours
 
@@ -30,6 +30,7 @@ Mask = NDArray[np.bool_]
 MEASURES = ("correlation", "distance", "orientation", "margin")
 
 _SMOOTHING = 6  # rounds of averaging over neighbouring triangles: a single triangle's noise does not decide
+_PARTS = 16  # of the triangles, that cores share
 _SAME_SIDE = 0.2  # least cosine between the normals of two layers of one surface
 
 
@@ -80,8 +81,19 @@ def closer_than(mesh: Mesh, owner: Indices, gap: float, reach: float) -> Indices
     if not len(radius):
         return np.zeros((0, 2), np.int64)
     usual = 1.5 * float(np.median(radius))
-    middles = cubes(centroids, float(np.hypot(2 * usual + gap, reach)) / 2)
-    return np.asarray(kernels.closer(middles, owner, normals, corners, radius, usual, gap, reach, _SAME_SIDE))
+    common = float(np.hypot(2 * usual + gap, reach))
+    middles = cubes(centroids, common / 2)
+    inside = among_alike(middles, owner, common)
+
+    def pairs(first: int, last: int) -> Indices:
+        found = kernels.closer(
+            middles, inside, owner, normals, corners, radius, usual, gap, reach, _SAME_SIDE, first, last
+        )
+        return np.asarray(found)
+
+    bounds = np.linspace(0, len(radius), _PARTS + 1).astype(np.int64)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return np.concatenate(list(pool.map(pairs, bounds[:-1], bounds[1:])))
 
 
 def badness(mesh: Mesh, owner: Indices, covered: Cover, correlation: Array, weights: Mapping[str, float]) -> Array:
@@ -116,11 +128,15 @@ def badness(mesh: Mesh, owner: Indices, covered: Cover, correlation: Array, weig
 def _from_border(mesh: Mesh, owner: Indices) -> Array:
     """Distance of each triangle from the border of its own surface, (M,) mm; 0 for a closed surface."""
     centroids, distance = mesh.centroids, np.zeros(len(mesh.faces))
-    for k in range(owner.max(initial=-1) + 1):
+
+    def of(k: int) -> None:
         part = owner == k
         border = Mesh(mesh.vertices, mesh.faces[part]).boundary_edges()
         if len(border):
             distance[part] = cKDTree(mesh.vertices[border].mean(axis=1)).query(centroids[part])[0]
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(of, range(owner.max(initial=-1) + 1)))
     return distance
 
 

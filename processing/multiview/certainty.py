@@ -19,7 +19,7 @@ from processing.uncertainty.position import (
     reference_covariance,
     step_covariance,
 )
-from processing.uncertainty.strain import stretch_sigma
+from processing.uncertainty.strain import corners_alike, stretch_sigma
 
 Array = NDArray[np.float64]
 
@@ -52,6 +52,7 @@ def certainty(cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, 
     position[0] = _sigma(reference_covariance(at_first, alone, reference, label))
     displacement[0], stretches[0] = 0.0, 0.0
     places = np.stack([camera.project(shape.xyz) for camera in cameras])
+    alike = corners_alike(places, shape.faces, radius, order)
     for step in range(1, steps):
         sigma, noise = _of_step(len(cameras), motion, step)
         gain = position_gain(cameras, motion.xyz[step], sigma)
@@ -59,7 +60,7 @@ def certainty(cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, 
         displacement[step] = _sigma(covariance(gain, noise))
         position[step] = _sigma(step_covariance((at_first, gain), alone, (half, half), reference, label))
         found = deformation(shape.xyz, motion.xyz[step], shape.faces)
-        stretches[step] = stretch_sigma(found, shape.xyz, shape.faces, gain, places, noise, radius, order)
+        stretches[step] = stretch_sigma(found, shape.xyz, shape.faces, gain, alike, noise)
         lost = ~np.isfinite(motion.xyz[step]).all(axis=1)
         position[step, lost], displacement[step, lost] = np.nan, np.nan
     return Certainty(position, displacement, stretches)

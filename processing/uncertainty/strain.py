@@ -36,31 +36,39 @@ def overlap(distance: Array, radius: float, order: int = 1) -> Array:
     return np.asarray(np.interp(h, grid, values))
 
 
+def corners_alike(px: Array, faces: Faces, radius: float, order: int = 1) -> Array:
+    """Correlations (C, M, 3) of the errors of corners 0 and 1, 1 and 2, 2 and 0 of each triangle; 0 where not seen.
+
+    px : (C, N, 2) where each camera saw the points in its reference image. faces : (M, 3). radius, order : of subsets.
+    """
+    out = np.empty((len(px), len(faces), 3))
+    for camera, at in enumerate(px):
+        for k in range(3):
+            apart = at[faces[:, k]] - at[faces[:, (k + 1) % 3]]
+            out[camera, :, k] = overlap(np.hypot(apart[:, 0], apart[:, 1]), radius, order)
+    return np.nan_to_num(out, copy=False)
+
+
 def stretch_sigma(
     found: Deformation,
     reference: Array,
     faces: Faces,
     gain: Array,
-    px: Array,
+    alike: Array,
     sigma: Array,
-    radius: float,
-    order: int = 1,
 ) -> Array:
     """Standard deviations (M, 2) of λ1 and λ2 of one step from the noise of its images.
 
     Parameters
     ----------
     found : deformation of the step, M triangles. reference : (N, 3) mm. faces : (M, 3).
-    gain : (C, N, 3, 2) mm a px, of ``position_gain`` at the step. px : (C, N, 2) where each camera saw the points in
-        its reference image. sigma : (C, N, 2) px, of the displacement in each camera, by noise.
-    radius, order : of the subsets.
+    gain : (C, N, 3, 2) mm a px, of ``position_gain`` at the step. alike : (C, M, 3), of :func:`corners_alike`, or
+        (1, M, 3) the same in all cameras. sigma : (C, N, 2) px, of the displacement in each camera, by noise.
 
     Where λ1 and λ2 are nearly alike their order sorts the noise too; there the figures are a little large.
     """
     variance = np.zeros((len(faces), 2))
     slopes = stretch_slopes(found, reference, faces, current_only=True)[0]
-    places = px[:1] if np.ndim(px) == 3 and np.asarray(px).strides[0] == 0 else px  # the same for all of them
-    alike = np.stack([_alike(at, faces, radius, order) for at in places])
     gain, sigma = np.ascontiguousarray(gain, dtype=float), np.ascontiguousarray(sigma, dtype=float)
     kernels.stretch_variance(slopes, gain, sigma, alike, np.ascontiguousarray(faces), variance)
     return np.sqrt(np.maximum(variance, 0.0))
@@ -80,13 +88,6 @@ def stretch_slopes(
     directions = np.stack([found.direction1_reference, found.direction2_reference])
     kernels.stretch_slopes(D, found.F, directions, np.stack([found.lambda1, found.lambda2]), current, before)
     return current, before
-
-
-def _alike(px: Array, faces: Faces, radius: float, order: int) -> Array:
-    """Correlations (M, 3) of the errors of corners 0 and 1, 1 and 2, 2 and 0 of each triangle; 0 where not seen."""
-    corners = px[faces]
-    apart = corners - np.roll(corners, -1, axis=1)
-    return np.nan_to_num(overlap(np.hypot(apart[..., 0], apart[..., 1]), radius, order))
 
 
 def _curved() -> tuple[Array, Array]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from processing.deformation import deformation
-from processing.uncertainty.strain import overlap, stretch_sigma
+from processing.uncertainty.strain import corners_alike, overlap, stretch_sigma
 
 
 def disc(radius: int) -> tuple[np.ndarray, np.ndarray]:
@@ -63,7 +63,8 @@ def test_the_variance_is_that_of_the_stretches_own_derivatives(alike: bool) -> N
     sigma[2, 1] = np.nan
     # All at one place: errors of a camera are the same everywhere. Far apart: independent.
     px = np.zeros((3, 4, 2)) if alike else 1e6 * rng.normal(size=(3, 4, 2))
-    found = stretch_sigma(deformation(reference, current, faces), reference, faces, gain, px, sigma, 20.0)
+    shared = corners_alike(px, faces, 20.0)
+    found = stretch_sigma(deformation(reference, current, faces), reference, faces, gain, shared, sigma)
     variance = np.zeros((2, 2))
     for c in range(3):
         for axis in range(2):
@@ -81,7 +82,6 @@ def test_the_variance_is_that_of_the_stretches_own_derivatives(alike: bool) -> N
 def test_a_common_error_of_all_points_is_no_strain() -> None:
     reference, current, faces = surface()
     gain = np.broadcast_to(np.eye(3)[:, :2], (1, 4, 3, 2)).copy()
-    found = stretch_sigma(
-        deformation(reference, current, faces), reference, faces, gain, np.zeros((1, 4, 2)), np.ones((1, 4, 2)), 20.0
-    )
+    alike = corners_alike(np.zeros((1, 4, 2)), faces, 20.0)
+    found = stretch_sigma(deformation(reference, current, faces), reference, faces, gain, alike, np.ones((1, 4, 2)))
     np.testing.assert_allclose(found, 0.0, atol=1e-6)
