@@ -30,8 +30,11 @@ class Mesh:
     @property
     def area_vectors(self) -> Array:
         """Normals with the length of the areas, (M, 3) mm²."""
-        a, b, c = np.moveaxis(self.vertices[self.faces], 1, 0)
-        return 0.5 * np.cross(b - a, c - a)
+        from processing.triangle_kernels import area_vectors  # compiled, and loaded only where it is asked for
+
+        vectors = np.empty((len(self.faces), 3))
+        area_vectors(np.ascontiguousarray(self.vertices), np.ascontiguousarray(self.faces), vectors)
+        return vectors
 
     @property
     def areas(self) -> Array:
@@ -53,10 +56,10 @@ class Mesh:
     @property
     def vertex_normals(self) -> Array:
         """Unit normals of the vertices, weighted by area, (N, 3); NaN for a vertex without a whole triangle."""
-        vectors = np.nan_to_num(self.area_vectors)
-        total = np.zeros_like(self.vertices)
-        for corner in range(3):
-            np.add.at(total, self.faces[:, corner], vectors)
+        from processing.triangle_kernels import corner_sums
+
+        total = np.zeros(self.vertices.shape)
+        corner_sums(self.area_vectors, np.ascontiguousarray(self.faces), total)
         length = np.linalg.norm(total, axis=1, keepdims=True)
         return total / np.where(length > 0, length, np.nan)
 

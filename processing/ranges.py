@@ -14,6 +14,7 @@ from processing.fields import Field, StepFields
 Extent = dict[tuple[str, bool], NDArray[np.float64] | None]
 
 _PERCENTILES = np.array([0.0, 2.0, 98.0, 100.0])
+_FEW = 4096  # numbers that are sorted sooner than counted
 
 
 class Ranges:
@@ -98,28 +99,48 @@ def _ordered_keys(bits, keys):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _of_ranks(keys, ranks):  # type: ignore[no-untyped-def]
-    """The bits of the numbers that have these ranks, in order: counts of the upper, then of the lower halves."""
+    """The bits of the numbers of these ranks, which ascend: by counts of the upper halves, then among those alike."""
     upper = np.zeros(1 << 16, np.int32)
     for key in keys:
         upper[key >> np.uint32(16)] += 1
-    out = np.empty(len(ranks), np.uint32)
-    lower = np.empty(1 << 16, np.int32)
-    counted = -1
+    slot, begin = np.full(1 << 16, -1, np.int8), np.zeros(len(ranks) + 1, np.int64)
+    own, rest = np.empty(len(ranks), np.int8), np.empty(len(ranks), np.int64)
+    slots, high, before = 0, 0, 0
     for k in range(len(ranks)):
-        high, rank = 0, ranks[k]
-        while rank >= upper[high]:
-            rank -= upper[high]
+        while ranks[k] - before >= upper[high]:
+            before += upper[high]
             high += 1
-        if high != counted:
-            lower[:] = 0
-            for key in keys:
-                if key >> np.uint32(16) == high:
-                    lower[key & np.uint32(0xFFFF)] += 1
-            counted = high
-        low = 0
-        while rank >= lower[low]:
-            rank -= lower[low]
-            low += 1
-        key = np.uint32((high << 16) | low)
+        if slot[high] < 0:
+            slot[high] = slots
+            begin[slots + 1] = begin[slots] + upper[high]
+            slots += 1
+        own[k], rest[k] = slot[high], ranks[k] - before
+    alike, free = np.empty(begin[slots], np.uint32), begin.copy()
+    for key in keys:
+        s = slot[key >> np.uint32(16)]
+        if s >= 0:
+            alike[free[s]] = key
+            free[s] += 1
+    for s in range(slots):
+        _sort(alike[begin[s] : begin[s + 1]])
+    out = np.empty(len(ranks), np.uint32)
+    for k in range(len(ranks)):
+        key = alike[begin[own[k]] + rest[k]]
         out[k] = key & np.uint32(0x7FFFFFFF) if key >> np.uint32(31) else ~key
     return out
+
+
+@nb.njit(cache=True, nogil=True)
+def _sort(keys):  # type: ignore[no-untyped-def]
+    """Sort keys with the same upper half: the few of a wide range as they are, many by counts of the lower halves."""
+    if len(keys) < _FEW:
+        keys.sort()
+        return
+    lower, high = np.zeros(1 << 16, np.int32), keys[0] & np.uint32(0xFFFF0000)
+    for key in keys:
+        lower[key & np.uint32(0xFFFF)] += 1
+    at = 0
+    for low in range(1 << 16):
+        for _ in range(lower[low]):
+            keys[at] = high | np.uint32(low)
+            at += 1

@@ -52,7 +52,7 @@ def bazant(stretch: Array, m: float) -> Array:
 
 def magnitude(first: Array, second: Array) -> Array:
     """Frobenius norm of the tensor with these in-plane principal values and none along the normal."""
-    return np.hypot(first, second)
+    return np.asarray(np.sqrt(first * first + second * second))
 
 
 def equivalent(first: Array, second: Array) -> Array:

@@ -15,7 +15,7 @@ from processing.merging.mismatch import Mismatch, mismatches
 from processing.merging.overlap import MEASURES, badness, closer_than, cover, peel, regrow
 from processing.merging.stitch import stitch
 from processing.mesh import Mesh
-from processing.topology import pieces, without_pinches
+from processing.topology import neighbours, pieces, without_pinches
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -141,21 +141,22 @@ def _without_overlap(
     reach, gap = seam.layers * edge, seam.gap * edge
     covered = cover(mesh, owner, reach)
     lost = np.isnan(correlation)
-    bad = badness(mesh, owner, covered, np.where(lost, 0.0, correlation), weights)
+    beside = neighbours(mesh.faces)
+    bad = badness(mesh, beside, owner, covered, np.where(lost, 0.0, correlation), weights)
     bad[lost] += 1 + np.ptp(bad)
     over = np.stack([covered.own, covered.other], axis=1)
     # First what covers one another's middles, then, of the little that is left, what overlaps or is too close at all.
     left = np.ones(len(mesh.faces), bool)
     left[over[lost[over[:, 0]] & ~lost[over[:, 1]], 0]] = False
-    left = peel(mesh.faces, left, over, bad)
-    left = peel(mesh.faces, left, _close(mesh, owner, left, gap, reach), bad)
+    left = peel(beside, left, over, bad)
+    left = peel(beside, left, _close(mesh, owner, left, gap, reach), bad)
     for _ in range(2):  # where small pieces were dropped, the others may come back
         left = _tidy(mesh, left)
         free = ~left & ~lost
         free[over[left[over[:, 1]], 0]] = False
         free[over[left[over[:, 0]], 1]] = False
         close = np.concatenate([over, _close(mesh, owner, left | free, gap, reach)])
-        left = regrow(mesh.faces, left, free, close, bad)
+        left = regrow(beside, left, free, close, bad)
     return _tidy(mesh, left)
 
 

@@ -89,15 +89,40 @@ class Curved:
         points, directions = other.mesh.vertices[other.used], other.normals[other.used]
         hits = self._projector.hits(points, directions)
         over = self._inner[hits.face]
-        point, face, weights = hits.point[over], self.mesh.faces[hits.face[over]], hits.weights[over]
-        normal = np.einsum("nk,nki->ni", weights, self.normals[face])
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        # From the plane of the triangle to its corners' tangent planes: the curved surface lies midway.
-        foot = points[point] - hits.height[over, None] * directions[point]
-        tangents = np.einsum("nk,nki,nki->n", weights, foot[:, None] - self.mesh.vertices[face], self.normals[face])
-        cosine = np.einsum("ni,ni->n", normal, directions[point])
-        result[other.used[point]] = hits.height[over] * cosine + 0.5 * tangents
+        point, face = hits.point[over], self.mesh.faces[hits.face[over]]
+        result[other.used[point]] = _above(
+            points[point],
+            directions[point],
+            face,
+            hits.weights[over],
+            hits.height[over],
+            self.mesh.vertices,
+            self.normals,
+        )
         return result
+
+
+@nb.njit(cache=True, nogil=True)
+def _above(points, directions, corners, weights, height, vertices, normals):  # type: ignore[no-untyped-def]
+    """How far points (n, 3) lie above the curved triangles that their lines along directions (n, 3) hit, (n,) mm.
+
+    corners (n, 3), weights (n, 3), height (n,) of the hits. vertices, normals (N, 3).
+    """
+    out = np.empty(len(points))
+    for p in range(len(points)):
+        tangents, cosine, square = 0.0, 0.0, 0.0
+        for k in range(3):
+            mean, along = 0.0, 0.0
+            for i in range(3):  # component k of the normal there
+                mean += weights[p, i] * normals[corners[p, i], k]
+                # From the plane of the triangle to its corners' tangent planes: the curved surface lies midway.
+                foot = points[p, k] - height[p] * directions[p, k]
+                along += weights[p, i] * (foot - vertices[corners[p, i], k]) * normals[corners[p, i], k]
+            tangents += along
+            cosine += mean * directions[p, k]
+            square += mean * mean
+        out[p] = height[p] * cosine / np.sqrt(square) + 0.5 * tangents
+    return out
 
 
 @nb.njit(cache=True, nogil=True)

@@ -20,7 +20,6 @@ from processing.merging import kernels
 from processing.mesh import Mesh
 from processing.nearest import among_alike, cubes
 from processing.projection import Projector, sized
-from processing.topology import neighbours
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -96,12 +95,15 @@ def closer_than(mesh: Mesh, owner: Indices, gap: float, reach: float) -> Indices
         return np.concatenate(list(pool.map(pairs, bounds[:-1], bounds[1:])))
 
 
-def badness(mesh: Mesh, owner: Indices, covered: Cover, correlation: Array, weights: Mapping[str, float]) -> Array:
+def badness(
+    mesh: Mesh, beside: Indices, owner: Indices, covered: Cover, correlation: Array, weights: Mapping[str, float]
+) -> Array:
     """How bad each triangle is, (M,), in medians over the overlaps: the weighted sum of the measures.
 
-    owner : (M,) surface of each triangle. correlation : (M,) its C_LS. Measures: ``correlation``; ``distance`` to the
-    other surfaces; ``orientation``, the angle to the other surfaces' normals; ``margin``, how near the triangle lies
-    to the border of its own surface, where it was seen at the steepest angles.
+    beside : (M, 3), of ``neighbours``. owner : (M,) surface of each triangle. correlation : (M,) its C_LS.
+    Measures: ``correlation``; ``distance`` to the other surfaces; ``orientation``, the angle to the other surfaces'
+    normals; ``margin``, how near the triangle lies to the border of its own surface, where it was seen at the steepest
+    angles.
     """
     M = len(mesh.faces)
     hits = np.bincount(covered.own, minlength=M)
@@ -111,7 +113,7 @@ def badness(mesh: Mesh, owner: Indices, covered: Cover, correlation: Array, weig
         "distance": np.bincount(covered.own, np.abs(covered.height), M) / np.maximum(hits, 1),
         "orientation": np.bincount(covered.own, covered.angle, M) / np.maximum(hits, 1),
     }
-    beside, everywhere = neighbours(mesh.faces), np.ones(M, bool)
+    everywhere = np.ones(M, bool)
     total = np.zeros(M)
     for name, values in measures.items():
         if weights.get(name, 0.0):
@@ -140,28 +142,28 @@ def _from_border(mesh: Mesh, owner: Indices) -> Array:
     return distance
 
 
-def peel(faces: Indices, alive: Mask, competing: Indices, bad: Array) -> Mask:
+def peel(beside: Indices, alive: Mask, competing: Indices, bad: Array) -> Mask:
     """Triangles (M,) left when, worst first, border triangles that compete with others left are removed.
 
-    alive : (M,) to begin with. competing : (P, 2). bad : (M,).
+    beside : (M, 3), of ``neighbours``. alive : (M,) to begin with. competing : (P, 2). bad : (M,).
     """
     competing = competing[alive[competing].all(axis=1)]
-    start, rival = kernels.rivals(len(faces), competing)
+    start, rival = kernels.rivals(len(beside), competing)
     kept = alive.copy()
-    kernels.peel(start, rival, neighbours(faces), kept, bad)
+    kernels.peel(start, rival, beside, kept, bad)
     for first, second in competing[kept[competing].all(axis=1)].tolist():  # what no border reached
         if kept[first] and kept[second]:
             kept[first if bad[first] > bad[second] else second] = False
     return kept
 
 
-def regrow(faces: Indices, alive: Mask, candidate: Mask, competing: Indices, bad: Array) -> Mask:
+def regrow(beside: Indices, alive: Mask, candidate: Mask, competing: Indices, bad: Array) -> Mask:
     """Triangles (M,) there when those that compete with none left are put back, beside what is left of their surface.
 
-    candidate : (M,) that may come back. competing : (P, 2) among those alive and the candidates. The ones with most
-    neighbours there come first, of these the best.
+    beside : (M, 3), of ``neighbours``. candidate : (M,) that may come back. competing : (P, 2) among those alive and
+    the candidates. The ones with most neighbours there come first, of these the best.
     """
-    start, rival = kernels.rivals(len(faces), competing)
+    start, rival = kernels.rivals(len(beside), competing)
     living = alive.copy()
-    kernels.regrow(start, rival, neighbours(faces), living, candidate & ~alive, bad)
+    kernels.regrow(start, rival, beside, living, candidate & ~alive, bad)
     return living
