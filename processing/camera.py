@@ -120,7 +120,7 @@ class Camera:
         undistorted = self.undistort(px)
         h = np.concatenate([undistorted, np.ones((*undistorted.shape[:-1], 1))], axis=-1)
         M = self.P[:, :3]
-        d = np.linalg.solve(M, h[..., None])[..., 0] * np.sign(np.linalg.det(M))
+        d = np.linalg.solve(M, h.reshape(-1, 3).T).T.reshape(h.shape) * np.sign(np.linalg.det(M))
         return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
     def incidence_cosine(self, xyz: Array, normals: Array) -> Array:

@@ -36,21 +36,33 @@ def on_cylinder(camera: Camera, px: Array, radii: Array) -> Array:
     return origin + t[..., None] * d[:, None, :]
 
 
-def stereo_hypotheses(first: Camera, second: Camera, px: Array, radii: Array, half_width: float) -> Row:
+def stereo_hypotheses(
+    first: Camera,
+    second: Camera,
+    px: Array,
+    radii: Array,
+    half_width: float,
+    between: tuple[Array, Array] | None = None,
+) -> Row:
     """Warps from positions px (n, 2) of the first image into the second, for proxies of the given radii (K,) mm.
 
     The gradients are central differences over ``half_width`` px, about the radius of a subset. Of a long row of radii
     every fourth is followed exactly. NaN where the line of sight misses the proxy or the match leaves the second image.
+    between : (n,) and (n,) mm, the smallest and the largest radius of use; what lies clearly beyond is NaN too.
     """
     fewer = radii if len(radii) <= 2 * _APART else np.append(radii[:-1:_APART], radii[-1])
     rays = first.ray(px[:, None, :] + half_width * _AROUND)
     lens_of, K = second.intrinsics, np.eye(3)
-    knots = np.empty((len(px), len(fewer), 6))
+    low, high = between or (np.full(len(px), -np.inf), np.full(len(px), np.inf))
+    apart = float(np.diff(fewer).max(initial=0.0))
+    knots = np.full((len(px), len(fewer), 6), np.nan)
     _follow(
         first.centre,
         np.ascontiguousarray(rays),
         np.ascontiguousarray(px, dtype=float),
         fewer,
+        low - apart,
+        high + apart,
         np.ascontiguousarray(second.P),
         K if lens_of is None else np.ascontiguousarray(lens_of.K),
         _NO_LENS if lens_of is None else lens_of.distortion,
@@ -76,15 +88,19 @@ def _seen(origin, ray, radius, P, K, distortion):  # type: ignore[no-untyped-def
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", parallel=True)
-def _follow(origin, rays, px, radii, P, K, distortion, size, half_width, warps):  # type: ignore[no-untyped-def]
-    """Fills the warps (n, K, 6) of positions px (n, 2); rays (n, 5, 3) : their lines of sight and those about them."""
+def _follow(origin, rays, px, radii, low, high, P, K, distortion, size, half_width, warps):  # type: ignore[no-untyped-def]
+    """Fills the warps (n, K, 6) of positions px (n, 2) for radii (K,) from low (n,) to high (n,).
+
+    rays (n, 5, 3) : their lines of sight and those about them.
+    """
     for i in nb.prange(len(px)):
         seen = np.empty((5, 2))
         for k in range(len(radii)):
+            if not low[i] <= radii[k] <= high[i]:
+                continue
             for m in range(5):
                 seen[m, 0], seen[m, 1] = _seen(origin, rays[i, m], radii[k], P, K, distortion)
             x, y = seen[0]
-            warps[i, k] = np.nan
             if x >= 0.0 and y >= 0.0 and x < size[0] and y < size[1]:
                 warps[i, k, 0], warps[i, k, 1] = x - px[i, 0], y - px[i, 1]
                 warps[i, k, 2] = (seen[1, 0] - seen[2, 0]) / (2 * half_width) - 1

@@ -2,7 +2,8 @@
 
 Nothing is known of the shape but that it lies within reach of a cylinder about the target's axis. A match is believed
 where it looks alike, where no other depth looks nearly as alike, and where its neighbours lie at a like depth. Every
-second position each way is tried first, the others only near those that are believed: most of an image is no specimen.
+second position each way is tried first, the others only near those that are believed and near their depth: most of an
+image is no specimen.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from processing.start_field import lattice_spacing
 # Beside the speckled surface there may be bare skin that matches, but poorly: less contrast than this share of the
 # usual is no speckle.
 _LEAST_CONTRAST = 0.3
+_BEYOND = 3.0  # mm, past the radii of positions nearby; farther off no position is believed
 #: Subset radii from one position of the sweep to the next, to a multiple of the grid's step.
 SWEEP_RADII = 1.5
 
@@ -96,9 +98,10 @@ def sweep(
     hit[drawn] = np.isfinite(on_cylinder(first, px[drawn], radii[-1:])).all(axis=(1, 2))
     warps, which, believed = np.full((len(px), 6), np.nan), np.zeros(len(px), np.int64), np.zeros(len(px), bool)
 
-    def look(wanted: Mask) -> None:
+    def look(wanted: Mask, between: tuple[Array, Array] | None = None) -> None:
         at = np.flatnonzero(wanted)
-        row = stereo_hypotheses(first, second, px[at], radii, settings.radius)
+        within = None if between is None else (between[0][at], between[1][at])
+        row = stereo_hypotheses(first, second, px[at], radii, settings.radius, within)
         found = search_row(image, current, px[at], row, settings.radius, least=search.zncc_min)
         warps[at], which[at] = found.warps, found.which
         believed[at] = convincing(search, found.zncc, found.second_peak)
@@ -106,7 +109,8 @@ def sweep(
 
     few = _few(shape).ravel()
     look(hit & few)
-    look(hit & ~few & _near(believed.reshape(shape)).ravel())
+    near, between = _near(np.where(believed, radii[which], np.nan).reshape(shape))
+    look(hit & ~few & near, between)
     if mask is None:
         seen = np.flatnonzero(believed)
         texture = contrast(image, px[seen], settings.radius)
@@ -125,9 +129,14 @@ def _few(shape: tuple[int, ...]) -> Mask:
     return few
 
 
-def _near(believed: Mask) -> Mask:
-    """Positions of a lattice no farther than two from a believed one, (rows, columns)."""
-    return cv2.dilate(believed.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
+def _near(radius: Array) -> tuple[Mask, tuple[Array, Array]]:
+    """Positions (n,) of a lattice no farther than two from one whose radius (rows, columns) mm is known, and between
+    which radii (n,) theirs is looked for: as far beyond those about them as those differ, and a little more."""
+    reach, known = np.ones((5, 5), np.uint8), np.isfinite(radius)
+    high = cv2.dilate(np.where(known, radius, 0.0), reach).ravel()
+    low = np.minimum(cv2.erode(np.where(known, radius, np.inf), reach).ravel(), high)
+    beyond = high - low + _BEYOND
+    return high > 0.0, (low - beyond, high + beyond)
 
 
 def convincing(search: Search, zncc: Array, second_best: Array) -> Mask:

@@ -132,3 +132,16 @@ def test_a_long_row_of_radii_is_as_good_as_each_followed_exactly() -> None:
     assert off[:, :2].max() < 0.2  # px; the peak of the correlation is some px wide
     assert np.quantile(off[:, 2:], 0.99) < 0.01
     assert off[:, 2:].max() < 0.1  # where the surface turns away
+
+
+def test_radii_that_are_of_no_use_are_not_followed_and_the_others_as_ever() -> None:
+    _, px = surface(57.0)
+    radii = sweep_radii(57.0, 20.0, 0.28)
+    low, high = np.linspace(45.0, 55.0, len(px)), np.linspace(50.0, 70.0, len(px))
+    some = stereo_hypotheses(FIRST, SECOND, px, radii, 20.0, (low, high)).warps
+    every = stereo_hypotheses(FIRST, SECOND, px, radii, 20.0).warps
+    of_use = (low[:, None] <= radii) & (radii <= high[:, None])
+    np.testing.assert_array_equal(some[of_use], every[of_use])
+    assert np.isfinite(some[of_use]).any()
+    far = (radii < low[:, None] - 4.0) | (radii > high[:, None] + 4.0)
+    assert np.isnan(some[far]).all()
