@@ -4,7 +4,7 @@
 them. The room knows images, masks and points only: no camera, no calibration, no session.
 
 ``kernels``      one subset by inverse-compositional Gauss-Newton, and many in parallel
-``spline``       B-spline coefficients and gradients
+``spline``       B-spline coefficients and gradients, by the compiled ``filters``
 ``propagation``  from matched points to their neighbours, in waves
 ``neighbours``   the neighbours' judgement: prediction, outliers, islands
 ``seeds``        first matches in time; ``features`` first matches between cameras

@@ -22,11 +22,11 @@ class CorrelationSettings:
     interpolation : "quintic" or "cubic" B-spline of the current image.
     interpolation, tolerance : by what they cost in truth. Radius 20, speckle of 1.0, 1.5, 2.0 px (standard deviation of
         its blur): a cubic is biased by up to 4.1, 0.75, 0.22 thousandths of a pixel, a quintic by 0.99, 0.06, 0.01. A
-        tolerance of 1e-3 leaves 0.04 thousandths where noise makes 3 (radius 10: 0.08 where it makes 7).
-    tolerance : px; iteration stops when the next step, judged by how the last two shrank, would move the subset's rim
-        by less, in the root mean square sense, or steps below 1e-5 px shrink no more. Below 1e-6 px all is computed in
-        double precision, at a fifth of the speed.
-    max_iterations : after so many the point is lost.
+        tolerance of 1e-3 leaves 0.05 thousandths where noise makes 3 (radius 10: 0.08 where it makes 7).
+    tolerance : px; iteration stops when the next step, judged by how the last two shrank (after one: by how those of
+        other points did), would move the subset's rim by less, in the root mean square sense, or steps below 1e-5 px
+        shrink no more. Below 1e-6 px all is computed in double precision, at a fifth of the speed.
+    max_iterations : after so many the point is lost, or sooner when its steps foretell that these will not do.
     zncc_min : below this a point is lost.
     texture_min : least root-mean-square gradient along the weakest direction, in 1/255 of the grey range a pixel;
         the rounding to whole grey levels alone makes 0.5.
