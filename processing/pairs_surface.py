@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.camera import Camera
 from processing.merging import Merged, Mismatch, Seam, Sheet, merge, mismatches
 from processing.results import Matches, Results
-from processing.ring import Ring
 from processing.series import Shelf, usual
-from processing.session import Capture, Session
 from processing.settings import Settings
 from processing.surface import Matched, PairShape, PairStep
 
@@ -77,20 +76,21 @@ def merge_surfaces(pairs: Sequence[FollowedPair], heuristic: str) -> Merged:
 
 
 def pairs_surface(
-    session: Session,
-    ring: Ring,
+    rig: str,
+    cameras: Sequence[Camera],
     pairs: Sequence[FollowedPair],
-    steps: Sequence[Capture],
+    names: Sequence[str],
     settings: Settings,
     merging: Merging = merge_surfaces,
 ) -> tuple[PairsSeries, dict[str, Any]]:
     """The results of all pairs, and how well the pairs agree and how they were merged, as JSON values.
 
     With surface.merge "none" the surfaces stay side by side, one over the other where several pairs saw the body.
-    merging : what merges them otherwise, by that name.
+    rig : its name. cameras : all that were calibrated. names : of the steps, the reference first. merging : what merges
+    them otherwise, by that name.
     """
-    names = tuple(step.id for step in steps)
-    beside = _side_by_side(session, ring, pairs, names[0], settings)
+    names = tuple(names)
+    beside = _side_by_side(rig, cameras, pairs, names[0], settings)
     heuristic = settings.surface.merge
     if heuristic == "none":
         sheets = [pair.sheet for pair in pairs]
@@ -158,7 +158,7 @@ def _with_step(at_first: Matches, step: PairStep, found: Matched) -> Matches:
 
 
 def _side_by_side(
-    session: Session, ring: Ring, pairs: Sequence[FollowedPair], reference: str, settings: Settings
+    rig: str, cameras: Sequence[Camera], pairs: Sequence[FollowedPair], reference: str, settings: Settings
 ) -> Results:
     """The results of the reference alone."""
     shapes = [pair.shape for pair in pairs]
@@ -166,9 +166,9 @@ def _side_by_side(
     offsets = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int)
     vertices = np.concatenate([shape.at_first.vertices for shape in shapes])
     return Results(
-        rig=session.rig.name,
+        rig=rig,
         steps=(reference,),
-        cameras=tuple(calibration.camera for calibration in ring.cameras.values()),
+        cameras=tuple(cameras),
         pairs=tuple(shape.ids for shape in shapes),
         vertices_ref=vertices,
         vertices=vertices[None],

@@ -119,7 +119,8 @@ def track(
         series, drift, agreement, more_warnings = InMemory(whole.results), whole.drift, whole.agreement, whole.warnings
     else:
         pairs, more_warnings = _pairs(session, ring, tuple(errors), steps, settings, stages, executor)
-        series, agreement = pairs_surface(session, ring, pairs, steps, settings, merging)
+        cameras, names = [each.camera for each in ring.cameras.values()], [step.id for step in steps]
+        series, agreement = pairs_surface(session.rig.name, cameras, pairs, names, settings, merging)
         drift = {"-".join(pair.shape.ids): pair.drift for pair in pairs}
     return Tracked(series, ring, errors, drift, agreement, (*ring.warnings, *warnings, *more_warnings))
 

@@ -146,3 +146,7 @@ class Shelf:
         with self._lock:
             self._file.seek(self._at[key])
             return pickle.load(self._file)
+
+    def close(self) -> None:
+        """Forget everything; what is not closed goes with the shelf."""
+        self._file.close()

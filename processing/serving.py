@@ -61,9 +61,15 @@ def warm_up() -> None:
     lowered = getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0)
     command = [sys.executable, "-m", "processing", "--compile"]
     subprocess.run(command, check=False, stdin=subprocess.DEVNULL, creationflags=lowered)
+    _load_kernels()
+
+
+def _load_kernels() -> None:
     from processing.correlation.correlate import load_kernels
+    from processing.rehearsal import rehearse
 
     load_kernels()
+    rehearse()
 
 
 def compile_kernels(say: Say) -> None:
@@ -73,9 +79,7 @@ def compile_kernels(say: Say) -> None:
     from processing.correlation.warming import on_compiling
 
     with on_compiling(lambda: say({"worker": "warming", "compiling": True})):
-        from processing.correlation.correlate import load_kernels
-
-        load_kernels()
+        _load_kernels()
 
 
 def carry_out(

@@ -57,10 +57,8 @@ def run(heuristic: str) -> tuple[Results, dict]:
 
 def series_of(heuristic: str) -> tuple[PairsSeries, dict]:
     surfaces = [sheet(("A", "B"), 0, 0.0, 0.0), sheet(("B", "C"), 20, 0.1, 0.03)]
-    session = SimpleNamespace(rig=SimpleNamespace(name="plates"))
-    steps = [SimpleNamespace(id=f"000{k}-specimen") for k in range(STEPS)]
     settings = Settings(surface=SurfaceGroup(merge=heuristic))
-    return pairs_surface(session, SimpleNamespace(cameras={}), surfaces, steps, settings)
+    return pairs_surface("plates", [], surfaces, [f"000{k}-specimen" for k in range(STEPS)], settings)
 
 
 @pytest.mark.parametrize("heuristic", ["combined", "correlation"])

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import gettempdir
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -153,14 +152,8 @@ def by_pair(cameras: list[Camera], image: Callable[[str, int], np.ndarray], sear
     pair = (cameras[0], cameras[1])
     grid, steps = matched(Stereo(pair, search, CORRELATION), image)
     shape = pair_shape(pair, grid.xy, grid.faces, steps[0], CORRELATION.step, 0.05)
-    calibrated = {camera.id: SimpleNamespace(camera=camera) for camera in cameras}
-    series, _ = pairs_surface(
-        SimpleNamespace(rig=SimpleNamespace(name="patch")),
-        SimpleNamespace(cameras=calibrated),
-        [follow_pair(shape, steps.__getitem__, STEPS, Shelf(Path(gettempdir())))],
-        [SimpleNamespace(id=str(step)) for step in range(STEPS)],
-        Settings(),
-    )
+    followed = follow_pair(shape, steps.__getitem__, STEPS, Shelf(Path(gettempdir())))
+    series, _ = pairs_surface("patch", cameras, [followed], [str(step) for step in range(STEPS)], Settings())
     return with_uncertainty(joined([series.at(k) for k in range(STEPS)]), None)
 
 

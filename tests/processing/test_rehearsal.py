@@ -1,0 +1,34 @@
+"""After a rehearsal a job finds every kernel that follows its matching compiled."""
+
+import importlib
+from pathlib import Path
+
+from numba.core.dispatcher import Dispatcher
+
+from processing.pipeline import process_session
+from processing.rehearsal import rehearse
+from processing.settings import load_settings
+
+MODULES = (
+    "adjacency", "lens", "merging.kernels", "merging.mismatch", "merging.stars", "nearest", "point_kernels",
+    "projection", "ranges", "triangle_kernels",
+)  # fmt: skip
+
+
+def compiled() -> set[tuple[str, str]]:
+    """Every kernel of these modules with the types that it was compiled or loaded for."""
+    return {
+        (f"{name}.{kernel}", str(types))
+        for name in MODULES
+        for kernel, value in vars(importlib.import_module(f"processing.{name}")).items()
+        if isinstance(value, Dispatcher)
+        for types in value.signatures
+    }
+
+
+def test_a_job_needs_no_kernel_that_was_not_rehearsed(session: Path) -> None:
+    rehearse()
+    before = compiled()
+    assert any(name == "merging.stars.stars" for name, _ in before)
+    process_session(session, load_settings(None, ["correlation.radius_px=12", "correlation.step_px=8"]))
+    assert sorted(compiled() - before) == []
