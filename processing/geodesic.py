@@ -7,10 +7,8 @@ mesh such a path is at most 8 % longer than the shortest one (the worst directio
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix, vstack
-from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import cKDTree
 
 from processing.mesh import Mesh
 
@@ -22,7 +20,7 @@ DETOUR = 1.1
 _BLOCK = 256  # sources of one run of Dijkstra's algorithm, chosen near one another
 
 
-def step_graph(mesh: Mesh) -> csr_matrix:
+def step_graph(mesh: Mesh) -> scipy.sparse.csr_matrix:
     """Lengths (N, N), symmetric, mm, of the single steps between vertices: edges, and straight across shared edges.
 
     A triangle that has lost a corner takes no part.
@@ -32,29 +30,31 @@ def step_graph(mesh: Mesh) -> csr_matrix:
     count = len(mesh.vertices)
     keep = np.unique(i * count + j, return_index=True)[1]  # a pair named twice counts once
     i, j, length = i[keep], j[keep], length[keep]
-    return csr_matrix(
+    return scipy.sparse.csr_matrix(
         (np.concatenate([length, length]), (np.concatenate([i, j]), np.concatenate([j, i]))), (count, count)
     )
 
 
-def reach(mesh: Mesh, distance: float) -> csr_matrix:
+def reach(mesh: Mesh, distance: float) -> scipy.sparse.csr_matrix:
     """Which vertices are reached from which within ``distance`` mm along the mesh: (N, N), 1 if so, 1 for itself."""
     graph = step_graph(mesh)
     finite = np.flatnonzero(np.isfinite(mesh.vertices).all(axis=1))
-    tree = cKDTree(mesh.vertices[finite])
-    blocks: list[csr_matrix] = []
+    tree = scipy.spatial.cKDTree(mesh.vertices[finite])
+    blocks: list[scipy.sparse.csr_matrix] = []
     order = finite[_along_cells(mesh.vertices[finite], _BLOCK)]
     for start in range(0, len(order), _BLOCK):
         sources = order[start : start + _BLOCK]
         near = _near(tree, finite, mesh.vertices[sources], distance)
-        path = dijkstra(graph[near][:, near], indices=np.searchsorted(near, sources), limit=distance)
+        path = scipy.sparse.csgraph.dijkstra(
+            graph[near][:, near], indices=np.searchsorted(near, sources), limit=distance
+        )
         at, to = np.nonzero(np.isfinite(path))
-        blocks.append(csr_matrix((np.ones(len(at)), (at, near[to])), (len(sources), len(mesh.vertices))))
+        blocks.append(scipy.sparse.csr_matrix((np.ones(len(at)), (at, near[to])), (len(sources), len(mesh.vertices))))
     count = len(mesh.vertices)
     if not blocks:
-        return csr_matrix((count, count))
-    found = vstack(blocks, format="coo")
-    return csr_matrix((found.data, (order[found.row], found.col)), (count, count))
+        return scipy.sparse.csr_matrix((count, count))
+    found = scipy.sparse.vstack(blocks, format="coo")
+    return scipy.sparse.csr_matrix((found.data, (order[found.row], found.col)), (count, count))
 
 
 def _edges(mesh: Mesh) -> tuple[Ints, Ints, Array]:
@@ -106,7 +106,7 @@ def _along_cells(points: Array, block: int) -> Ints:
     return np.concatenate(done) if done else order
 
 
-def _near(tree: cKDTree, index: Ints, points: Array, distance: float) -> Ints:
+def _near(tree: scipy.spatial.cKDTree, index: Ints, points: Array, distance: float) -> Ints:
     """Sorted vertices in the ball round all of ``points`` that is ``distance`` larger than they need."""
     middle = points.mean(axis=0)
     radius = float(np.linalg.norm(points - middle, axis=1).max()) + distance

@@ -22,8 +22,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
 
 from processing import geodesic
 from processing.deformation import Deformation, directors, isotropy, of_directors
@@ -45,7 +45,7 @@ class StrainWindow:
 
     mesh: Mesh
     width: float
-    members: csr_matrix
+    members: scipy.sparse.csr_matrix
 
     def __post_init__(self) -> None:
         if self.members.shape != (len(self.mesh.faces), len(self.mesh.vertices)):
@@ -117,13 +117,15 @@ def strain_window(mesh: Mesh, width: float) -> StrainWindow:
     radius = 0.5 * width
     M, N = len(mesh.faces), len(mesh.vertices)
     reached = geodesic.reach(mesh, geodesic.DETOUR * radius)
-    corners = csr_matrix((np.ones(3 * M), mesh.faces.ravel(), 3 * np.arange(M + 1)), (M, N))
+    corners = scipy.sparse.csr_matrix((np.ones(3 * M), mesh.faces.ravel(), 3 * np.arange(M + 1)), (M, N))
     near = (corners @ reached).tocsr()
     row = np.repeat(np.arange(M), np.diff(near.indptr))
     with np.errstate(invalid="ignore"):
         inside = np.linalg.norm(mesh.vertices[near.indices] - mesh.centroids[row], axis=1) <= radius
     pointer = np.concatenate([[0], np.cumsum(np.bincount(row[inside], minlength=M))])
-    return StrainWindow(mesh, float(width), csr_matrix((np.ones(pointer[-1]), near.indices[inside], pointer), (M, N)))
+    return StrainWindow(
+        mesh, float(width), scipy.sparse.csr_matrix((np.ones(pointer[-1]), near.indices[inside], pointer), (M, N))
+    )
 
 
 @dataclass(frozen=True)

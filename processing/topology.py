@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from processing.adjacency import fan_numbers, piece_numbers, twins, vertices_of_several_fans
 from processing.mesh import Mesh, half_edges
@@ -174,7 +174,7 @@ def _neighbourhood(mesh: Mesh, reach: float) -> tuple[Indices, Indices]:
     centroids = mesh.centroids
     size = np.linalg.norm(mesh.vertices[mesh.faces] - centroids[:, None], axis=2).max(axis=1)
     usual = 1.4 * float(np.median(size))
-    tree = cKDTree(centroids)
+    tree = scipy.spatial.cKDTree(centroids)
     pairs = tree.query_pairs(float(np.hypot(2 * usual, reach)), output_type="ndarray").astype(np.int64)
     large = np.flatnonzero(size > usual)
     around = tree.query_ball_point(centroids[large], np.hypot(size[large] + size.max(), reach))

@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from processing.calibration.parameters import PER_CAMERA
 from processing.calibration.patch import (
@@ -192,7 +191,7 @@ class _Normal:
     a: Array
     d: Array
     prior: Array
-    by_rest: sparse.csr_array
+    by_rest: scipy.sparse.csr_array
     by_dot: Array
     residuals: Array
     weights: Array
@@ -212,7 +211,7 @@ def _normal(problem: Problem, state: State, scales: Scales) -> _Normal:
         axis=1,
     )
     starts = np.arange(2 * n + 1) * at.shape[1]
-    J = sparse.csr_array(
+    J = scipy.sparse.csr_array(
         (values.reshape(-1), np.repeat(at, 2, axis=0).ravel(), starts), shape=(2 * n, len(problem.free))
     )
     return _assembled(problem, state, scales, J[:, problem.free], by_dot, problem.px - px)
@@ -224,7 +223,7 @@ def _reweighted(problem: Problem, state: State, normal: _Normal, scales: Scales)
 
 
 def _assembled(
-    problem: Problem, state: State, scales: Scales, by_rest: sparse.csr_array, by_dot: Array, residuals: Array
+    problem: Problem, state: State, scales: Scales, by_rest: scipy.sparse.csr_array, by_dot: Array, residuals: Array
 ) -> _Normal:
     m = len(problem.rows) if scales.print else 0
     w = np.minimum(1.0, HUBER * scales.px / np.maximum(np.abs(residuals), 1e-300)) / scales.px**2  # (n, 2)
@@ -236,7 +235,7 @@ def _assembled(
     if m:
         n = len(residuals)
         at = np.repeat(2 * problem.dot[:, None] + np.arange(2), 2, axis=0).ravel()
-        J = sparse.csr_array((by_dot.reshape(-1), at, 2 * np.arange(2 * n + 1)), shape=(2 * n, 2 * m))
+        J = scipy.sparse.csr_array((by_dot.reshape(-1), at, 2 * np.arange(2 * n + 1)), shape=(2 * n, 2 * m))
         B = (weighted.T @ J).toarray().reshape(-1, m, 2)
         np.add.at(D, problem.dot, np.swapaxes(by_dot, 1, 2) @ (w[..., None] * by_dot))
         D += np.eye(2) / scales.print**2
@@ -347,8 +346,8 @@ def _reduced(normal: _Normal, damping: float) -> tuple[tuple[Array, bool], Array
     S = A - BD.reshape(len(A), -1) @ normal.B.reshape(len(A), -1).T
     scale = 1 / np.sqrt(np.diag(A))
     try:
-        factor = cho_factor(S * np.outer(scale, scale), lower=True)
-    except LinAlgError as error:
+        factor = scipy.linalg.cho_factor(S * np.outer(scale, scale), lower=True)
+    except scipy.linalg.LinAlgError as error:
         raise ComputationError(
             "the images of the target do not determine all that the bundle adjustment was told to adjust; "
             "hold the target's radius and pitch, or use calibration.method = 'dlt'"
@@ -360,7 +359,7 @@ def _solve(normal: _Normal, damping: float) -> tuple[Array, Array]:
     """One damped step: of the free parameters of cameras and sheet (k,) and of the dots (m, 2)."""
     factor, scale, inverse_D, BD = _reduced(normal, damping)
     right = normal.a - np.einsum("kmi,mi->k", BD, normal.d)
-    rest = scale * cho_solve(factor, scale * right)
+    rest = scale * scipy.linalg.cho_solve(factor, scale * right)
     dots = np.einsum("mij,mj->mi", inverse_D, normal.d) - np.einsum("kmi,k->mi", BD, rest)
     return rest, dots
 
@@ -368,6 +367,6 @@ def _solve(normal: _Normal, damping: float) -> tuple[Array, Array]:
 def _inverse(normal: _Normal) -> tuple[Array, Array, Array]:
     """Covariance of the free parameters of cameras and sheet (k, k), with the dots (k, m, 2), of each dot (m, 2, 2)."""
     factor, scale, inverse_D, BD = _reduced(normal, 0.0)
-    covariance = cho_solve(factor, np.eye(len(scale))) * np.outer(scale, scale)
+    covariance = scipy.linalg.cho_solve(factor, np.eye(len(scale))) * np.outer(scale, scale)
     crossed = -np.tensordot(covariance, BD, axes=1)
     return covariance, crossed, inverse_D - np.einsum("kmi,kmj->mij", BD, crossed)

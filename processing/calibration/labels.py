@@ -10,6 +10,7 @@ from collections.abc import Iterable
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from processing.calibration import dlt
@@ -40,8 +41,6 @@ def read_labels(image: NDArray[np.generic], dots: DotObservations, target: Targe
 
     image : grey, as the dots were found in it. below : under the lowest row in place of above the highest.
     """
-    from scipy.ndimage import gaussian_filter  # not loaded where the calibration is kept
-
     grey = np.asarray(image, dtype=np.float32)
     camera = Camera("", dlt.to_projection(dlt.solve_dlt(dots.xyz, dots.px)), (1, 1))
     bend = _Bend(dots, target, dots.px - camera.project(dots.xyz))
@@ -65,7 +64,7 @@ def read_labels(image: NDArray[np.generic], dots: DotObservations, target: Targe
         patch = cv2.remap(grey, px[..., 0], px[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         paper = float(np.percentile(patch, 90))
         if paper > 0:
-            labels[int(column)] = np.asarray(gaussian_filter(patch / paper, _BLUR), dtype=np.float64)
+            labels[int(column)] = np.asarray(scipy.ndimage.gaussian_filter(patch / paper, _BLUR), dtype=np.float64)
     return labels
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections import Counter, deque
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from processing.calibration.dots import Dots
 from processing.rig import Target
@@ -53,7 +53,7 @@ def _neighbours(dots: Dots, target: Target) -> tuple[Index, Index]:
     """For each spot the one above and the one to the right; −1 where there is none. Only mutual neighbours count."""
     tall = target.row_spacing_mm / target.dot_size_mm * dots.height
     wide = target.column_spacing_mm / target.dot_size_mm * dots.width
-    tree = cKDTree(dots.px)
+    tree = scipy.spatial.cKDTree(dots.px)
     n = len(dots)
     found = {name: np.full(n, -1, dtype=np.intp) for name in ("above", "below", "right", "left")}
     reach = _FARTHEST * np.hypot(np.maximum(tall, wide), _HORIZONTAL_SLOPE * wide)

@@ -15,8 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
 
@@ -78,9 +78,9 @@ def independent(residuals: Array, board_xy: Array) -> float:
 
     residuals : (v, n, 2) of the corners at board_xy (n, 2) in v views.
     """
-    distance, _ = cKDTree(board_xy).query(board_xy, k=2)
+    distance, _ = scipy.spatial.cKDTree(board_xy).query(board_xy, k=2)
     pitch = float(np.median(distance[:, 1]))
-    pairs = cKDTree(board_xy).query_pairs(1.2 * pitch, output_type="ndarray")
+    pairs = scipy.spatial.cKDTree(board_xy).query_pairs(1.2 * pitch, output_type="ndarray")
     if not len(pairs):
         return float(residuals.size)
     power = float(np.mean(residuals**2))

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
 from processing.calibration.bundle import BundleFit
 from processing.calibration.parameters import LENS, PER_CAMERA, POSE, Parameters, projection_jacobians
@@ -130,7 +130,7 @@ def _scale(poses: Sequence[Parameters], xyz: Array, px: Array, sigma: Array) -> 
     left = np.stack([projection_jacobians(pose, xyz)[0] for pose in poses])
     pulls = ((px - left) / sigma) ** 2
     views = np.isfinite(pulls).all(axis=2).sum(axis=0)
-    usual = 2.0 * gammaincinv(0.5 * np.maximum(2 * views - 3, 1), 0.5)  # the median of χ²
+    usual = 2.0 * scipy.special.gammaincinv(0.5 * np.maximum(2 * views - 3, 1), 0.5)  # the median of χ²
     ratio = np.nansum(pulls, axis=(0, 2)) / usual
     return max(1.0, float(np.sqrt(np.median(ratio[views >= 2]))))
 

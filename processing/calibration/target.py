@@ -15,8 +15,8 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from processing.calibration import dlt, lattice
 from processing.calibration.dots import Dots
@@ -401,13 +401,14 @@ def _try(
 
 def _find_bend(dots: Dots, xyz: Array) -> float:
     """The bend after which a camera without distortion agrees best with the dots."""
-    from scipy.optimize import minimize_scalar  # takes longer to load than a kept calibration to read
 
     def misfit(bend: float) -> float:
         px = _straightened(dots, bend).px
         return float(np.median(np.linalg.norm(dlt.residuals(dlt.solve_dlt(xyz, px), xyz, px), axis=1)))
 
-    return float(minimize_scalar(misfit, bounds=(-0.4, 0.4), method="bounded", options={"xatol": 1e-3}).x)
+    return float(
+        scipy.optimize.minimize_scalar(misfit, bounds=(-0.4, 0.4), method="bounded", options={"xatol": 1e-3}).x
+    )
 
 
 def _occupied_rows(rows: Index, columns: Index) -> Index:
@@ -432,8 +433,8 @@ def _match(
     expected = camera.project_undistorted(xyz)
     width, height = _projected_size(camera, xyz, target)
 
-    distance, nearest = cKDTree(dots.px).query(expected)
-    back = cKDTree(expected).query(dots.px)[1]
+    distance, nearest = scipy.spatial.cKDTree(dots.px).query(expected)
+    back = scipy.spatial.cKDTree(expected).query(dots.px)[1]
     ok = back[nearest] == np.arange(len(expected))
     ok &= distance < np.maximum(_PLACE * np.minimum(width, height), 1.5)
     ok &= np.abs(dots.width[nearest] - width) < 0.3 * width + 3

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from processing.correlation.prepared import Current, Reference, as_8_bit
 
@@ -29,7 +29,7 @@ def feature_starts(reference: Reference, current: Current, xy: Array, radius: in
     out = np.full((len(xy), 12), np.nan)
     if len(p) < 2 * _NEAREST:
         return out
-    distance, near = cKDTree(p).query(xy, k=_NEAREST)
+    distance, near = scipy.spatial.cKDTree(p).query(xy, k=_NEAREST)
     for k in range(len(xy)):
         use = near[k][distance[k] < 8 * radius]
         if len(use) >= 5:

@@ -6,8 +6,8 @@ import math
 
 import numba as nb
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ def neighbours(xy: Array, step: float) -> NDArray[np.int64]:
         table[column, row] = np.arange(len(xy))
         if (table[column, row] == np.arange(len(xy))).all():  # no point twice
             return np.stack([table[column + dx, row + dy] for dx, dy in _AROUND], axis=1)
-    distance, index = cKDTree(xy).query(xy, k=COUNT + 1, distance_upper_bound=1.6 * step)
+    distance, index = scipy.spatial.cKDTree(xy).query(xy, k=COUNT + 1, distance_upper_bound=1.6 * step)
     index = np.where(np.isfinite(distance), index, -1).astype(np.int64)
     own = index == np.arange(len(xy))[:, None]
     # Drop each point itself; where duplicates hide it, drop the last column.

@@ -13,8 +13,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from processing.merging import kernels
 from processing.mesh import Mesh
@@ -135,7 +135,7 @@ def _from_border(mesh: Mesh, owner: Indices) -> Array:
         part = owner == k
         border = Mesh(mesh.vertices, mesh.faces[part]).boundary_edges()
         if len(border):
-            distance[part] = cKDTree(mesh.vertices[border].mean(axis=1)).query(centroids[part])[0]
+            distance[part] = scipy.spatial.cKDTree(mesh.vertices[border].mean(axis=1)).query(centroids[part])[0]
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         list(pool.map(of, range(owner.max(initial=-1) + 1)))

@@ -16,9 +16,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix, identity
-from scipy.spatial import cKDTree
 
 from processing.deformation import Deformation, directors
 from processing.mesh import Mesh
@@ -78,7 +77,7 @@ def window_scatter(window: StrainWindow, alike: Callable[[Array], Array], reach:
     return WindowScatter(mesh.faces, tangents, gain)
 
 
-def _coordinates(members: csr_matrix, vertices: Array, tangents: Array) -> list[csr_matrix]:
+def _coordinates(members: scipy.sparse.csr_matrix, vertices: Array, tangents: Array) -> list[scipy.sparse.csr_matrix]:
     """Both tangential coordinates of the points of each window about their mean, as sparse (m, N)."""
     row = np.repeat(np.arange(members.shape[0]), np.diff(members.indptr))
     count = np.maximum(np.diff(members.indptr), 1)
@@ -86,19 +85,19 @@ def _coordinates(members: csr_matrix, vertices: Array, tangents: Array) -> list[
     for a in range(2):
         along = np.einsum("ki,ki->k", vertices[members.indices], tangents[row, a])
         mean = np.bincount(row, along, members.shape[0]) / count
-        found.append(csr_matrix((along - mean[row], members.indices, members.indptr), members.shape))
+        found.append(scipy.sparse.csr_matrix((along - mean[row], members.indices, members.indptr), members.shape))
     return found
 
 
-def _correlation(mesh: Mesh, alike: Callable[[Array], Array], reach: float) -> csr_matrix:
+def _correlation(mesh: Mesh, alike: Callable[[Array], Array], reach: float) -> scipy.sparse.csr_matrix:
     """Correlations (N, N), sparse, of the errors of all points of a mesh."""
     N = len(mesh.vertices)
     finite = np.flatnonzero(np.isfinite(mesh.vertices).all(axis=1))
-    i, j = finite[cKDTree(mesh.vertices[finite]).query_pairs(reach, output_type="ndarray")].T
+    i, j = finite[scipy.spatial.cKDTree(mesh.vertices[finite]).query_pairs(reach, output_type="ndarray")].T
     rho = alike(np.linalg.norm(mesh.vertices[i] - mesh.vertices[j], axis=1))
-    upper = csr_matrix((rho, (i, j)), (N, N))
-    return csr_matrix(upper + upper.T + identity(N, format="csr"))
+    upper = scipy.sparse.csr_matrix((rho, (i, j)), (N, N))
+    return scipy.sparse.csr_matrix(upper + upper.T + scipy.sparse.identity(N, format="csr"))
 
 
-def _row_sums(a: csr_matrix, b: csr_matrix) -> Array:
+def _row_sums(a: scipy.sparse.csr_matrix, b: scipy.sparse.csr_matrix) -> Array:
     return np.asarray(a.multiply(b).sum(axis=1), dtype=float).ravel()
