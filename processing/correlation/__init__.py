@@ -17,7 +17,7 @@ from processing.correlation.correlate import Correlation, correlate, in_order, r
 from processing.correlation.grid import grid
 from processing.correlation.hypotheses import Row, search_hypotheses, search_row
 from processing.correlation.prepared import Current, Reference, prepare_current, prepare_reference
-from processing.correlation.propagation import reference_bytes
+from processing.correlation.refinement import reference_bytes
 from processing.correlation.settings import CorrelationSettings
 from processing.correlation.status import Status
 

@@ -26,7 +26,7 @@ from processing.correlation.correlate import Correlation, correlate, load_kernel
 from processing.correlation.grid import grid
 from processing.correlation.machine import Machine, demand, measure_machine
 from processing.correlation.prepared import prepare_current, prepare_reference
-from processing.correlation.propagation import refine
+from processing.correlation.refinement import refine
 from processing.correlation.settings import CorrelationSettings
 from processing.correlation.status import Status
 from processing.errors import InputError

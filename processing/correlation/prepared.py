@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -60,6 +60,11 @@ class Reference:
         """Padded coefficients of the box; only points between the pixels need them."""
         return coefficients(self.image, self.degree, self.box, self.precision)
 
+    @cached_property
+    def turned(self) -> Reference:
+        """The image turned about its diagonal: x and y exchanged."""
+        return replace(self, image=_turned(self.image), box=_exchanged(self.box), mask=_turned(self.mask), _kept={})
+
     def once(self, key: Hashable, make: Callable[[], T]) -> T:
         """What ``make`` finds in this image, made when first asked for: of one reference many images are matched."""
         if key not in self._kept:
@@ -91,6 +96,11 @@ class Current:
     def coef(self) -> Levels:
         """Padded coefficients of the box, those of the whole image: the filter sees the pixels around."""
         return coefficients(self.image, self.degree, self.box, self.precision)
+
+    @cached_property
+    def turned(self) -> Current:
+        """The image turned about its diagonal: x and y exchanged."""
+        return replace(self, image=_turned(self.image), box=_exchanged(self.box))
 
     def around(self, positions: Array, margin: float) -> Current:
         """The same with the box no larger than the positions (k, 2) px and a margin about them."""
@@ -158,6 +168,14 @@ def _grey_range(image: NDArray) -> float:
 
 def _clip(box: Box, shape: tuple[int, ...]) -> Box:
     return max(int(box[0]), 0), max(int(box[1]), 0), min(int(box[2]), shape[1]), min(int(box[3]), shape[0])
+
+
+def _turned(image: NDArray) -> NDArray:
+    return np.ascontiguousarray(image.T)
+
+
+def _exchanged(box: Box) -> Box:
+    return box[1], box[0], box[3], box[2]
 
 
 def _crop(image: NDArray, box: Box, precision: type) -> Levels:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from hashlib import sha256
 
 import cv2
 import numpy as np
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from processing.correlation import kernels
 from processing.correlation.neighbours import COUNT, inconsistent, local_fit, neighbours, predicted
 from processing.correlation.prepared import Current, Reference
+from processing.correlation.refinement import Subsets, refine, subsets_of
 from processing.correlation.settings import CorrelationSettings
 from processing.correlation.status import Status
 
@@ -30,18 +30,7 @@ _LEVELS = (0.9, 0.8, 0.6)  # reliability in steps, ZNCC; the last one is setting
 _RETRIES = 3
 _DRIFTING = 0.9  # ZNCC of a point that twice did not converge from which on it is not started elsewhere
 _PATIENCE = 15  # iterations of a point that failed before
-_WORTH_KEEPING = 500  # points
-_SETS = 2  # of points of one reference: a lattice and all
 _STRETCH = 4.0  # largest stretch and compression of a subset between two images
-
-
-class Subsets:
-    """What a correlation finds of n subsets of the reference alone: found (n, ...), as ``kernels`` leave it, where
-    known (n,) bool."""
-
-    def __init__(self, n: int, order: int) -> None:
-        self.found = np.empty((n, kernels.width_of_subset(order)))
-        self.known = np.zeros(n, bool)
 
 
 @dataclass
@@ -95,7 +84,7 @@ class Field:
             self.bare = bare_points(self.reference, self.xy, self.settings)
         self.status[self.bare] = Status.NO_TEXTURE
         if not self.alone:
-            self.subsets = _subsets(self.reference, self.xy, self.settings)
+            self.subsets = subsets_of(self.reference, self.xy, self.settings)
 
     @property
     def good(self) -> NDArray[np.bool_]:
@@ -253,28 +242,6 @@ class Field:
         return np.asarray(((self.near >= 0) & self.good[self.near]) @ (1 << np.arange(COUNT)))
 
 
-def _subsets(reference: Reference, xy: Array, settings: CorrelationSettings) -> Subsets | None:
-    """What is known of the subsets about these points, kept with the reference for the next image; None for a few.
-
-    The last sets of points that were asked for are kept.
-    """
-    if len(xy) < _WORTH_KEEPING:
-        return None
-    sets: dict[tuple[object, ...], Subsets] = reference.once("subsets", dict)
-    key = (sha256(xy.tobytes()).digest(), settings.radius, settings.order, settings.subset, settings.texture_min)
-    found = sets.pop(key, None) or Subsets(len(xy), settings.order)
-    while len(sets) >= _SETS:
-        sets.pop(next(iter(sets)))
-    sets[key] = found
-    return found
-
-
-def reference_bytes(reference: Reference, n: int, settings: CorrelationSettings) -> int:
-    """The most that a reference takes in memory once n points of it have been followed into other images."""
-    filtered = reference.mask.size * (3 * np.dtype(reference.precision).itemsize + 1)
-    return int(reference.image.nbytes + filtered + _SETS * n * (8 * kernels.width_of_subset(settings.order) + 1))
-
-
 def bare_points(reference: Reference, xy: Array, settings: CorrelationSettings) -> NDArray[np.bool_]:
     """Points (n,) with clearly too little texture about them, seen at once for all: no start value is sought there.
 
@@ -313,65 +280,3 @@ def _degenerate(parameters: Array) -> NDArray[np.bool_]:
     largest = np.sqrt(half + np.sqrt(np.maximum(half * half - det * det, 0.0)))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(~((det > 0) & (largest < _STRETCH) & (det / largest > 1.0 / _STRETCH)))
-
-
-def refine(
-    reference: Reference,
-    current: Current,
-    xy: Array,
-    start: Array,
-    settings: CorrelationSettings,
-    follow: bool = False,
-    kept: tuple[Subsets, NDArray[np.int64]] | None = None,
-) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array, Array]:
-    """IC-GN of points xy (n, 2) from start values (n, 12), NaN rows left out.
-
-    Returns status (n,), ZNCC (n,), iterations (n,), sigma (n, 2) px and parameters (n, 12), all as the kernel left
-    them: nothing is judged here. follow : a point beside one just matched starts from it, if it agrees.
-    kept : what is known of subsets of the reference, and which of them each point's (n,) is.
-    """
-    n, order = len(xy), _tiles(xy, settings)
-    xy, parameters = np.ascontiguousarray(xy[order], dtype=np.float64), np.array(start[order], dtype=np.float64)
-    known = np.isfinite(parameters).all(axis=1)
-    status = np.full(n, Status.NOT_REACHED, np.int64)
-    zncc, sigma = np.full(n, np.nan), np.full((n, 2), np.nan)
-    iterations = np.zeros(n, np.int64)
-    between = bool(np.any(xy != np.rint(xy)))
-    subsets, row = kept or (Subsets(0, settings.order), np.full(n, -1))
-    kernels.refine(
-        reference.grey,
-        *reference.slopes,
-        reference.coef if between else np.zeros((1, 1), settings.precision),
-        reference.mask.view(np.uint8),
-        reference.origin,
-        current.coef,
-        current.origin,
-        xy,
-        parameters,
-        known,
-        settings.radius,
-        settings.subset == "circle",
-        3 if settings.order == 1 else 6,
-        settings.degree == 5,
-        settings.tolerance,
-        settings.max_iterations,
-        settings.texture_min * reference.grey_range / 255.0,
-        settings.noise or 0.0,
-        1.6 * settings.step if follow else 0.0,
-        subsets.found,
-        subsets.known,
-        row[order],
-        status,
-        zncc,
-        iterations,
-        sigma,
-    )
-    back = np.argsort(order)
-    return status[back], zncc[back], iterations[back], sigma[back], parameters[back]
-
-
-def _tiles(xy: Array, settings: CorrelationSettings) -> NDArray[np.int64]:
-    """An order of points xy (n, 2) in which points that share pixels follow one another. (n,)."""
-    side = max(8.0 * settings.step, 2.0 * settings.radius)
-    column, row = np.floor(xy / side).T
-    return np.lexsort((xy[:, 1], xy[:, 0], row, column))

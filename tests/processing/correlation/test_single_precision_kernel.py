@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from processing.correlation import CorrelationSettings, correlate, grid, prepare_current, prepare_reference
-from processing.correlation.propagation import refine
+from processing.correlation.refinement import refine
 from processing.correlation.spline import PAD, coefficients, gradients
 
 _SPEC = importlib.util.spec_from_file_location("double_precision", Path(__file__).with_name("double_precision.py"))
@@ -60,9 +60,10 @@ def in_double_precision(reference, current, mask, xy, start, settings):
 
 GENTLE = np.array([[0.012, -0.02], [0.015, 0.008]])
 STEEP = np.array([[-0.35, 0.12], [0.06, 0.1]])
+STEEP_ALONG_ROWS = np.array([[0.3, 0.02], [0.06, 0.03]])
 
 
-@pytest.mark.parametrize("gradient", [GENTLE, STEEP], ids=["gentle", "steep"])
+@pytest.mark.parametrize("gradient", [GENTLE, STEEP, STEEP_ALONG_ROWS], ids=["gentle", "steep", "steep along rows"])
 @pytest.mark.parametrize(
     ("interpolation", "order", "subset"),
     [("cubic", 1, "circle"), ("cubic", 2, "circle"), ("quintic", 1, "square"), ("quintic", 2, "circle")],
@@ -92,6 +93,30 @@ def test_single_precision_gives_the_matches_of_double(speckle, gradient, interpo
     assert difference[:, [1, 2, 7, 8]].max() < 1e-6
     np.testing.assert_allclose(zncc[good], truth[1][good], atol=1e-6)
     np.testing.assert_allclose(sigma[good], truth[3][good], rtol=1e-3)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_images_that_are_stretched_along_their_rows_are_matched_along_their_columns(speckle, order):
+    """As the same images turned about their diagonal are along their rows, to the last digit."""
+    settings = CorrelationSettings(14, 11, order)
+    reference, current = np.rint(speckle), warped(speckle, STEEP_ALONG_ROWS, (3.3, -1.7), 2e-4)
+    mask = np.zeros((SIZE, SIZE), bool)
+    mask[50:160, 40:140] = True
+    xy = grid(mask, settings.step)[0]
+    xy[::3] += [0.3, -0.45]
+    start = np.zeros((len(xy), 12))
+    start[:, [1, 2, 7, 8]] = STEEP_ALONG_ROWS.ravel()
+    start[:, [0, 6]] = (xy - (SIZE - 1) / 2) @ STEEP_ALONG_ROWS.T + [3.5, -1.5]
+    exchanged = [6, 8, 7, 11, 10, 9, 0, 2, 1, 5, 4, 3]
+    prepared = prepare_reference(reference, mask, settings), prepare_current(current, None, settings)
+    turned = prepare_reference(reference.T.copy(), mask.T, settings), prepare_current(current.T.copy(), None, settings)
+    one = refine(*prepared, xy, start, settings)
+    other = refine(*turned, xy[:, ::-1], start[:, exchanged], settings)
+    assert (one[0] == 0).mean() > 0.9
+    for mine, theirs in zip(one[:3], other[:3], strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    np.testing.assert_array_equal(one[3], other[3][:, ::-1])
+    np.testing.assert_array_equal(one[4], other[4][:, exchanged])
 
 
 @pytest.mark.parametrize("order", [1, 2])
