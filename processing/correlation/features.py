@@ -15,7 +15,7 @@ from processing.correlation.prepared import Current, Reference, as_8_bit
 
 Array = NDArray[np.float64]
 
-_PIXELS = 1.2e6  # reduce larger images to this
+_PIXELS = 0.6e6  # reduce larger images to this; the detector doubles them again
 _FEATURES = 3000
 _RATIO = 0.85
 _NEAREST = 14
