@@ -40,8 +40,8 @@ class CameraJob:
         task = self.steps[step - 1]
         if task is None:
             return None
-        arrays = read_output(task.output)
-        return places(Followed(step=int(arrays["step"]), **{name: arrays[name] for name in _FOLLOWED}), xy)
+        found = kept.get(("followed", str(task.output)), lambda: _followed(task.output), _bytes)  # of two pairs
+        return places(found, xy)
 
 
 @dataclass(frozen=True)
@@ -175,6 +175,15 @@ def _prepared(
         return reference_bytes(reference, len(grid.xy), settings) + grid.region.nbytes + grid.xy.nbytes
 
     return kept.get(("reference", camera.id, *map(str, pairs)), make, size)
+
+
+def _followed(output: Path) -> Followed:
+    arrays = read_output(output)
+    return Followed(step=int(arrays["step"]), **{name: arrays[name] for name in _FOLLOWED})
+
+
+def _bytes(found: Followed) -> int:
+    return sum(int(getattr(found, name).nbytes) for name in _FOLLOWED)
 
 
 def _grid(arrays: Arrays) -> Grid:

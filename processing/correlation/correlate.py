@@ -227,6 +227,7 @@ def _carry_on(
         points.propagate()
         points.retry_from_fit()
         points.reject_outliers()
+    points.hold_curvature()
     seconds["refine"] += time.perf_counter() - began
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from processing.correlation import kernels
 from processing.correlation.neighbours import COUNT, inconsistent, local_fit, neighbours, predicted
 from processing.correlation.prepared import Current, Reference
-from processing.correlation.refinement import Subsets, refine, subsets_of
+from processing.correlation.refinement import Subsets, refine, steep_along_rows, subsets_of
 from processing.correlation.settings import CorrelationSettings
 from processing.correlation.status import Status
 
@@ -92,24 +92,30 @@ class Field:
         return self.status == Status.GOOD
 
     def attempt(
-        self, index: NDArray[np.int64], start: Array, zncc_min: float | None = None, follow: bool = False
+        self,
+        index: NDArray[np.int64],
+        start: Array,
+        zncc_min: float | None = None,
+        follow: bool = False,
+        held: bool = False,
     ) -> NDArray[np.bool_]:
         """Refine points (k,) from start values (k, 12) and keep what is good; true where it was. (k,) bool.
 
-        follow : a point beside one just matched starts from it, if it agrees with the start value.
+        follow : a point beside one just matched starts from it, if it agrees with the start value. held : the second
+        derivatives stay as they are given.
         A result must look alike (ZNCC) and lie within a step of its start value.
         """
+        settings = replace(self._patient(index), order=1) if held else self._patient(index)
         part = self.region if self.region is not None else self.current.around(*self._reached(start, index))
-        self._filter(part)
+        self._filter(part, start)
         status, zncc, iterations, sigma, found = refine(
-            self.reference, part, self.xy[index], start, self._patient(index), follow, self._kept(index)
+            self.reference, part, self.xy[index], start, settings, follow, None if held else self._kept(index)
         )
         beyond = np.flatnonzero(status == Status.OUTSIDE)
         if part is not self.current and len(beyond):  # of the region, but perhaps not of the image
             part = self.current
-            self._filter(part)
-            kept = self._kept(index[beyond])
-            again = refine(self.reference, part, self.xy[index[beyond]], start[beyond], self.settings, kept=kept)
+            self._filter(part, start[beyond])
+            again = refine(self.reference, part, self.xy[index[beyond]], start[beyond], settings)
             status[beyond], zncc[beyond], iterations[beyond], sigma[beyond], found[beyond] = again
         self.region = part
         limit = self.settings.zncc_min if zncc_min is None else zncc_min
@@ -142,9 +148,9 @@ class Field:
             return replace(self.settings, max_iterations=_PATIENCE)
         return self.settings
 
-    def _filter(self, part: Current) -> None:
+    def _filter(self, part: Current, start: Array) -> None:
         began = time.perf_counter()
-        assert part.coef.size  # computed when first asked for
+        assert (part.turned if steep_along_rows(start) else part).coef.size  # computed when first asked for
         self.filtering += time.perf_counter() - began
 
     def _reached(self, start: Array, index: NDArray[np.int64]) -> tuple[Array, float]:
@@ -220,6 +226,20 @@ class Field:
             if not usable.any() or not self.attempt(index[usable], start[usable]).any():
                 return
             self.propagate()
+
+    def hold_curvature(self) -> None:
+        """Lost points of second order once more as of first, with the second derivatives of their best neighbour.
+
+        A subset that the region cuts in half knows its own too poorly.
+        """
+        index = np.flatnonzero(self._open() & (self._good_neighbours() > 0))
+        if self.settings.order == 1 or not len(index):
+            return
+        near = self.near[index]
+        best = np.argmax(np.where((near >= 0) & self.good[near], self.zncc[near], -np.inf), axis=1)
+        source = near[np.arange(len(index)), best]
+        if self.attempt(index, predicted(self.xy, self.parameters, source, index), held=True).any():
+            self.reject_outliers()
 
     def reject_outliers(self) -> bool:
         """Points that contradict their neighbours become lost, until none does. True if any did."""

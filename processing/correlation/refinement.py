@@ -24,7 +24,7 @@ Refined = tuple[NDArray[np.int64], Array, NDArray[np.int64], Array, Array]
 _WORTH_KEEPING = 500  # points
 _SETS = 2  # of points of one reference: a lattice and all
 _STEEP = 0.1  # change of the displacement from pixel to pixel of a row from which on columns may be faster
-_SOME = 8  # every so many points tell how steep the displacements are
+_SOME = 500  # points tell how steep the displacements are
 _TURNED = [6, 8, 7, 11, 10, 9, 0, 2, 1, 5, 4, 3]  # parameters with x and y, u and v exchanged
 
 
@@ -74,20 +74,22 @@ def refine(
     them: nothing is judged here. follow : a point beside one just matched starts from it, if it agrees.
     kept : what is known of subsets of the reference, and which of them each point's (n,) is.
     """
-    if not _steep_along_rows(start):
+    if not steep_along_rows(start):
         return _refine(reference, current, xy, start, settings, follow, kept)
     found = _refine(reference.turned, current.turned, xy[:, ::-1], start[:, _TURNED], settings, follow, None)
     status, zncc, iterations, sigma, parameters = found
     return status, zncc, iterations, sigma[:, ::-1], parameters[:, _TURNED]
 
 
-def _steep_along_rows(start: Array) -> bool:
+def steep_along_rows(start: Array) -> bool:
     """Whether displacements (n, 12) change along rows of the image, and less than half as much along its columns."""
-    some = start[np.isfinite(start).all(axis=1)][::_SOME]
-    if not len(some):
+    some = start[:: max(1, len(start) // _SOME)]
+    change = np.abs(some[:, [1, 2]]) + np.abs(some[:, [7, 8]])
+    change = change[np.isfinite(change).all(axis=1)]
+    if not len(change):
         return False
-    along_row, along_column = (float(np.median(np.abs(some[:, at]).sum(axis=1))) for at in ([1, 7], [2, 8]))
-    return along_row > _STEEP and along_column < 0.5 * along_row
+    along_row, along_column = np.median(change, axis=0)
+    return bool(along_row > _STEEP and along_column < 0.5 * along_row)
 
 
 def _refine(

@@ -181,4 +181,6 @@ def test_another_calibration_makes_all_anew(session: Path) -> None:
 def test_no_image_is_decoded_twice(session: Path) -> None:
     before = kept.made
     process_session(session, SETTINGS, executor=LocalExecutor(2))
-    assert kept.made - before == 2 * STEPS + 2  # the images, and each camera's prepared reference
+    assert kept.made - before == 2 * STEPS + 2 + 2 * (
+        STEPS - 1
+    )  # images, prepared references, and what each camera showed
