@@ -17,6 +17,7 @@ import sys
 from pathlib import Path
 from typing import Any, NoReturn
 
+from processing.allocation import keep_freed_memory
 from processing.errors import RingdicError
 from processing.serving import carry_out, compile_kernels, serve, told
 
@@ -31,6 +32,7 @@ def main() -> int:
     parser.add_argument("--settings", type=Path)
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="NAME=VALUE")
     arguments = parser.parse_args()
+    keep_freed_memory()
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
     if arguments.compile:
         compile_kernels(_line)

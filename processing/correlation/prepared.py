@@ -46,15 +46,15 @@ class Reference:
         """(x, y) px of the box in the image."""
         return np.array(self.box[:2], dtype=np.float64)
 
-    @cached_property
+    @property
     def grey(self) -> Levels:
         """Grey levels of the box. (h, w)."""
-        return _crop(self.image, self.box, self.precision)
+        return self.once("grey", lambda: _crop(self.image, self.box, self.precision))
 
-    @cached_property
+    @property
     def slopes(self) -> tuple[Levels, Levels]:
         """∂/∂x and ∂/∂y of the box, two (h, w)."""
-        return gradients(self.image, self.degree, self.box, self.precision)
+        return self.once("slopes", lambda: gradients(self.image, self.degree, self.box, self.precision))
 
     @cached_property
     def coef(self) -> Levels:
@@ -64,7 +64,10 @@ class Reference:
     @cached_property
     def turned(self) -> Reference:
         """The image turned about its diagonal: x and y exchanged."""
-        return replace(self, image=_turned(self.image), box=_exchanged(self.box), mask=_turned(self.mask), _kept={})
+        along_x, along_y = self.slopes
+        found: dict[Hashable, Any] = {"grey": _turned(self.grey), "slopes": (_turned(along_y), _turned(along_x))}
+        box, mask = _exchanged(self.box), _turned(self.mask)
+        return replace(self, image=_turned(self.image), box=box, mask=mask, _kept=found)
 
     def once(self, key: Hashable, make: Callable[[], T]) -> T:
         """What ``make`` finds in this image, made when first asked for: of one reference many images are matched."""
