@@ -114,9 +114,10 @@ def merge(
     if not len(mesh.faces):
         return Merged(mesh.faces, owner, np.zeros(0, np.int64), np.zeros(0, np.int64), 0, ())
     edge = Seam.mean_edge(sheets)
+    overlap = _Overlap.of(mesh, owner, correlation, chosen, seam.layers * edge)
     with ThreadPoolExecutor(1) as pool:  # the mismatches beside what has to go one after the other
         apart = pool.submit(mismatches, sheets, seam.layers * edge)
-        kept = _without_overlap(mesh, owner, correlation, chosen, seam, edge)
+        kept = _without_overlap(mesh, owner, overlap, seam.gap * edge, seam.layers * edge)
         faces, pair, added = _joined(mesh, mesh.faces[kept], owner, sheets, seam, edge)
         return Merged(faces, pair, np.unique(faces), np.flatnonzero(~kept), added, apart.result())
 
@@ -134,17 +135,30 @@ def _together(sheets: Sequence[Sheet]) -> tuple[Mesh, Indices, Array]:
     return mesh, owner, values[mesh.faces].max(axis=1)
 
 
-def _without_overlap(
-    mesh: Mesh, owner: Indices, correlation: Array, weights: Mapping[str, float], seam: Seam, edge: float
-) -> NDArray[np.bool_]:
-    """Triangles (M,) left when no place is covered twice and the gap is kept."""
-    reach, gap = seam.layers * edge, seam.gap * edge
-    covered = cover(mesh, owner, reach)
-    lost = np.isnan(correlation)
-    beside = neighbours(mesh.faces)
-    bad = badness(mesh, beside, owner, covered, np.where(lost, 0.0, correlation), weights)
-    bad[lost] += 1 + np.ptp(bad)
-    over = np.stack([covered.own, covered.other], axis=1)
+@dataclass(frozen=True)
+class _Overlap:
+    """What lies over one another: pairs (P, 2) of triangles, the first covered by the second.
+
+    beside : (M, 3), of ``neighbours``. lost : (M,) triangles with a lost corner. bad : (M,), those the worst of all.
+    """
+
+    over: Indices
+    beside: Indices
+    lost: NDArray[np.bool_]
+    bad: Array
+
+    @classmethod
+    def of(cls, mesh: Mesh, owner: Indices, correlation: Array, weights: Mapping[str, float], reach: float) -> _Overlap:
+        """Of triangles whose surface (M,) and correlation (M,) are given; reach : mm. Works on all cores."""
+        covered, lost, beside = cover(mesh, owner, reach), np.isnan(correlation), neighbours(mesh.faces)
+        bad = badness(mesh, beside, owner, covered, np.where(lost, 0.0, correlation), weights)
+        bad[lost] += 1 + np.ptp(bad)
+        return cls(np.stack([covered.own, covered.other], axis=1), beside, lost, bad)
+
+
+def _without_overlap(mesh: Mesh, owner: Indices, overlap: _Overlap, gap: float, reach: float) -> NDArray[np.bool_]:
+    """Triangles (M,) left when no place is covered twice and the gap, mm, is kept; reach : mm."""
+    over, beside, lost, bad = overlap.over, overlap.beside, overlap.lost, overlap.bad
     # First what covers one another's middles, then, of the little that is left, what overlaps or is too close at all.
     left = np.ones(len(mesh.faces), bool)
     left[over[lost[over[:, 0]] & ~lost[over[:, 1]], 0]] = False

@@ -51,7 +51,9 @@ def cover(mesh: Mesh, owner: Indices, reach: float) -> Cover:
     """Which triangles' middles are covered by another surface. owner : (M,) surface of each triangle; reach : mm."""
     centroids, normals = mesh.centroids, mesh.normals
     parts = [np.flatnonzero(owner == k) for k in range(owner.max(initial=-1) + 1)]
-    surfaces = [Projector(Mesh(mesh.vertices, mesh.faces[part]), reach, _SAME_SIDE) for part in parts]
+
+    def projector(part: Indices) -> Projector:
+        return Projector(Mesh(mesh.vertices, mesh.faces[part]), reach, _SAME_SIDE)
 
     def over(k: int) -> list[tuple[Indices, Indices, Array]]:
         """What the other surfaces cover of surface k."""
@@ -63,6 +65,7 @@ def cover(mesh: Mesh, owner: Indices, reach: float) -> Cover:
         return found
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
+        surfaces = list(pool.map(projector, parts))
         found = [row for rows in pool.map(over, range(len(parts))) for row in rows]
     own, other = (np.concatenate([row[i] for row in found] or [np.zeros(0)]).astype(np.int64) for i in (0, 1))
     height = np.concatenate([row[2] for row in found] or [np.zeros(0)])
