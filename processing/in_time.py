@@ -31,7 +31,6 @@ from processing.start_field import lattice_spacing, match_from_lattice, on_latti
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 Mask = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 _HELD = 0.6  # ZNCC under the warp that optical flow tells, from which on it is a start value
 _ENOUGH = 0.8  # share of the points that must be matched, or start values are looked for in other ways

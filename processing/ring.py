@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import math
 import os
 from collections.abc import Callable
@@ -40,8 +39,6 @@ from processing.rig import Rig, Target
 from processing.session import Capture, Session
 from processing.settings import CalibrationGroup
 from processing.step_images import Digests
-
-log = logging.getLogger(__name__)
 
 _VERSION = 3  # of what a kept calibration means; raise it when the method changes
 #: A lens this much further from the board's than its uncertainty tells of a fault of board or target.

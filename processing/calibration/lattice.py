@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from processing.calibration.dots import Dots
 from processing.rig import Target
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 #: Neighbours nearer or farther than these parts of the expected distance are not neighbours.
