@@ -27,7 +27,7 @@ class CorrelationGroup(_Group):
     order: Literal[1, 2] = 1
     subset: Literal["circle", "square"] = "circle"
     interpolation: Literal["quintic", "cubic"] = "quintic"
-    tolerance: float = Field(default=1e-3, gt=0)
+    tolerance: float = Field(default=2e-3, gt=0)
     max_iterations: int = Field(default=50, ge=1)
     zncc_min: float = Field(default=0.7, ge=-1, lt=1)
 
