@@ -7,7 +7,6 @@ the calibration and a sweep of proxy cylinders. Later images are matched each to
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -81,9 +80,7 @@ class StepMatches:
         return np.where(self.good[:, None], self.px[1], np.nan)
 
 
-def match_reference(
-    stereo: Stereo, first: Image, second: Image, mask: Mask | None, progress: Callable[[float], None] = lambda _: None
-) -> tuple[Grid, StepMatches]:
+def match_reference(stereo: Stereo, first: Image, second: Image, mask: Mask | None) -> tuple[Grid, StepMatches]:
     """Find the region in the reference images of both cameras, lay the points and match them between the two.
 
     mask : a region drawn by the user, or None to find it.
@@ -92,7 +89,6 @@ def match_reference(
     settings = stereo.settings
     current = prepare_current(second, settings=settings)
     region, seeds, warps = _find_region(stereo, first, current, mask)
-    progress(0.5)
     xy, faces = grid(region, settings.step)
     reference = prepare_reference(first, region, settings)
     found = match_from_lattice(
