@@ -15,8 +15,8 @@ from processing.correlation.prepared import Current, Reference, as_8_bit
 
 Array = NDArray[np.float64]
 
-_PIXELS = 0.6e6  # reduce larger images to this; the detector doubles them again
-_FEATURES = 3000
+_PIXELS = 0.45e6  # reduce larger images to this; the detector doubles them again
+_FEATURES = 2500
 _RATIO = 0.85
 _NEAREST = 14
 _TRIALS = 120

@@ -309,7 +309,7 @@ def width_of_subset(order: int) -> int:
     return 3 + 2 * size + size * (size + 1) // 2
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(forceinline=True, nogil=True)
 def _refine_point(  # type: ignore[no-untyped-def]
     image, gx, gy, coef_ref, stride_ref, mask, shape_ref, coef, shape, x_ref, y_ref, x_cur, y_cur, p,
     corner, corner_f, offset, uncut, strips, radius, terms, quintic, tolerance, max_iterations, texture, noise,
@@ -436,7 +436,7 @@ def _scratch(rows, columns, kind):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, parallel=True)
 def refine(  # type: ignore[no-untyped-def]
-    image, gx, gy, coef_ref, mask, origin_ref, coef, origin_cur, xy, parameters, known,
+    image, gx, gy, coef_ref, mask, origin_ref, coef, origin_cur, xy, order, parameters, known,
     radius, circle, terms, quintic, tolerance, max_iterations, texture, noise, follow,
     kept, known_subset, row_kept, status, zncc, iterations, sigma,
 ):  # fmt: skip
@@ -444,7 +444,8 @@ def refine(  # type: ignore[no-untyped-def]
 
     image, gx, gy, mask : (h, w) crop of the reference at origin_ref (x, y), coef_ref its coefficients, padded.
     coef : padded coefficients of the crop of the current image at origin_cur.
-    xy : (n, 2) px. parameters : (n, 12), start values in and results out. known : (n,) bool, points to refine.
+    xy : (n, 2) px. order : (n,), that in which the points are taken. parameters : (n, 12), start values in and results
+    out. known : (n,) bool, points to refine.
     follow : px; a point no farther from the one before it starts from that one's result where it is a good match and
     agrees with the point's own start value; 0 never. kept : (N, width_of_subset), what was found of N subsets of this
     reference before, and known_subset : (N,) bool, of which; both filled; row_kept : (n,), each point's row, -1 for
@@ -463,7 +464,7 @@ def refine(  # type: ignore[no-untyped-def]
         H, moment, vectors = np.empty((2 * terms, 2 * terms)), np.empty((7, 15)), np.empty((5, 16))
         A, B = np.empty((6, 6)), np.empty((6, 6))
         before, shown = -1, np.zeros(3)
-        for k in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, xy.shape[0])):
+        for k in order[chunk * _CHUNK : (chunk + 1) * _CHUNK]:
             if known[k]:
                 if before >= 0:
                     _follow(parameters[before], xy[k] - xy[before], follow, parameters[k])

@@ -18,6 +18,7 @@ _MOST_CELLS = 64  # of a grid a point of it; a sparser one has its neighbours lo
 _LEAST_JUMP = 0.5
 _SCATTERS = 8.0
 _LEAST_ISLAND = 4
+_CHUNK = 256  # points that share their scratch memory
 
 
 def neighbours(xy: Array, step: float) -> NDArray[np.int64]:
@@ -92,37 +93,39 @@ def _jumps(xy, parameters, good, near, stale, jump):  # type: ignore[no-untyped-
 
     Only where the point or a neighbour is stale (n,).
     """
-    for k in nb.prange(len(xy)):
-        changed = stale[k]
-        for slot in range(near.shape[1]):
-            changed |= near[k, slot] >= 0 and stale[near[k, slot]]
-        if not changed:
-            continue
-        jump[k] = np.nan
-        if not good[k]:
-            continue
-        expected, m = np.empty((2, near.shape[1])), 0
-        for slot in range(near.shape[1]):
-            source = near[k, slot]
-            if source >= 0 and good[source]:
-                expected[0, m] = _expected(xy, parameters, source, k, 0)
-                expected[1, m] = _expected(xy, parameters, source, k, 6)
-                m += 1
-        if m:
-            u, v = _median(expected[0], m), _median(expected[1], m)
-            jump[k] = math.hypot(parameters[k, 0] - u, parameters[k, 6] - v)
+    for chunk in nb.prange((len(xy) + _CHUNK - 1) // _CHUNK):
+        u, v = np.empty(near.shape[1]), np.empty(near.shape[1])
+        for k in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(xy))):
+            changed = stale[k]
+            for slot in range(near.shape[1]):
+                changed |= near[k, slot] >= 0 and stale[near[k, slot]]
+            if not changed:
+                continue
+            jump[k] = np.nan
+            if not good[k]:
+                continue
+            m = 0
+            for slot in range(near.shape[1]):
+                source = near[k, slot]
+                if source >= 0 and good[source]:
+                    u[m] = _expected(xy, parameters, source, k, 0)
+                    v[m] = _expected(xy, parameters, source, k, 6)
+                    m += 1
+            if m:
+                jump[k] = math.hypot(parameters[k, 0] - _median(u, m), parameters[k, 6] - _median(v, m))
 
 
 @nb.njit(cache=True, nogil=True)
 def _median(values, count):  # type: ignore[no-untyped-def]
-    """Median of the first few values, which it puts in order."""
-    for k in range(1, count):
-        value, at = values[k], k
-        while at and values[at - 1] > value:
-            values[at] = values[at - 1]
-            at -= 1
-        values[at] = value
-    return 0.5 * (values[(count - 1) // 2] + values[count // 2])
+    """Median of the first few values: those with half of the others below them, without a branch that is not known."""
+    low, high = 0.0, 0.0
+    for k in range(count):
+        rank = 0
+        for m in range(count):
+            rank += (values[m] < values[k]) | ((values[m] == values[k]) & (m < k))
+        low = values[k] if rank == (count - 1) // 2 else low
+        high = values[k] if rank == count // 2 else high
+    return 0.5 * (low + high)
 
 
 @nb.njit(cache=True, nogil=True)
@@ -159,19 +162,23 @@ def _hangs_together(xy, parameters, good, near, limit, k, found, most):  # type:
     return count
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, parallel=True)
 def _islands(xy, parameters, good, near, limit, least):  # type: ignore[no-untyped-def]
     """Good points (n,) that hang together with fewer than ``least``, themselves included; none where nothing hangs
     together with four times as many."""
-    out, many = np.zeros(len(xy), np.bool_), False
-    found = np.empty(4 * least, np.int64)
+    out, many, most = np.zeros(len(xy), np.bool_), False, 4 * least
+    found = np.empty(most, np.int64)
     for k in range(len(xy)):
-        if good[k]:
-            most = least if many else len(found)
-            count = _hangs_together(xy, parameters, good, near, limit, k, found, most)
-            many |= count == len(found)
-            out[k] = count < least
-    return out & many
+        many = good[k] and _hangs_together(xy, parameters, good, near, limit, k, found, most) == most
+        if many:
+            break
+    if not many:
+        return out
+    for chunk in nb.prange((len(xy) + _CHUNK - 1) // _CHUNK):
+        few = np.empty(least, np.int64)
+        for k in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(xy))):
+            out[k] = good[k] and _hangs_together(xy, parameters, good, near, limit, k, few, least) < least
+    return out
 
 
 def local_fit(

@@ -108,11 +108,13 @@ class Current:
 
     def around(self, positions: Array, margin: float) -> Current:
         """The same with the box no larger than the positions (k, 2) px and a margin about them."""
-        low, high = np.floor(positions.min(axis=0) - margin), np.ceil(positions.max(axis=0) + margin) + 1
         x0, y0, x1, y1 = self.box
+        (left, right), (top, bottom) = (
+            (int(np.floor(at.min() - margin)), int(np.ceil(at.max() + margin)) + 1) for at in positions.T
+        )
         box = (
-            max(x0, min(int(low[0]), x1 - 8)), max(y0, min(int(low[1]), y1 - 8)),
-            min(x1, max(int(high[0]), x0 + 8)), min(y1, max(int(high[1]), y0 + 8)),
+            max(x0, min(left, x1 - 8)), max(y0, min(top, y1 - 8)),
+            min(x1, max(right, x0 + 8)), min(y1, max(bottom, y0 + 8)),
         )  # fmt: skip
         if (box[2] - box[0]) * (box[3] - box[1]) > 0.7 * (x1 - x0) * (y1 - y0):
             return self

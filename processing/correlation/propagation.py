@@ -30,6 +30,7 @@ _LEVELS = (0.9, 0.8, 0.6)  # reliability in steps, ZNCC; the last one is setting
 _RETRIES = 3
 _DRIFTING = 0.9  # ZNCC of a point that twice did not converge from which on it is not started elsewhere
 _PATIENCE = 15  # iterations of a point that failed before
+_SOME = 500  # points tell how the region of interest is stretched as a whole
 _STRETCH = 4.0  # largest stretch and compression of a subset between two images
 
 
@@ -164,8 +165,9 @@ class Field:
         margin = 3.0 * self.settings.radius + 32.0
         if len(at) < 8:
             return np.array([[0.0, 0.0], [self.current.shape[1], self.current.shape[0]]]), margin
-        A = np.concatenate([np.ones((len(at), 1)), at], axis=1)
-        fit = np.linalg.lstsq(A, to, rcond=None)[0]
+        some = slice(None, None, max(1, len(at) // _SOME))
+        A = np.concatenate([np.ones((len(at[some]), 1)), at[some]], axis=1)
+        fit = np.linalg.lstsq(A, to[some], rcond=None)[0]
         return np.concatenate([to, fit[0] + self.xy @ fit[1:]]), margin
 
     def adopt(self, index: NDArray[np.int64], other: Field) -> None:
@@ -183,7 +185,7 @@ class Field:
     def propagate(self) -> None:
         """Waves from the good points until no point has an untried good neighbour."""
         levels = [level for level in _LEVELS if level > self.settings.zncc_min] + [-1.0]
-        while True:
+        while self._open().any():
             for level in levels:
                 if self._wave(level):
                     break
@@ -216,8 +218,11 @@ class Field:
         Not those that failed so before and whose neighbours are good or lost as they were then.
         """
         for _ in range(2):
+            lost = self._open()
+            if not lost.any():
+                return
             beside = self._good_neighbours()
-            index = np.flatnonzero(self._open() & (beside > 0) & (beside != self.fitted))
+            index = np.flatnonzero(lost & (beside > 0) & (beside != self.fitted))
             if not len(index):
                 return
             self.fitted[index] = beside[index]
@@ -232,8 +237,11 @@ class Field:
 
         A subset that the region cuts in half knows its own too poorly.
         """
-        index = np.flatnonzero(self._open() & (self._good_neighbours() > 0))
-        if self.settings.order == 1 or not len(index):
+        lost = self._open()
+        if self.settings.order == 1 or not lost.any():
+            return
+        index = np.flatnonzero(lost & (self._good_neighbours() > 0))
+        if not len(index):
             return
         near = self.near[index]
         best = np.argmax(np.where((near >= 0) & self.good[near], self.zncc[near], -np.inf), axis=1)

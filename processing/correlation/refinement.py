@@ -102,8 +102,7 @@ def _refine(
     kept: tuple[Subsets, NDArray[np.int64]] | None,
 ) -> Refined:
     """The same along the rows of the images as they are."""
-    n, order = len(xy), _tiles(xy, settings)
-    xy, parameters = np.ascontiguousarray(xy[order], dtype=np.float64), np.array(start[order], dtype=np.float64)
+    n, xy, parameters = len(xy), np.ascontiguousarray(xy, dtype=np.float64), np.array(start, dtype=np.float64)
     known = np.isfinite(parameters).all(axis=1)
     status = np.full(n, Status.NOT_REACHED, np.int64)
     zncc, sigma = np.full(n, np.nan), np.full((n, 2), np.nan)
@@ -119,6 +118,7 @@ def _refine(
         current.coef,
         current.origin,
         xy,
+        _tiles(xy, settings),
         parameters,
         known,
         settings.radius,
@@ -132,18 +132,17 @@ def _refine(
         1.6 * settings.step if follow else 0.0,
         subsets.found,
         subsets.known,
-        row[order],
+        row,
         status,
         zncc,
         iterations,
         sigma,
     )
-    back = np.argsort(order)
-    return status[back], zncc[back], iterations[back], sigma[back], parameters[back]
+    return status, zncc, iterations, sigma, parameters
 
 
 def _tiles(xy: Array, settings: CorrelationSettings) -> NDArray[np.int64]:
     """An order of points xy (n, 2) in which points that share pixels follow one another. (n,)."""
     side = max(8.0 * settings.step, 2.0 * settings.radius)
-    column, row = np.floor(xy / side).T
-    return np.lexsort((xy[:, 1], xy[:, 0], row, column))
+    column, row = np.floor(xy / side).T.astype(np.int64)
+    return np.argsort(column * (1 << 32) + row, kind="stable")
