@@ -38,14 +38,16 @@ def _cubic(t):  # type: ignore[no-untyped-def]
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _quintic(t):  # type: ignore[no-untyped-def]
-    """Quintic B-spline at the taps -2 … 3 for a fraction t, times 120."""
-    s, t2 = _F(1) - t, t * t
-    s2 = s * s
-    a, f = s2 * s2 * s, t2 * t2 * t
-    c = t2 * (t2 * (_F(30) - _F(10) * t) - _F(60)) + _F(66)
-    d = s2 * (s2 * (_F(30) - _F(10) * s) - _F(60)) + _F(66)
-    b = t * (t * (t * (t * (_F(5) * t - _F(20)) + _F(20)) + _F(20)) - _F(50)) + _F(26)
-    return a, b, c, d, _F(120) - a - b - c - d - f, f
+    """Quintic B-spline at the taps -2 … 3 for a fraction t, times 120: even and odd parts about t = ½ share factors."""
+    t2, q = t * t, _F(5) * t - _F(2.5)
+    h, f = t2 - t, t2 * t2 * t
+    h2 = h * h
+    a = _F(5) * (h + h2) + (_F(1) - f)
+    k = h2 - _F(3) * h
+    inner, outer = _F(5) * (h2 - _F(5) * h) + _F(46), _F(13.5) - _F(7.5) * k
+    u, v = q * (k + _F(4)), q * (h2 - h - _F(5))
+    u = u + u
+    return a, outer + v, inner - u, inner + u, outer - v, f
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
