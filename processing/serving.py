@@ -27,7 +27,7 @@ from processing.settings import load_settings
 from processing.tasks import kept
 
 Say = Callable[[dict[str, Any]], None]
-_MOST_KEPT = 4 << 30  # bytes
+_MOST_KEPT, _USUAL_MEMORY = 4 << 30, 8 << 30  # bytes
 _NICE = 10  # compiling must not slow a capture down
 
 
@@ -36,7 +36,7 @@ def _memory() -> int:
     try:
         whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, OSError, ValueError):  # not told on this system
-        return kept.limit
+        whole = _USUAL_MEMORY
     return int(min(_MOST_KEPT, max(kept.limit, whole // 4)))
 
 

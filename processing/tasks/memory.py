@@ -15,7 +15,8 @@ from processing.images import read_gray
 
 T = TypeVar("T")
 
-_LIMIT = 1 << 30  # bytes
+# Bytes. A run takes camera after camera and asks for none again; memory not used before is dear, the system clears it.
+_LIMIT = 256 << 20
 
 
 @dataclass
