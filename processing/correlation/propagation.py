@@ -185,25 +185,30 @@ class Field:
     def propagate(self) -> None:
         """Waves from the good points until no point has an untried good neighbour."""
         levels = [level for level in _LEVELS if level > self.settings.zncc_min] + [-1.0]
-        while self._open().any():
-            for level in levels:
-                if self._wave(level):
-                    break
-            else:
+        while len(index := self._beside_untried()):
+            if not any(self._wave(index, level) for level in levels):
                 return
 
-    def _wave(self, level: float) -> bool:
-        """One wave from neighbours at least this reliable; false if there was nothing to do."""
-        reliable = self.good & (np.nan_to_num(self.zncc, nan=-1.0) >= level)
+    def _beside_untried(self) -> NDArray[np.int64]:
+        """Open points (k,) with a good neighbour that none has started from, and tries left."""
         index = np.flatnonzero(self._open())
         index = index[self.tried[index].sum(axis=1) < _RETRIES]
-        offer = (self.near[index] >= 0) & reliable[self.near[index]] & ~self.tried[index]
-        offered = offer.any(axis=1)
-        index, offer = index[offered], offer[offered]
+        return index[self._offer(index).any(axis=1)]
+
+    def _offer(self, index: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which of the neighbours of points (k,) are good and untried. (k, 8)."""
+        near = self.near[index]
+        return np.asarray((near >= 0) & self.good[near] & ~self.tried[index])
+
+    def _wave(self, index: NDArray[np.int64], level: float) -> bool:
+        """One wave to points (k,) from neighbours at least this reliable; false if there was nothing to do."""
+        worth = np.where(self._offer(index), self.zncc[self.near[index]], -np.inf)
+        worth[~(worth >= level)] = -np.inf
+        slot = np.argmax(worth, axis=1)
+        ready = worth[np.arange(len(index)), slot] > -np.inf
+        index, slot = index[ready], slot[ready]
         if not len(index):
             return False
-        worth = np.where(offer, self.zncc[self.near[index]], -np.inf)
-        slot = np.argmax(worth, axis=1)
         self.tried[index, slot] = True
         start = predicted(self.xy, self.parameters, self.near[index, slot], index)
         failed = self.iterations[index] > 0
