@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,7 @@ class FollowedPair:
     """A pair's surface through F steps, which are read again when they are asked for.
 
     correlation : (N,) of each point the worst over the steps, NaN if it was lost at one. drift : (F,) px, of
-    `PairStep`. noise : (F, 2) px, of `Series`. seconds : time spent by stage.
+    `PairStep`. noise : (F, 2) px, of `Series`.
     """
 
     shape: PairShape
@@ -36,7 +35,6 @@ class FollowedPair:
     correlation: Array
     drift: Array
     noise: Array
-    seconds: dict[str, float] = field(default_factory=dict)
 
     @property
     def sheet(self) -> Sheet:
@@ -58,16 +56,15 @@ Merging = Callable[[Sequence[FollowedPair], str], Merged]
 def follow(shape: PairShape, matched: Callable[[int], Matched], steps: int, shelf: Shelf) -> FollowedPair:
     """A pair's surface through its steps. matched : of each. shelf : where the points in space are laid aside."""
     worst = shape.at_first.correlation.astype(float)
-    drift, noise, seconds = np.full(steps, np.nan), np.full((steps, 2), np.nan), Counter[str]()
+    drift, noise = np.full(steps, np.nan), np.full((steps, 2), np.nan)
     for k in range(steps):
         found = matched(k)
         step = shape.step(found) if k else shape.at_first
         shelf.put((shape.ids, k), (step, found))
         drift[k], noise[k] = step.drift, usual(found.sigma, step.status)
-        seconds.update(found.seconds)
         if np.mean(step.status[shape.rows] == 0) >= _MOST:
             worst = np.maximum(worst, step.correlation)
-    return FollowedPair(shape, lambda k: shelf.get((shape.ids, k)), worst, drift, noise, dict(seconds))
+    return FollowedPair(shape, lambda k: shelf.get((shape.ids, k)), worst, drift, noise)
 
 
 def merge_surfaces(pairs: Sequence[FollowedPair], heuristic: str) -> Merged:
@@ -194,7 +191,7 @@ def _at_reference(pair: FollowedPair, offset: int) -> Matches:
         sigma=found.sigma[None].astype(float),
         status=shape.at_first.status[None],
         vertex=np.where(vertex >= 0, vertex + offset, -1),
-        seconds=pair.seconds,
+        seconds=dict(found.seconds),
     )
 
 

@@ -35,7 +35,8 @@ def sheet(pair: tuple[str, str], first: int, above: float, turned: float) -> Fol
     c_ls = np.where(status == 0, 0.01 + 1e-4 * np.arange(n), np.nan)
     sigma = np.where(status[..., None] == 0, np.broadcast_to(xyz / 1000, (STEPS, n, 3)), np.nan)
     # One match more than there are vertices: it was lost from the start.
-    matched = SimpleNamespace(px=np.zeros((2, n + 1, 2)), sigma=np.zeros((2, n + 1, 2)), c_ls=np.zeros(n + 1))
+    in_pixels = {name: np.zeros((2, n + 1, 2)) for name in ("px", "sigma")}
+    matched = SimpleNamespace(**in_pixels, c_ls=np.zeros(n + 1), seconds={})
     places = [
         PairStep(vertices[k], c_ls[k].astype(np.float32), sigma[k].astype(np.float32), np.append(status[k], 5), 0.0)
         for k in range(STEPS)

@@ -95,7 +95,6 @@ class Step(PairStep):
     """A step that is its own matches."""
 
     px: np.ndarray = field(default_factory=lambda: np.zeros((2, 4, 2)))
-    seconds: dict[str, float] = field(default_factory=lambda: {"refine": 1.0})
 
 
 class FixedShape(PairShape):
@@ -120,6 +119,5 @@ def test_a_point_is_as_good_as_its_worst_step_and_a_step_that_failed_says_nothin
     pair = follow(shape, steps.__getitem__, 3, Shelf(tmp_path))
     np.testing.assert_array_equal(pair.correlation, np.float32([0.3, 0.2, np.nan, 0.4]))
     np.testing.assert_array_equal(pair.at(1)[0].correlation, c_ls[1])
-    assert pair.seconds == {"refine": 3.0}
     np.testing.assert_allclose(pair.noise, 0.01, rtol=1e-6)
     np.testing.assert_array_equal(pair.drift, 0.5)
