@@ -3,7 +3,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test lint bench clean
+# A processor without AVX-512, as numba is told of it.
+NARROW := +sse,+sse2,+sse3,+ssse3,+sse4.1,+sse4.2,+avx,+avx2,+fma,+bmi,+bmi2,+popcnt,+lzcnt,+cmov,+cx8,+cx16,+f16c,+fxsr,+mmx,+movbe,+sahf,+xsave
+
+.PHONY: install demo test test-narrow lint bench clean
 
 $(VENV)/.installed: pyproject.toml
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
@@ -27,6 +30,10 @@ lint: $(VENV)/.installed-test          ## style, types and the walls between the
 
 test: lint                             ## everything that CI runs
 	$(BIN)/python -m pytest $(PYTEST)
+
+test-narrow: $(VENV)/.installed-test   ## the kernels compiled for an x86-64 processor without AVX-512
+	NUMBA_CPU_NAME=haswell NUMBA_CPU_FEATURES="$(NARROW)" NUMBA_CACHE_DIR=build/narrow \
+	  $(BIN)/python -m pytest tests/processing/correlation/test_single_precision_kernel.py
 
 bench: install                         ## speed and memory
 	$(BIN)/ringdic bench

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 import llvmlite.ir as ir
+import numba
 import numpy as np
 from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 from numba import extending
@@ -22,11 +23,14 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import lower_builtin, models, register_model
 
 
-def _wide_registers() -> bool:
-    return bool(get_host_cpu_features().get("avx512f")) and get_host_cpu_name() != "znver4"
+def _avx512() -> bool:
+    """Whether numba compiles for a processor with AVX-512: this one, or that of NUMBA_CPU_FEATURES."""
+    asked = numba.config.CPU_FEATURES  # type: ignore[attr-defined]
+    return bool(get_host_cpu_features().get("avx512f")) if asked is None else "+avx512f" in asked.split(",")
 
 
-LANES = 16 if _wide_registers() else 8
+_AVX512 = _avx512()
+LANES = 16 if _AVX512 and get_host_cpu_name() != "znver4" else 8
 WINDOW = 32  # numbers that ``picked`` picks from
 BITS = np.uint16 if LANES == 16 else np.uint8  # one bit a lane
 _BITS = types.uint16 if LANES == 16 else types.uint8
@@ -291,7 +295,7 @@ def picked(typingctx, start, index, which):  # type: ignore[no-untyped-def]
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         lane = builder.fptosi(args[2], _INDEX)
-        if sig.return_type.dtype == types.float32 and get_host_cpu_features().get("avx512f"):
+        if sig.return_type.dtype == types.float32 and _AVX512:
             half, whole = ir.VectorType(ir.FloatType(), WINDOW // 2), ir.Constant(args[1].type, WINDOW // 2)
             near = builder.load(_address(builder, args[0], args[1], half), align=4)
             far = builder.load(_address(builder, args[0], builder.add(args[1], whole), half), align=4)

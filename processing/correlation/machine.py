@@ -21,7 +21,7 @@ from processing.correlation.settings import CorrelationSettings
 # and sum the moments (by order); to interpolate in one pixel interval (place, weights of both axes, rows of taps) and
 # to add to the sums of a step (by order), to find the place.
 _ONCE = {1: 4 + 21, 2: 4 + 31}
-_INTERPOLATE = {3: 4 + 2 * 9 + 4 * 4 + 4, 5: 4 + 2 * 26 + 6 * 6 + 6}
+_INTERPOLATE = {3: 4 + 2 * 9 + 4 * 4 + 4, 5: 4 + 2 * 23 + 6 * 6 + 6}
 _STEP = {1: 10, 2: 14}
 _PLACE = 3
 _LINE = 16  # numbers of single precision in a cache line

@@ -58,6 +58,27 @@ def in_double_precision(reference, current, mask, xy, start, settings):
     return status, zncc, p, sigma
 
 
+def in_the_middle(settings):
+    """Points of a grid whose subsets lie in the image."""
+    mask = np.zeros((SIZE, SIZE), bool)
+    mask[40:160, 40:160] = True
+    return grid(mask, settings.step)[0]
+
+
+def left_by_the_tolerance(speckle, settings, xy, start):
+    """How far points of a gentle pair lie from where they go in the end (n, 2) px, and their mean iterations."""
+    reference, current = np.rint(speckle), warped(speckle, GENTLE, (3.3, -1.7))
+    found, iterations = [], []
+    for tolerance in (settings.tolerance, 1e-6):
+        finer = replace(settings, tolerance=tolerance)
+        prepared = prepare_reference(reference, None, finer), prepare_current(current, None, finer)
+        status, _, made, _, parameters = refine(*prepared, xy, start, finer)
+        assert (status == 0).all()
+        found.append(parameters[:, [0, 6]])
+        iterations.append(made.mean())
+    return found[0] - found[1], iterations[0]
+
+
 GENTLE = np.array([[0.012, -0.02], [0.015, 0.008]])
 STEEP = np.array([[-0.35, 0.12], [0.06, 0.1]])
 STEEP_ALONG_ROWS = np.array([[0.3, 0.02], [0.06, 0.03]])
@@ -123,20 +144,10 @@ def test_images_that_are_stretched_along_their_rows_are_matched_along_their_colu
 def test_the_default_tolerance_leaves_a_tenth_of_itself(speckle, order, figures):
     """The end of an iteration is foretold from its last two steps; start values are 0.3 px off."""
     settings = CorrelationSettings(14, 9, order)
-    reference, current = np.rint(speckle), warped(speckle, GENTLE, (3.3, -1.7))
-    mask = np.zeros((SIZE, SIZE), bool)
-    mask[40:160, 40:160] = True
-    xy = grid(mask, settings.step)[0]
+    xy = in_the_middle(settings)
     start = np.zeros((len(xy), 12))
     start[:, [0, 6]] = (xy - (SIZE - 1) / 2) @ GENTLE.T + [3.5, -1.5]
-    found = []
-    for tolerance in (settings.tolerance, 1e-6):
-        finer = replace(settings, tolerance=tolerance)
-        prepared = prepare_reference(reference, None, finer), prepare_current(current, None, finer)
-        status, _, _, _, parameters = refine(*prepared, xy, start, finer)
-        assert (status == 0).all()
-        found.append(parameters[:, [0, 6]])
-    left = found[0] - found[1]
+    left, _ = left_by_the_tolerance(speckle, settings, xy, start)
     figures(f"left by the default tolerance, order {order}: 1e-3 px", f"{1e3 * left.std():.3f}", "0.1")
     assert np.abs(left).max() < settings.tolerance
     assert np.sqrt(np.mean(left**2)) < 0.1 * settings.tolerance
@@ -146,27 +157,14 @@ def test_the_default_tolerance_leaves_a_tenth_of_itself(speckle, order, figures)
 def test_points_that_begin_near_their_match_save_an_iteration(speckle, order, figures):
     """The end is then foretold from how the steps of other points shrank; by two steps of their own it takes two."""
     settings = CorrelationSettings(20, 4, order)
-    reference, current = np.rint(speckle), warped(speckle, GENTLE, (3.3, -1.7))
-    mask = np.zeros((SIZE, SIZE), bool)
-    mask[40:160, 40:160] = True
-    xy = grid(mask, settings.step)[0]
+    xy = in_the_middle(settings)
     start = np.zeros((len(xy), 12))
     start[:, [0, 6]] = (xy - (SIZE - 1) / 2) @ GENTLE.T + [3.3, -1.7]
     start[:, [1, 2, 7, 8]] = GENTLE.ravel()
     start[:, [0, 6]] += np.random.default_rng(0).normal(0.0, 0.01, (len(xy), 2))
-    found, iterations = [], []
-    for tolerance in (settings.tolerance, 1e-6):
-        finer = replace(settings, tolerance=tolerance)
-        prepared = prepare_reference(reference, None, finer), prepare_current(current, None, finer)
-        status, _, made, _, parameters = refine(*prepared, xy, start, finer)
-        assert (status == 0).all()
-        found.append(parameters[:, [0, 6]])
-        iterations.append(made)
-    left = found[0] - found[1]
-    figures(
-        f"left after {iterations[0].mean():.2f} iterations, order {order}: 1e-3 px", f"{1e3 * left.std():.3f}", "0.1"
-    )
-    assert iterations[0].mean() < (1.3 if order == 1 else 1.8)
+    left, iterations = left_by_the_tolerance(speckle, settings, xy, start)
+    figures(f"left after {iterations:.2f} iterations, order {order}: 1e-3 px", f"{1e3 * left.std():.3f}", "0.1")
+    assert iterations < (1.3 if order == 1 else 1.8)
     assert np.abs(left).max() < settings.tolerance
     assert np.sqrt(np.mean(left**2)) < 0.1 * settings.tolerance
 
@@ -194,9 +192,7 @@ def test_points_that_resemble_nothing_are_soon_given_up(speckle):
     other = np.rint(120.0 + 450.0 * cv2.GaussianBlur(other, (0, 0), 1.6))
     settings = CorrelationSettings(14, 5, 1)
     prepared = prepare_reference(np.rint(speckle), None, settings), prepare_current(other, None, settings)
-    mask = np.zeros((SIZE, SIZE), bool)
-    mask[40:160, 40:160] = True
-    xy = grid(mask, settings.step)[0]
+    xy = in_the_middle(settings)
     status, zncc, iterations, _, _ = refine(*prepared, xy, np.zeros((len(xy), 12)), settings)
     assert not ((status == 0) & (zncc > settings.zncc_min)).any()
     assert iterations.mean() < 0.3 * settings.max_iterations
