@@ -166,7 +166,7 @@ class Field:
         if len(at) < 8:
             return np.array([[0.0, 0.0], [self.current.shape[1], self.current.shape[0]]]), margin
         some = slice(None, None, max(1, len(at) // _SOME))
-        A = np.concatenate([np.ones((len(at[some]), 1)), at[some]], axis=1)
+        A = np.insert(at[some], 0, 1.0, axis=1)
         fit = np.linalg.lstsq(A, to[some], rcond=None)[0]
         return np.concatenate([to, fit[0] + self.xy @ fit[1:]]), margin
 
