@@ -13,7 +13,6 @@ from processing.lattice_field import ALL, between_corners
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_MARGIN = 3.0  # subset radii, and 32 px, about the expected places in which the current image is filtered
 _FEWEST = 8  # matches of which an affine fit says where the others lie
 
 
@@ -40,7 +39,8 @@ def match_from_lattice(
     known = np.isfinite(start[chosen]).all(axis=1)
     if known.sum() < _FEWEST:
         return correlate(reference, current, xy, settings, start=start)
-    part = _about(current, xy, chosen[known], start, settings)
+    at = xy[chosen[known]]
+    part = current.about_all(at, at + start[chosen[known], :2], xy, settings.radius)
     coarse = correlate(reference, part, xy[chosen], replace(settings, step=spacing), start=start[chosen], follow=True)
     dense = between(coarse, xy, spacing, settings.order)
     if not np.isfinite(dense).all(axis=1).any():
@@ -61,13 +61,3 @@ def between(coarse: Correlation, xy: Array, spacing: int, order: int) -> Array:
     start, weight = between_corners(coarse.xy[coarse.good], np.concatenate(parts, axis=1)[coarse.good], spacing, xy)
     start[weight <= ALL] = np.nan  # other points are reached from their neighbours
     return start
-
-
-def _about(
-    current: Current, xy: Array, known: NDArray[np.int64], start: Array, settings: CorrelationSettings
-) -> Current:
-    """The current image filtered once, about where an affine fit of the start values puts all points."""
-    A = np.concatenate([np.ones((len(known), 1)), xy[known]], axis=1)
-    to = xy[known] + start[known, :2]
-    fit = np.linalg.lstsq(A, to, rcond=None)[0]
-    return current.around(np.concatenate([to, fit[0] + xy @ fit[1:]]), _MARGIN * settings.radius + 32.0)

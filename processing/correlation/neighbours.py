@@ -18,7 +18,6 @@ _MOST_CELLS = 64  # of a grid a point of it; a sparser one has its neighbours lo
 _LEAST_JUMP = 0.5
 _SCATTERS = 8.0
 _LEAST_ISLAND = 4
-_CHUNK = 256  # points that share their scratch memory
 
 
 def neighbours(xy: Array, step: float) -> NDArray[np.int64]:
@@ -93,26 +92,25 @@ def _jumps(xy, parameters, good, near, stale, jump):  # type: ignore[no-untyped-
 
     Only where the point or a neighbour is stale (n,).
     """
-    for chunk in nb.prange((len(xy) + _CHUNK - 1) // _CHUNK):
-        u, v = np.empty(near.shape[1]), np.empty(near.shape[1])
-        for k in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(xy))):
-            changed = stale[k]
-            for slot in range(near.shape[1]):
-                changed |= near[k, slot] >= 0 and stale[near[k, slot]]
-            if not changed:
-                continue
-            jump[k] = np.nan
-            if not good[k]:
-                continue
-            m = 0
-            for slot in range(near.shape[1]):
-                source = near[k, slot]
-                if source >= 0 and good[source]:
-                    u[m] = _expected(xy, parameters, source, k, 0)
-                    v[m] = _expected(xy, parameters, source, k, 6)
-                    m += 1
-            if m:
-                jump[k] = math.hypot(parameters[k, 0] - _median(u, m), parameters[k, 6] - _median(v, m))
+    for k in nb.prange(len(xy)):
+        changed = stale[k]
+        for slot in range(near.shape[1]):
+            changed |= near[k, slot] >= 0 and stale[near[k, slot]]
+        if not changed:
+            continue
+        jump[k] = np.nan
+        if not good[k]:
+            continue
+        expected, m = np.empty((2, near.shape[1])), 0
+        for slot in range(near.shape[1]):
+            source = near[k, slot]
+            if source >= 0 and good[source]:
+                expected[0, m] = _expected(xy, parameters, source, k, 0)
+                expected[1, m] = _expected(xy, parameters, source, k, 6)
+                m += 1
+        if m:
+            u, v = _median(expected[0], m), _median(expected[1], m)
+            jump[k] = math.hypot(parameters[k, 0] - u, parameters[k, 6] - v)
 
 
 @nb.njit(cache=True, nogil=True)
@@ -174,10 +172,9 @@ def _islands(xy, parameters, good, near, limit, least):  # type: ignore[no-untyp
             break
     if not many:
         return out
-    for chunk in nb.prange((len(xy) + _CHUNK - 1) // _CHUNK):
+    for k in nb.prange(len(xy)):
         few = np.empty(least, np.int64)
-        for k in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(xy))):
-            out[k] = good[k] and _hangs_together(xy, parameters, good, near, limit, k, few, least) < least
+        out[k] = good[k] and _hangs_together(xy, parameters, good, near, limit, k, few, least) < least
     return out
 
 

@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 Levels = NDArray[np.floating]
 T = TypeVar("T")
 
+_SOME = 500  # points tell how a region is stretched as a whole
+
 
 @dataclass(frozen=True)
 class Reference:
@@ -119,6 +121,15 @@ class Current:
         if (box[2] - box[0]) * (box[3] - box[1]) > 0.7 * (x1 - x0) * (y1 - y0):
             return self
         return Current(self.image, box, self.degree, self.precision)
+
+    def about_all(self, at: Array, to: Array, xy: Array, radius: int) -> Current:
+        """The same with a box about where points xy (n, 2) px will lie, judged by some of which it is known.
+
+        at, to : (k, 2) px. An affine fit of them moves and stretches all; the margin is three subset radii and 32 px.
+        """
+        some = slice(None, None, max(1, len(at) // _SOME))
+        fit = np.linalg.lstsq(np.insert(at[some], 0, 1.0, axis=1), to[some], rcond=None)[0]
+        return self.around(np.concatenate([to, fit[0] + xy @ fit[1:]]), 3.0 * radius + 32.0)
 
 
 def prepare_reference(

@@ -30,7 +30,7 @@ _LEVELS = (0.9, 0.8, 0.6)  # reliability in steps, ZNCC; the last one is setting
 _RETRIES = 3
 _DRIFTING = 0.9  # ZNCC of a point that twice did not converge from which on it is not started elsewhere
 _PATIENCE = 15  # iterations of a point that failed before
-_SOME = 500  # points tell how the region of interest is stretched as a whole
+_FEWEST = 8  # start values that tell where the region of interest goes
 _STRETCH = 4.0  # largest stretch and compression of a subset between two images
 
 
@@ -107,7 +107,7 @@ class Field:
         A result must look alike (ZNCC) and lie within a step of its start value.
         """
         settings = replace(self._patient(index), order=1) if held else self._patient(index)
-        part = self.region if self.region is not None else self.current.around(*self._reached(start, index))
+        part = self.region if self.region is not None else self._reached(start, index)
         self._filter(part, start)
         status, zncc, iterations, sigma, found = refine(
             self.reference, part, self.xy[index], start, settings, follow, None if held else self._kept(index)
@@ -154,21 +154,13 @@ class Field:
         assert (part.turned if steep_along_rows(start) else part).coef.size  # computed when first asked for
         self.filtering += time.perf_counter() - began
 
-    def _reached(self, start: Array, index: NDArray[np.int64]) -> tuple[Array, float]:
-        """Where the points will lie, judged by the first start values, (k, 2) px, and a margin about that.
-
-        The region of interest moved and stretched as a whole by an affine fit of the start values.
-        """
+    def _reached(self, start: Array, index: NDArray[np.int64]) -> Current:
+        """The part of the current image where the points will lie, judged by the first start values (k, 12)."""
         known = np.isfinite(start).all(axis=1)
+        if known.sum() < _FEWEST:
+            return self.current
         at = self.xy[index[known]]
-        to = at + start[known][:, [0, 6]]
-        margin = 3.0 * self.settings.radius + 32.0
-        if len(at) < 8:
-            return np.array([[0.0, 0.0], [self.current.shape[1], self.current.shape[0]]]), margin
-        some = slice(None, None, max(1, len(at) // _SOME))
-        A = np.insert(at[some], 0, 1.0, axis=1)
-        fit = np.linalg.lstsq(A, to[some], rcond=None)[0]
-        return np.concatenate([to, fit[0] + self.xy @ fit[1:]]), margin
+        return self.current.about_all(at, at + start[known][:, [0, 6]], self.xy, self.settings.radius)
 
     def adopt(self, index: NDArray[np.int64], other: Field) -> None:
         """Take over the good points of another field, whose points are ``index`` (k,) here, where still open."""
@@ -185,37 +177,26 @@ class Field:
     def propagate(self) -> None:
         """Waves from the good points until no point has an untried good neighbour."""
         levels = [level for level in _LEVELS if level > self.settings.zncc_min] + [-1.0]
-        while len(index := self._beside_untried()):
-            if not any(self._wave(index, level) for level in levels):
+        while True:
+            index = np.flatnonzero(self._open())
+            index = index[self.tried[index].sum(axis=1) < _RETRIES]
+            near = self.near[index]
+            worth = np.where((near >= 0) & self.good[near] & ~self.tried[index], self.zncc[near], -np.inf)
+            best = worth.max(axis=1)
+            level = next((level for level in levels if (best >= level).any()), None)
+            if level is None:
                 return
+            ready = best >= level
+            self._wave(index[ready], np.argmax(worth[ready], axis=1))
 
-    def _beside_untried(self) -> NDArray[np.int64]:
-        """Open points (k,) with a good neighbour that none has started from, and tries left."""
-        index = np.flatnonzero(self._open())
-        index = index[self.tried[index].sum(axis=1) < _RETRIES]
-        return index[self._offer(index).any(axis=1)]
-
-    def _offer(self, index: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which of the neighbours of points (k,) are good and untried. (k, 8)."""
-        near = self.near[index]
-        return np.asarray((near >= 0) & self.good[near] & ~self.tried[index])
-
-    def _wave(self, index: NDArray[np.int64], level: float) -> bool:
-        """One wave to points (k,) from neighbours at least this reliable; false if there was nothing to do."""
-        worth = np.where(self._offer(index), self.zncc[self.near[index]], -np.inf)
-        worth[~(worth >= level)] = -np.inf
-        slot = np.argmax(worth, axis=1)
-        ready = worth[np.arange(len(index)), slot] > -np.inf
-        index, slot = index[ready], slot[ready]
-        if not len(index):
-            return False
+    def _wave(self, index: NDArray[np.int64], slot: NDArray[np.int64]) -> None:
+        """Open points (k,) refined from one of their neighbours each (k,)."""
         self.tried[index, slot] = True
         start = predicted(self.xy, self.parameters, self.near[index, slot], index)
         failed = self.iterations[index] > 0
         for part in (~failed, failed):
             if part.any():
                 self.attempt(index[part], start[part])
-        return True
 
     def retry_from_fit(self) -> None:
         """Lost points once more, from an affine fit of the good points around them; then from their new neighbours.
@@ -223,14 +204,13 @@ class Field:
         Not those that failed so before and whose neighbours are good or lost as they were then.
         """
         for _ in range(2):
-            lost = self._open()
-            if not lost.any():
-                return
-            beside = self._good_neighbours()
-            index = np.flatnonzero(lost & (beside > 0) & (beside != self.fitted))
+            index = np.flatnonzero(self._open())
+            beside = self._good_neighbours(index)
+            new = (beside > 0) & (beside != self.fitted[index])
+            index, beside = index[new], beside[new]
             if not len(index):
                 return
-            self.fitted[index] = beside[index]
+            self.fitted[index] = beside
             start = local_fit(self.xy, self.parameters, self.good, self.near, index)
             usable = np.isfinite(start).all(axis=1)
             if not usable.any() or not self.attempt(index[usable], start[usable]).any():
@@ -242,11 +222,9 @@ class Field:
 
         A subset that the region cuts in half knows its own too poorly.
         """
-        lost = self._open()
-        if self.settings.order == 1 or not lost.any():
-            return
-        index = np.flatnonzero(lost & (self._good_neighbours() > 0))
-        if not len(index):
+        index = np.flatnonzero(self._open())
+        index = index[self._good_neighbours(index) > 0]
+        if self.settings.order == 1 or not len(index):
             return
         near = self.near[index]
         best = np.argmax(np.where((near >= 0) & self.good[near], self.zncc[near], -np.inf), axis=1)
@@ -270,9 +248,10 @@ class Field:
         """Points not matched that another start value may help. (n,)."""
         return ~self.good & (self.status != Status.NO_TEXTURE) & ~self.drifting
 
-    def _good_neighbours(self) -> NDArray[np.int64]:
-        """Which of its neighbours are good, as bits of a number. (n,)."""
-        return np.asarray(((self.near >= 0) & self.good[self.near]) @ (1 << np.arange(COUNT)))
+    def _good_neighbours(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Which of the neighbours of points (k,) are good, as bits of a number. (k,)."""
+        near = self.near[index]
+        return np.asarray(((near >= 0) & self.good[near]) @ (1 << np.arange(COUNT)))
 
 
 def bare_points(reference: Reference, xy: Array, settings: CorrelationSettings) -> NDArray[np.bool_]:
