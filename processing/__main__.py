@@ -15,7 +15,7 @@ import logging
 import os
 import sys
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from processing.allocation import keep_freed_memory
 from processing.errors import RingdicError
@@ -38,7 +38,7 @@ def main() -> int:
         compile_kernels(_line)
         return 0
     if arguments.serve:
-        _serve_to_the_end()
+        return _serve_to_the_end()
     try:
         _line(carry_out(arguments.session, arguments.settings, arguments.overrides, lambda at: _line(told(at))))
     except RingdicError as error:
@@ -47,16 +47,13 @@ def main() -> int:
     return 0
 
 
-def _serve_to_the_end() -> NoReturn:
-    """Serve; end without waiting for the thread that reads the orders."""
-    code = 0
+def _serve_to_the_end() -> int:
     try:
         serve(sys.stdin, _line)
     except Exception:
         logging.exception("the processing failed through a fault of its own")
-        code = 1
-    sys.stderr.flush()
-    os._exit(code)
+        return 1
+    return 0
 
 
 def _line(value: dict[str, Any]) -> None:
@@ -68,4 +65,5 @@ if __name__ == "__main__":
     code = main()
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(code)  # at once: all is written, and taking the arrays and the kernels down takes half a second
+    # At once: all is written, taking arrays and kernels down takes half a second, and who reads the orders never ends.
+    os._exit(code)
