@@ -181,6 +181,7 @@ def test_another_calibration_makes_all_anew(session: Path) -> None:
 def test_no_image_is_decoded_twice(session: Path) -> None:
     before = kept.made
     process_session(session, SETTINGS, executor=LocalExecutor(2))
-    assert kept.made - before == 2 * STEPS + 2 + 2 * (
-        STEPS - 1
-    )  # images, prepared references, and what each camera showed
+    images, references, later = 2 * STEPS, 2, 2 * (STEPS - 1)
+    assert (
+        kept.made - before == images + references + later
+    )  # the last: what each camera showed, asked for by its pairs

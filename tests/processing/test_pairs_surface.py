@@ -36,7 +36,7 @@ def sheet(pair: tuple[str, str], first: int, above: float, turned: float) -> Fol
     sigma = np.where(status[..., None] == 0, np.broadcast_to(xyz / 1000, (STEPS, n, 3)), np.nan)
     # One match more than there are vertices: it was lost from the start.
     in_pixels = {name: np.zeros((2, n + 1, 2)) for name in ("px", "sigma")}
-    matched = SimpleNamespace(**in_pixels, c_ls=np.zeros(n + 1), seconds={})
+    matched = SimpleNamespace(**in_pixels, c_ls=np.zeros(n + 1), seconds={"refine": 1.0})
     places = [
         PairStep(vertices[k], c_ls[k].astype(np.float32), sigma[k].astype(np.float32), np.append(status[k], 5), 0.0)
         for k in range(STEPS)
@@ -78,6 +78,7 @@ def test_every_vertex_keeps_its_own_values(heuristic: str) -> None:
         has = mine.vertex >= 0
         np.testing.assert_array_equal(results.vertices_ref[mine.vertex[has]], whole.vertices_ref[before.vertex[has]])
         assert before.vertex[-1] == mine.vertex[-1] == -1
+    assert [matches.seconds for matches in results.matches] == [{"refine": 1.0}] * 2  # those of the reference alone
     assert sum((matches.vertex >= 0).sum() for matches in results.matches) == len(results.vertices_ref)
 
 
