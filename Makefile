@@ -28,7 +28,7 @@ lint: $(VENV)/.installed-test          ## style, types and the walls between the
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-test: lint                             ## everything that CI runs
+test: lint                             ## style, types and the whole suite
 	$(BIN)/python -m pytest $(PYTEST)
 
 test-narrow: $(VENV)/.installed-test   ## the kernels compiled for an x86-64 processor without AVX-512
