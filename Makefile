@@ -39,4 +39,4 @@ bench: install                         ## speed and memory
 	$(BIN)/ringdic bench
 
 clean:
-	rm -rf $(VENV) build dist controller/web/static
+	rm -rf $(VENV) build dist controller/ringdic_controller/web/static

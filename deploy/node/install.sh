@@ -112,7 +112,7 @@ as_service_user() {
 controller_address() { # controller_address VENV: the host in the node's configuration; fails if it is not sound
   "$1/bin/python" - "$config" <<'PYTHON'
 import pathlib, sys
-from node_agent.config import ConfigError, read_config
+from ringdic_node.config import ConfigError, read_config
 try:
     endpoint = read_config(pathlib.Path(sys.argv[1])).controller
 except ConfigError as error:

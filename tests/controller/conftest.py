@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
-
-from controller.app import create_app
-from controller.archive import Archive, SessionWriter
-from controller.children import WarmChild
-from controller.desk import Desk
-from node_agent.wire import CaptureKey, Manifest
-from processing.errors import ComputationError
+from ringdic.errors import ComputationError
+from ringdic_controller.archive.writer import Archive, SessionWriter
+from ringdic_controller.jobs.children import WarmChild
+from ringdic_controller.service.app import create_app
+from ringdic_controller.service.desk import Desk
+from ringdic_node.wire import CaptureKey, Manifest
 
 CAMERAS = ("01", "02", "03", "04")
 STAND_IN = [sys.executable, str(Path(__file__).with_name("stand_in_processing.py"))]

@@ -12,12 +12,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-
-from processing.camera import Camera
-from processing.results import Results
-from processing.results_writer import write_results
-from processing.series import part
-from processing.session import new_live, new_run, read_session
+from ringdic.geometry.camera import Camera
+from ringdic.results.results import Results
+from ringdic.results.series import part
+from ringdic.results.writer import write_results
+from ringdic.session.folder import new_live, new_run, read_session
 
 AROUND, ALONG = 60, 16
 LOST = (400, 401, 402)

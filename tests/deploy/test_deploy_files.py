@@ -18,11 +18,10 @@ from pathlib import Path
 import pytest
 import typer.main
 import zenoh
-
-from controller.cli import app
-from controller.config import read_config as read_controller_config
-from node_agent.cli import _parser as node_parser
-from node_agent.config import read_config as read_node_config
+from ringdic_controller.cli.app import app
+from ringdic_controller.service.config import read_config as read_controller_config
+from ringdic_node.cli import _parser as node_parser
+from ringdic_node.config import read_config as read_node_config
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 NODE = REPOSITORY / "deploy" / "node"

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-
-from node_agent.agent import (
+from ringdic_node.agent import (
     Acknowledged,
     Agent,
     Answer,
@@ -28,8 +27,8 @@ from node_agent.agent import (
     Tick,
     Triggered,
 )
-from node_agent.clock import Instant
-from node_agent.wire import Ack, Arm, ArmReply, CaptureKey, Manifest, Trigger
+from ringdic_node.clock import Instant
+from ringdic_node.wire import Ack, Arm, ArmReply, CaptureKey, Manifest, Trigger
 
 SECOND = 1_000_000_000
 NOW = Instant(100 * SECOND, 0)

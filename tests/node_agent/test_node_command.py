@@ -9,13 +9,12 @@ import sys
 import cv2
 import numpy as np
 import pytest
-
-from node_agent.cameras.camera import CameraError, Frame, Shot, check_settings
-from node_agent.cameras.pattern import PatternCamera
-from node_agent.cameras.playback import PlaybackCamera
-from node_agent.cli import main
-from node_agent.clock import SystemClock, parse_tracking
-from node_agent.config import ConfigError, make_camera, read_config
+from ringdic_node.cameras.camera import CameraError, Frame, Shot, check_settings
+from ringdic_node.cameras.pattern import PatternCamera
+from ringdic_node.cameras.playback import PlaybackCamera
+from ringdic_node.cli import main
+from ringdic_node.clock import SystemClock, parse_tracking
+from ringdic_node.config import ConfigError, make_camera, read_config
 
 SOUND = """
 rig = "ring"
@@ -92,8 +91,8 @@ def test_a_node_needs_none_of_the_pc_packages():
         "import sys\n"
         "for name in ('numba', 'cv2', 'scipy', 'h5py', 'pydantic', 'typer', 'processing', 'controller', 'picamera2'):\n"
         "    sys.modules[name] = None\n"
-        "import node_agent.cli, node_agent.service, node_agent.cameras.pattern, node_agent.cameras.pi\n"
-        "import node_agent.cameras.virtual\n"
+        "import ringdic_node.cli, ringdic_node.service, ringdic_node.cameras.pattern, ringdic_node.cameras.pi\n"
+        "import ringdic_node.cameras.virtual\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 

@@ -9,10 +9,9 @@ import types
 
 import numpy as np
 import pytest
-
-from node_agent.cameras.camera import CameraError, Shot
-from node_agent.cameras.pi import PiCamera, frame_time
-from node_agent.clock import Instant, SystemClock
+from ringdic_node.cameras.camera import CameraError, Shot
+from ringdic_node.cameras.pi import PiCamera, frame_time
+from ringdic_node.clock import Instant, SystemClock
 
 PERIOD_NS = 20_000_000
 MS = 1_000_000

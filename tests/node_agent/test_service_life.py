@@ -5,14 +5,13 @@ from __future__ import annotations
 import threading
 
 import pytest
-
-from node_agent.agent import ArmAsked
-from node_agent.cameras.pattern import PatternCamera
-from node_agent.clock import SystemClock
-from node_agent.config import NodeConfig
-from node_agent.service import NodeService, ServiceError
-from node_agent.spool import Spool
-from node_agent.wire import Arm
+from ringdic_node.agent import ArmAsked
+from ringdic_node.cameras.pattern import PatternCamera
+from ringdic_node.clock import SystemClock
+from ringdic_node.config import NodeConfig
+from ringdic_node.service import NodeService, ServiceError
+from ringdic_node.spool import Spool
+from ringdic_node.wire import Arm
 
 
 class BrokenCamera(PatternCamera):

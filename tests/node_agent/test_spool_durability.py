@@ -5,9 +5,8 @@ from __future__ import annotations
 import os
 
 import pytest
-
-from node_agent.spool import Spool, SpoolError, digest
-from node_agent.wire import CaptureKey, Manifest
+from ringdic_node.spool import Spool, SpoolError, digest
+from ringdic_node.wire import CaptureKey, Manifest
 
 PARTS = (b"P5\n3 2\n255\n", b"abcdef")
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from node_agent.cameras.camera import CameraError, Shot
-from node_agent.cameras.virtual import VirtualCamera
-from node_agent.clock import SystemClock
+from ringdic_node.cameras.camera import CameraError, Shot
+from ringdic_node.cameras.virtual import VirtualCamera
+from ringdic_node.clock import SystemClock
 
 pytest.importorskip("numba", reason="the simulated rig needs the extra 'virtual'")
 
@@ -17,10 +16,10 @@ def camera(name: str = "cam_02", **settings) -> VirtualCamera:
 
 
 def test_the_commanded_scene_is_rendered_for_this_camera():
-    from node_agent.virtual_rig.render import radiance
-    from node_agent.virtual_rig.rig import paper_rig
-    from node_agent.virtual_rig.scenes import scene
-    from node_agent.virtual_rig.sensor import expose
+    from ringdic_node.virtual_rig.render import radiance
+    from ringdic_node.virtual_rig.rig import paper_rig
+    from ringdic_node.virtual_rig.scenes import scene
+    from ringdic_node.virtual_rig.sensor import expose
 
     seen = camera()
     lens = paper_rig(cameras=12, scale=0.05, seed=3).cameras[1]

@@ -7,8 +7,7 @@ import json
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from node_agent.wire import (
+from ringdic_node.wire import (
     IMAGE_LIMIT,
     NETWORK,
     Ack,

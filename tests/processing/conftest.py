@@ -5,15 +5,14 @@ from pathlib import Path
 
 import cv2
 import pytest
-
-from controller.importing import import_folder
-from node_agent.virtual_rig.render import render
-from node_agent.virtual_rig.rig import VirtualRig, paper_rig
-from node_agent.virtual_rig.scenes import scene
-from processing.ring import calibrate_ring
-from processing.session import read_session
-from processing.settings import CalibrationGroup
-from processing.tasks import kept
+from ringdic.calibration.rig import calibrate_ring
+from ringdic.session.folder import read_session
+from ringdic.settings import CalibrationGroup
+from ringdic.tasks import kept
+from ringdic_controller.archive.importing import import_folder
+from ringdic_node.virtual_rig.render import render
+from ringdic_node.virtual_rig.rig import VirtualRig, paper_rig
+from ringdic_node.virtual_rig.scenes import scene
 
 SCALE, STEPS = 0.2, 3
 

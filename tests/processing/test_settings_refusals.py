@@ -3,10 +3,9 @@
 from pathlib import Path
 
 import pytest
-
-from processing.correlation.settings import CorrelationSettings
-from processing.errors import InputError
-from processing.settings import Settings, load_settings
+from ringdic.correlation.settings import CorrelationSettings
+from ringdic.errors import InputError
+from ringdic.settings import Settings, load_settings
 
 
 def test_the_defaults_are_the_papers() -> None:

@@ -14,10 +14,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-
-from node_agent.virtual_rig.render import render
-from node_agent.virtual_rig.rig import VirtualRig, paper_rig
-from node_agent.virtual_rig.scenes import scene
+from ringdic_node.virtual_rig.render import render
+from ringdic_node.virtual_rig.rig import VirtualRig, paper_rig
+from ringdic_node.virtual_rig.scenes import scene
 
 BAD_INPUT, NOT_COMPUTABLE = 2, 3
 SCALE = 0.2

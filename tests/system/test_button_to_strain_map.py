@@ -8,16 +8,15 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
-
-from controller.demo.comparison import compare_with_truth
-from controller.demo.rig import Setting, check_alive, running_controller, running_nodes
-from controller.demo.run import settings_for
-from node_agent.virtual_rig.render import warm_up
-from node_agent.virtual_rig.rig import VirtualRig, paper_rig
-from node_agent.virtual_rig.scenes import Limb
-from processing.results import read_results
-from processing.rig import parse_rig
-from processing.session import newest_results
+from ringdic.results.results import read_results
+from ringdic.session.folder import newest_results
+from ringdic.session.rig import parse_rig
+from ringdic_controller.studies.demo.comparison import compare_with_truth
+from ringdic_controller.studies.demo.rig import Setting, check_alive, running_controller, running_nodes
+from ringdic_controller.studies.demo.run import settings_for
+from ringdic_node.virtual_rig.render import warm_up
+from ringdic_node.virtual_rig.rig import VirtualRig, paper_rig
+from ringdic_node.virtual_rig.scenes import Limb
 
 pytestmark = pytest.mark.browser
 

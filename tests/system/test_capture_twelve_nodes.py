@@ -17,14 +17,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from controller.archive import Archive, SessionWriter, verify
-from controller.capture import MS, SECOND, Timing
-from controller.rig import RigLink
-from controller.rounds import CaptureRefusedError
-from node_agent.cli import main as node_command
-from processing.errors import InputError
-from processing.session import read_session
+from ringdic.errors import InputError
+from ringdic.session.folder import read_session
+from ringdic_controller.archive.writer import Archive, SessionWriter, verify
+from ringdic_controller.rig.capture import MS, SECOND, Timing
+from ringdic_controller.rig.link import RigLink
+from ringdic_controller.rig.rounds import CaptureRefusedError
+from ringdic_node.cli import main as node_command
 
 RigToml = Callable[[str, Sequence[str]], str]
 WIDTH, HEIGHT = 640, 480
@@ -59,7 +58,7 @@ class Ring:
         )
         with open(self.folder / f"{camera}.log", "ab") as log:
             self.processes[camera] = subprocess.Popen(
-                [sys.executable, "-m", "node_agent.cli", "run", "--config", str(config)], stderr=log, stdout=log
+                [sys.executable, "-P", "-m", "ringdic_node", "run", "--config", str(config)], stderr=log, stdout=log
             )
 
     def kill(self, camera: str) -> None:
@@ -179,10 +178,10 @@ def test_a_node_killed_in_the_middle_of_a_capture(twelve: Ring, tmp_path: Path, 
 CONTROLLER = """
 import sys
 from pathlib import Path
-from controller.archive import Archive
-from controller.capture import MS, SECOND, Timing
-from controller.rig import RigLink
-from controller.rounds import CaptureRefusedError
+from ringdic_controller.archive.writer import Archive
+from ringdic_controller.rig.capture import MS, SECOND, Timing
+from ringdic_controller.rig.link import RigLink
+from ringdic_controller.rig.rounds import CaptureRefusedError
 
 root, endpoint = Path(sys.argv[1]), sys.argv[2]
 archive = Archive(root)

@@ -15,16 +15,15 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
-
-from node_agent.virtual_rig.render import radiance
-from node_agent.virtual_rig.rig import paper_rig
-from node_agent.virtual_rig.scenes import Cylinder, Specimen, Target
-from node_agent.virtual_rig.sensor import FULL_WELL, READ_NOISE, expose
-from processing.evaluation import Evaluated, evaluated
-from processing.report.hardware import camera_facts
-from processing.results import read_results
-from processing.rigid_motion import motion_to_reference
-from processing.session import newest_results, read_session
+from ringdic.report.hardware import camera_facts
+from ringdic.results.evaluation import Evaluated, evaluated
+from ringdic.results.results import read_results
+from ringdic.session.folder import newest_results, read_session
+from ringdic.strain.rigid_motion import motion_to_reference
+from ringdic_node.virtual_rig.render import radiance
+from ringdic_node.virtual_rig.rig import paper_rig
+from ringdic_node.virtual_rig.scenes import Cylinder, Specimen, Target
+from ringdic_node.virtual_rig.sensor import FULL_WELL, READ_NOISE, expose
 
 SWOLLEN, WINDOW, AT_REST = 1.02, 20.0, 3
 RADIUS = 57.0

@@ -21,18 +21,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-
-from node_agent.virtual_rig.render import render
-from node_agent.virtual_rig.rig import VirtualRig, paper_rig
-from node_agent.virtual_rig.scenes import scene
-from processing.pipeline import process_session
-from processing.results import Results, read_results
-from processing.settings import load_settings
-from processing.tasks import Executor, LocalExecutor, Ran, Task, Told, work_folder
+from ringdic.jobs.pipeline import process_session
+from ringdic.results.results import Results, read_results
+from ringdic.settings import load_settings
+from ringdic.tasks import Executor, LocalExecutor, Ran, Task, Told, work_folder
+from ringdic_node.virtual_rig.render import render
+from ringdic_node.virtual_rig.rig import VirtualRig, paper_rig
+from ringdic_node.virtual_rig.scenes import scene
 
 distributed = pytest.importorskip("distributed", reason="SKIPPED FOR WANT OF A LIBRARY: install the extra 'cluster'")
-from processing.cluster import ClusterExecutor  # noqa: E402 - after the check above
-from processing.errors import ComputationError, InputError  # noqa: E402
+from ringdic.errors import ComputationError, InputError  # noqa: E402
+from ringdic.jobs.cluster import ClusterExecutor  # noqa: E402 - after the check above
 
 SCALE = 0.2
 STEPS = 4  # with the reference
@@ -45,7 +44,7 @@ class Worker:
     """A worker process."""
 
     def __init__(self, address: str, name: str, folder: Path, path: Path | None = None) -> None:
-        environment = {**os.environ, "PYTHONPATH": str(path or Path.cwd())}
+        environment = os.environ if path is None else {**os.environ, "PYTHONPATH": str(path)}
         command = [sys.executable, "-m", "dask", "worker", address, "--no-nanny", "--nthreads", "1", "--name", name]
         local = ["--no-dashboard", "--local-directory", str(folder), "--death-timeout", "60"]
         self.name = name
@@ -246,7 +245,7 @@ def test_a_worker_killed_in_the_middle_costs_only_its_tasks(
 
 def test_a_job_whose_driver_was_killed_makes_only_what_is_missing(session: Path, local: Results, crew: str) -> None:
     options = [each for name in SETTINGS for each in ("--set", name)]
-    command = [sys.executable, "-m", "controller", "process", str(session), *options, "--cluster", crew]
+    command = [sys.executable, "-P", "-m", "ringdic_controller", "process", str(session), *options, "--cluster", crew]
     driver = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     outputs = work_folder(session)
     try:
@@ -271,8 +270,8 @@ def test_a_worker_with_another_version_is_refused_by_name_and_left_out(
     session: Path, local: Results, crew: str, tmp_path: Path, caplog
 ) -> None:
     other = tmp_path / "other"
-    shutil.copytree(Path.cwd() / "processing", other / "processing")
-    with open(other / "processing" / "errors.py", "a", encoding="utf-8") as file:
+    shutil.copytree(Path.cwd() / "processing" / "ringdic", other / "ringdic")
+    with open(other / "ringdic" / "errors.py", "a", encoding="utf-8") as file:
         file.write("\n# another version\n")
     executor = ClusterExecutor(crew)
     executor.check(session)

@@ -3,12 +3,11 @@
 from pathlib import Path
 
 import numpy as np
-
-from controller.bench.live import bench_live, live_ratios
-from controller.truth import errors
-from node_agent.virtual_rig.scenes import Limb
-from processing.results import read_results
-from processing.session import live_results
+from ringdic.results.results import read_results
+from ringdic.session.folder import live_results
+from ringdic_controller.studies.bench.live import bench_live, live_ratios
+from ringdic_controller.studies.truth import errors
+from ringdic_node.virtual_rig.scenes import Limb
 
 STEPS, INTERVAL = 3, 2.0
 LONG = 60.0  # seconds; a loaded machine

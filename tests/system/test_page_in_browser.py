@@ -21,12 +21,11 @@ import numpy as np
 import pytest
 import uvicorn
 from playwright.sync_api import Browser, Page, expect
-
-from controller.app import STATIC, create_app
-from controller.children import Command, Processing, WarmChild
-from controller.config import ControllerConfig
-from controller.desk import Desk
-from controller.service import SHUTDOWN_LIMIT, free_endpoint, open_desk
+from ringdic_controller.jobs.children import Command, Processing, WarmChild
+from ringdic_controller.service.app import STATIC, create_app
+from ringdic_controller.service.config import ControllerConfig
+from ringdic_controller.service.desk import Desk
+from ringdic_controller.service.service import SHUTDOWN_LIMIT, free_endpoint, open_desk
 
 pytestmark = pytest.mark.browser
 
@@ -53,7 +52,7 @@ class Station:
             f'rig = "page-ring"\nid = "{camera}"\ncontroller = "{self.config.endpoint}"\n'
             f'spool = "spool-{camera}"\ncamera = "pattern"\nstatus_s = 0.5\n[pattern]\nwidth = 120\nheight = 160\n'
         )
-        command = [sys.executable, "-m", "node_agent.cli", "run", "--config", str(config)]
+        command = [sys.executable, "-P", "-m", "ringdic_node", "run", "--config", str(config)]
         with (self.folder / f"node-{camera}.log").open("ab") as log:
             self.nodes[camera] = subprocess.Popen(command, stdout=log, stderr=log)
 

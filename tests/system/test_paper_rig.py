@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ringdic.results.results import Results, read_results
+from ringdic.session.folder import newest_results
+from ringdic.strain.rigid_motion import kabsch
 from scipy.optimize import least_squares
-
-from processing.results import Results, read_results
-from processing.rigid_motion import kabsch
-from processing.session import newest_results
 
 #: As in the sample: Ncorr's radius 21 px and spacing 11 px, which is a step of 12.
 SUBSETS = ("correlation.radius_px=21", "correlation.step_px=12")

@@ -10,12 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from ringdic.mesh.topology import holes, inconsistent_edges, is_closed_tube, non_manifold_vertices, overlap_area
+from ringdic.results.results import Results, read_results
+from ringdic.session.folder import newest_results
+from ringdic.strain.deformation import deformation
 from scipy.interpolate import RectBivariateSpline
-
-from processing.deformation import deformation
-from processing.results import Results, read_results
-from processing.session import newest_results
-from processing.topology import holes, inconsistent_edges, is_closed_tube, non_manifold_vertices, overlap_area
 
 TURN = 2 * np.pi
 

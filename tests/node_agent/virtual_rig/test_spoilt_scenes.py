@@ -3,11 +3,10 @@
 import cv2
 import numpy as np
 import pytest
-
-from node_agent.virtual_rig.render import radiance
-from node_agent.virtual_rig.rig import paper_rig
-from node_agent.virtual_rig.scenes import Bar, Cylinder, Damage, Limb, Patch, Specimen, Target
-from node_agent.virtual_rig.sensor import POINT_SPREAD
+from ringdic_node.virtual_rig.render import radiance
+from ringdic_node.virtual_rig.rig import paper_rig
+from ringdic_node.virtual_rig.scenes import Bar, Cylinder, Damage, Limb, Patch, Specimen, Target
+from ringdic_node.virtual_rig.sensor import POINT_SPREAD
 
 CAMERA = paper_rig(12, 0.25, seed=3).cameras[1]
 LIMB = Limb()

@@ -5,16 +5,15 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from ringdic.correlation import CorrelationSettings, correlate, prepare_current, prepare_reference
+from ringdic_node.virtual_rig.body import approach
+from ringdic_node.virtual_rig.lens import VirtualCamera, distort, ideal
+from ringdic_node.virtual_rig.render import radiance, render
+from ringdic_node.virtual_rig.rig import paper_rig, write_truth
+from ringdic_node.virtual_rig.scenes import Cylinder, Limb, Specimen, Target, scene
+from ringdic_node.virtual_rig.sensor import FULL_WELL, READ_NOISE, encode, expose
+from ringdic_node.virtual_rig.texture import speckle
 from scipy.stats import norm
-
-from node_agent.virtual_rig.body import approach
-from node_agent.virtual_rig.lens import VirtualCamera, distort, ideal
-from node_agent.virtual_rig.render import radiance, render
-from node_agent.virtual_rig.rig import paper_rig, write_truth
-from node_agent.virtual_rig.scenes import Cylinder, Limb, Specimen, Target, scene
-from node_agent.virtual_rig.sensor import FULL_WELL, READ_NOISE, encode, expose
-from node_agent.virtual_rig.texture import speckle
-from processing.correlation import CorrelationSettings, correlate, prepare_current, prepare_reference
 
 SCALE = 0.25
 RIG = paper_rig(12, SCALE, seed=3)

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-
-from processing.calibration.board import board_points, find_corners
-from processing.rig import Board
+from ringdic.calibration.board import board_points, find_corners
+from ringdic.session.rig import Board
 
 BOARD = Board("checkerboard", (15, 20), 10.0)
 

@@ -10,18 +10,17 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from ringdic.calibration import dlt
+from ringdic.calibration.bundle import BundleFit, TargetPrior, adjust_ring, centroid_shift
+from ringdic.calibration.camera_calibration import CameraCalibration
+from ringdic.calibration.intrinsics import IntrinsicsFit, calibrate_intrinsics
+from ringdic.calibration.patch import Sheet, Views, nodes, patch_jacobians, project_patches, sheet_points
+from ringdic.calibration.target import DotObservations, dot_points
+from ringdic.errors import ComputationError
+from ringdic.geometry.camera import Camera, Intrinsics
+from ringdic.geometry.triangulation import triangulate
+from ringdic.session.rig import Target
 from scipy.optimize import least_squares
-
-from processing.calibration import dlt
-from processing.calibration.bundle import BundleFit, TargetPrior, adjust_ring, centroid_shift
-from processing.calibration.camera_calibration import CameraCalibration
-from processing.calibration.intrinsics import IntrinsicsFit, calibrate_intrinsics
-from processing.calibration.patch import Sheet, Views, nodes, patch_jacobians, project_patches, sheet_points
-from processing.calibration.target import DotObservations, dot_points
-from processing.camera import Camera, Intrinsics
-from processing.errors import ComputationError
-from processing.rig import Target
-from processing.triangulation import triangulate
 
 TARGET = Target("dot-cylinder", 57.0, 20, 12.0, 10.0, 30, 12.0, 4.0)
 SIZE = (2464, 3280)

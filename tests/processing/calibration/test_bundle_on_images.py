@@ -10,19 +10,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from ringdic.calibration.bundle import adjust_ring, centroid_shift
+from ringdic.calibration.camera_calibration import CameraCalibration, calibrate_camera
+from ringdic.calibration.dots import find_dots
+from ringdic.calibration.rig import calibrate_ring, control_points
+from ringdic.calibration.target import DotObservations, identify
+from ringdic.errors import InputError
+from ringdic.geometry.camera import Camera, Intrinsics
+from ringdic.geometry.triangulation import reprojection_residuals, triangulate
+from ringdic.session.folder import Capture, Session
+from ringdic.session.rig import Rig, RigCamera, read_rig
+from ringdic.settings import CalibrationGroup
 from scipy.optimize import least_squares
-
-from processing.calibration.bundle import adjust_ring, centroid_shift
-from processing.calibration.camera_calibration import CameraCalibration, calibrate_camera
-from processing.calibration.dots import find_dots
-from processing.calibration.target import DotObservations, identify
-from processing.camera import Camera, Intrinsics
-from processing.errors import InputError
-from processing.rig import Rig, RigCamera, read_rig
-from processing.ring import calibrate_ring, control_points
-from processing.session import Capture, Session
-from processing.settings import CalibrationGroup
-from processing.triangulation import reprojection_residuals, triangulate
 
 MOVED = np.array([5.0, 0.0, 0.0])
 

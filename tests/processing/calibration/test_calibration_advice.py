@@ -5,16 +5,15 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-
-from processing.calibration.advice import camera_advice, pair_advice
-from processing.calibration.camera_calibration import CameraCalibration
-from processing.calibration.intrinsics import calibrate_intrinsics
-from processing.calibration.parameters import Parameters
-from processing.calibration.quality import camera_quality, pair_quality
-from processing.calibration.target import DotObservations, dot_points
-from processing.camera import Camera, Intrinsics
-from processing.errors import ComputationError
-from processing.rig import Target
+from ringdic.calibration.advice import camera_advice, pair_advice
+from ringdic.calibration.camera_calibration import CameraCalibration
+from ringdic.calibration.intrinsics import calibrate_intrinsics
+from ringdic.calibration.parameters import Parameters
+from ringdic.calibration.quality import camera_quality, pair_quality
+from ringdic.calibration.target import DotObservations, dot_points
+from ringdic.errors import ComputationError
+from ringdic.geometry.camera import Camera, Intrinsics
+from ringdic.session.rig import Target
 
 TARGET = Target("dot-cylinder", 57.0, 20, 12.0, 10.0, 30, 12.0, 4.0)
 SIZE = (1232, 1640)

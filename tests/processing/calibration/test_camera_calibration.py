@@ -7,12 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-
-from processing.calibration.camera_calibration import CameraCalibration, calibrate_camera
-from processing.calibration.quality import camera_quality, reconstruction_error
-from processing.camera import Camera, Intrinsics
-from processing.errors import ComputationError, InputError
-from processing.rig import Rig, RigCamera, read_rig
+from ringdic.calibration.camera_calibration import CameraCalibration, calibrate_camera
+from ringdic.calibration.quality import camera_quality, reconstruction_error
+from ringdic.errors import ComputationError, InputError
+from ringdic.geometry.camera import Camera, Intrinsics
+from ringdic.session.rig import Rig, RigCamera, read_rig
 
 
 def grey(path: Path) -> np.ndarray:

@@ -3,9 +3,8 @@
 import cv2
 import numpy as np
 import pytest
-
-from processing.calibration.parameters import PER_CAMERA, Parameters, projection_jacobians
-from processing.camera import Camera, Intrinsics
+from ringdic.calibration.parameters import PER_CAMERA, Parameters, projection_jacobians
+from ringdic.geometry.camera import Camera, Intrinsics
 
 K = np.array([[2611.7, -1.37, 1246.5], [0, 2615.4, 1627.7], [0, 0, 1]])
 LENS = Intrinsics(K, np.array([0.179, -0.295, 1.5e-4, 6.8e-4, -0.05]), (2464, 3280))

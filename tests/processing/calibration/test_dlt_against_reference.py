@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-
-from processing.calibration import dlt
-from processing.camera import Camera, Intrinsics
-from processing.errors import ComputationError
+from ringdic.calibration import dlt
+from ringdic.errors import ComputationError
+from ringdic.geometry.camera import Camera, Intrinsics
 
 
 def cylinder(columns: int = 8) -> np.ndarray:

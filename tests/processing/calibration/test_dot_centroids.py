@@ -3,9 +3,8 @@
 import cv2
 import numpy as np
 import pytest
-
-from processing.calibration.dots import find_dots
-from processing.rig import Target
+from ringdic.calibration.dots import find_dots
+from ringdic.session.rig import Target
 
 TARGET = Target("dot-cylinder", 57.0, 20, 12.0, 10.0, 30, 12.0, 4.0)
 

@@ -5,15 +5,14 @@ import json
 import cv2
 import numpy as np
 import pytest
-
-from processing.calibration.intrinsics import (
+from ringdic.calibration.intrinsics import (
     IntrinsicsFit,
     calibrate_intrinsics,
     intrinsics_to_dict,
     read_intrinsics,
 )
-from processing.camera import Intrinsics
-from processing.errors import ComputationError, InputError
+from ringdic.errors import ComputationError, InputError
+from ringdic.geometry.camera import Intrinsics
 
 SIZE = (1232, 1640)
 LENS = Intrinsics(

@@ -3,11 +3,10 @@
 import cv2
 import numpy as np
 import pytest
-
-from processing.calibration.coverage import coverage, residual_distortion
-from processing.calibration.intrinsics import IntrinsicsFit, calibrate_intrinsics
-from processing.calibration.lens_model import LensModel, independent
-from processing.camera import Intrinsics
+from ringdic.calibration.coverage import coverage, residual_distortion
+from ringdic.calibration.intrinsics import IntrinsicsFit, calibrate_intrinsics
+from ringdic.calibration.lens_model import LensModel, independent
+from ringdic.geometry.camera import Intrinsics
 
 SIZE = (1232, 1640)
 BOARD = np.stack(np.meshgrid(np.arange(14) * 10.0, np.arange(19) * 10.0), axis=-1).reshape(-1, 2)

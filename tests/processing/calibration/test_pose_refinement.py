@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
-
-from processing.calibration.parameters import LENS, Parameters
-from processing.calibration.refinement import loose_covariance, refine_poses
-from processing.camera import Camera, Intrinsics
-from processing.errors import ComputationError
-from processing.rigid_motion import motion_to_reference
-from processing.steadied import SteadiedCameras
-from processing.triangulation import triangulate
+from ringdic.calibration.moving_cameras import SteadiedCameras
+from ringdic.calibration.parameters import LENS, Parameters
+from ringdic.calibration.refinement import loose_covariance, refine_poses
+from ringdic.errors import ComputationError
+from ringdic.geometry.camera import Camera, Intrinsics
+from ringdic.geometry.triangulation import triangulate
+from ringdic.strain.rigid_motion import motion_to_reference
 
 SIZE = (2464, 3280)
 LENS_OF_ALL = Intrinsics(

@@ -7,13 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-
-from processing.calibration.dots import Dots, find_dots
-from processing.calibration.labels import printed, read_labels
-from processing.calibration.survey import Sight, sight, survey
-from processing.calibration.target import identify, possible_azimuths
-from processing.errors import InputError
-from processing.rig import Rig, RigCamera, read_rig
+from ringdic.calibration.dots import Dots, find_dots
+from ringdic.calibration.labels import printed, read_labels
+from ringdic.calibration.survey import Sight, sight, survey
+from ringdic.calibration.target import identify, possible_azimuths
+from ringdic.errors import InputError
+from ringdic.session.rig import Rig, RigCamera, read_rig
 
 
 def grey(path: Path) -> np.ndarray:

@@ -7,13 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-
-from processing.calibration import dlt
-from processing.calibration.dots import Dots, find_dots
-from processing.calibration.target import DotObservations, dot_points, identify
-from processing.camera import Camera
-from processing.errors import InputError
-from processing.rig import RigCamera, Target, read_rig
+from ringdic.calibration import dlt
+from ringdic.calibration.dots import Dots, find_dots
+from ringdic.calibration.target import DotObservations, dot_points, identify
+from ringdic.errors import InputError
+from ringdic.geometry.camera import Camera
+from ringdic.session.rig import RigCamera, Target, read_rig
 
 REAL_TARGET = Target("dot-cylinder", 57.0, 20, 12.0, 10.0, 14, 12.0, 4.0)
 

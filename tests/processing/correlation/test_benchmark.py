@@ -3,9 +3,8 @@
 import json
 
 import pytest
-
-from processing.correlation import bench
-from processing.errors import InputError
+from ringdic.correlation import bench
+from ringdic.errors import InputError
 
 
 @pytest.fixture

@@ -3,10 +3,9 @@
 import cv2
 import numpy as np
 import pytest
-
-from processing.correlation import CorrelationSettings
-from processing.correlation.command import correlate_files
-from processing.errors import ComputationError, InputError
+from ringdic.correlation import CorrelationSettings
+from ringdic.correlation.command import correlate_files
+from ringdic.errors import ComputationError, InputError
 
 SETTINGS = CorrelationSettings(radius=8, step=8, tolerance=1e-5)
 

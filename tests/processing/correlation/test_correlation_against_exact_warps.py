@@ -3,8 +3,7 @@
 import numba
 import numpy as np
 import pytest
-
-from processing.correlation import (
+from ringdic.correlation import (
     CorrelationSettings,
     Status,
     correlate,

@@ -13,8 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-
-from processing.correlation import (
+from ringdic.correlation import (
     Correlation,
     CorrelationSettings,
     Status,
@@ -23,7 +22,7 @@ from processing.correlation import (
     prepare_current,
     prepare_reference,
 )
-from processing.images import read_gray
+from ringdic.session.images import read_gray
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,9 @@
 import numba as nb
 import numpy as np
 import pytest
-from scipy import ndimage
-
-from processing.correlation.interpolation import SCATTERED, WIDE, make_interpolation
-from processing.correlation.kernels import _place
-from processing.correlation.lanes import (
+from ringdic.correlation.interpolation import SCATTERED, WIDE, make_interpolation
+from ringdic.correlation.kernels import _place
+from ringdic.correlation.lanes import (
     BITS,
     LANES,
     WINDOW,
@@ -23,7 +21,8 @@ from processing.correlation.lanes import (
     store,
     total,
 )
-from processing.correlation.spline import PAD, coefficients
+from ringdic.correlation.spline import PAD, coefficients
+from scipy import ndimage
 
 _U = np.uint64
 _SPLINES = {3: make_interpolation(False), 5: make_interpolation(True)}

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-
-from processing.correlation.quadratic import LowerQuartiles, Neighbourhoods
+from ringdic.correlation.quadratic import LowerQuartiles, Neighbourhoods
 
 GRADIENT = np.array([[0.3, -0.2], [0.05, 0.4]])
 CURVATURE = np.array([[4e-3, -1e-3, 2e-3], [-3e-3, 5e-4, 1e-3]])

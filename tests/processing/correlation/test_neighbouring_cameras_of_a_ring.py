@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from processing.camera import Intrinsics
-from processing.correlation import CorrelationSettings, correlate, prepare_current, prepare_reference
-from processing.images import read_gray
+from ringdic.correlation import CorrelationSettings, correlate, prepare_current, prepare_reference
+from ringdic.geometry.camera import Intrinsics
+from ringdic.session.images import read_gray
 
 BORDER = 10.0  # mm of the speckled band left out at either end
 

@@ -1,9 +1,8 @@
 """Neighbours on a grid and among scattered points, and what they say about one another."""
 
 import numpy as np
+from ringdic.correlation.neighbours import inconsistent, local_fit, neighbours
 from scipy.spatial import cKDTree
-
-from processing.correlation.neighbours import inconsistent, local_fit, neighbours
 
 STEP = 10.0
 

@@ -4,10 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from processing.correlation import CorrelationSettings, correlate, grid, prepare_current, prepare_reference
-from processing.correlation.command import correlate_files
-from processing.images import read_gray, read_mask
+from ringdic.correlation import CorrelationSettings, correlate, grid, prepare_current, prepare_reference
+from ringdic.correlation.command import correlate_files
+from ringdic.session.images import read_gray, read_mask
 
 SETTINGS = CorrelationSettings(radius=21, step=12, order=1, subset="circle")
 LIMITS = {"201": 0.015, "202": 0.08}  # px, 95 % of the points

@@ -3,8 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-
-from processing.correlation import Row, prepare_current, prepare_reference, search_hypotheses, search_row
+from ringdic.correlation import Row, prepare_current, prepare_reference, search_hypotheses, search_row
 
 RADIUS, SIZE = 12, 220
 

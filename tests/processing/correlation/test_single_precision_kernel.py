@@ -8,10 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-
-from processing.correlation import CorrelationSettings, correlate, grid, prepare_current, prepare_reference
-from processing.correlation.refinement import refine
-from processing.correlation.spline import PAD, coefficients, gradients
+from ringdic.correlation import CorrelationSettings, correlate, grid, prepare_current, prepare_reference
+from ringdic.correlation.refinement import refine
+from ringdic.correlation.spline import PAD, coefficients, gradients
 
 _SPEC = importlib.util.spec_from_file_location("double_precision", Path(__file__).with_name("double_precision.py"))
 double_precision = importlib.util.module_from_spec(_SPEC)

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
+from ringdic.correlation import grid
+from ringdic.correlation.spline import PAD, coefficients, gradients
+from ringdic.correlation.warps import compose_inverse, compose_inverse_affine
 from scipy import ndimage
-
-from processing.correlation import grid
-from processing.correlation.spline import PAD, coefficients, gradients
-from processing.correlation.warps import compose_inverse, compose_inverse_affine
 
 
 @pytest.mark.parametrize("degree", [3, 5])

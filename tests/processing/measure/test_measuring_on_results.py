@@ -6,21 +6,20 @@ import json
 
 import numpy as np
 import pytest
-
-from processing.camera import Camera
-from processing.errors import ComputationError, InputError
-from processing.evaluation import Evaluated, Evaluation
-from processing.measure.extensometer import extensometer
-from processing.measure.path import shortest_path
-from processing.measure.place import Place, nearest_place, place_of_face, place_of_vertex
-from processing.measure.region import Ball, Box, Everything, Listed, Patch, region_statistics, statistics
-from processing.measure.section import Cut, crossings, section
-from processing.measure.series import time_series
-from processing.measure.table import Table
-from processing.measure.window_study import gauge, window_study
-from processing.mesh import Mesh
-from processing.results import Results
-from processing.strain_window import strain_window
+from ringdic.errors import ComputationError, InputError
+from ringdic.geometry.camera import Camera
+from ringdic.measure.extensometer import extensometer
+from ringdic.measure.path import shortest_path
+from ringdic.measure.place import Place, nearest_place, place_of_face, place_of_vertex
+from ringdic.measure.region import Ball, Box, Everything, Listed, Patch, region_statistics, statistics
+from ringdic.measure.section import Cut, crossings, section
+from ringdic.measure.series import time_series
+from ringdic.measure.table import Table
+from ringdic.measure.window_study import gauge, window_study
+from ringdic.mesh.mesh import Mesh
+from ringdic.results.evaluation import Evaluated, Evaluation
+from ringdic.results.results import Results
+from ringdic.strain.window import strain_window
 
 RADIUS, AROUND, ALONG = 50.0, 120, 31
 STRETCH = (1.0, 1.1, 1.21)  # along z

@@ -4,30 +4,29 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-
-from node_agent.virtual_rig.render import render
-from node_agent.virtual_rig.rig import paper_rig
-from node_agent.virtual_rig.scenes.specimen import Limb, Specimen
-from processing.camera import Camera, Intrinsics
-from processing.correlation import CorrelationSettings
-from processing.deformation import deformation
-from processing.errors import ComputationError
-from processing.mesh import Mesh
-from processing.multiview.agreement import triangulate_agreeing
-from processing.multiview.lattice import Lattice, Pieces, fit_pieces
-from processing.multiview.motion import measure_motion
-from processing.multiview.shape import reference_shape
-from processing.multiview.tracking import Tracking
-from processing.multiview.tube import lattice_faces
-from processing.multiview.views import seen
-from processing.multiview.warps import surface_stencil, warps_to
-from processing.proxy import on_cylinder
-from processing.results import read_results
-from processing.results_writer import write_results
-from processing.ring_surface import ring_surface
-from processing.settings import BEST, CorrelationGroup
-from processing.sweep import Search
-from processing.topology import holes, inconsistent_edges, is_closed_tube, non_manifold_vertices
+from ringdic.correlation import CorrelationSettings
+from ringdic.errors import ComputationError
+from ringdic.geometry.camera import Camera, Intrinsics
+from ringdic.mesh.mesh import Mesh
+from ringdic.mesh.topology import holes, inconsistent_edges, is_closed_tube, non_manifold_vertices
+from ringdic.multiview.agreement import triangulate_agreeing
+from ringdic.multiview.lattice import Lattice, Pieces, fit_pieces
+from ringdic.multiview.motion import measure_motion
+from ringdic.multiview.shape import reference_shape
+from ringdic.multiview.surface import ring_surface
+from ringdic.multiview.tracking import Tracking
+from ringdic.multiview.tube import lattice_faces
+from ringdic.multiview.views import seen
+from ringdic.multiview.warps import surface_stencil, warps_to
+from ringdic.results.results import read_results
+from ringdic.results.writer import write_results
+from ringdic.settings import BEST, CorrelationGroup
+from ringdic.strain.deformation import deformation
+from ringdic.sweep.proxies import on_cylinder
+from ringdic.sweep.sweep import Search
+from ringdic_node.virtual_rig.render import render
+from ringdic_node.virtual_rig.rig import paper_rig
+from ringdic_node.virtual_rig.scenes.specimen import Limb, Specimen
 
 SCALE = 0.25
 LATTICE = Lattice(radius=57.0, columns=240, z=np.arange(10.0, 230.1, 1.5))

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-
-from processing.multiview.lattice import TURN, Lattice, evaluate, fit_pieces, robust_pieces
+from ringdic.multiview.lattice import TURN, Lattice, evaluate, fit_pieces, robust_pieces
 
 LATTICE = Lattice(radius=50.0, columns=160, z=np.arange(0.0, 121.0, 2.0))
 ANGLE, HEIGHT = 1.0, 60.0

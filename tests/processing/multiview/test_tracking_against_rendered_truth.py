@@ -6,15 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from node_agent.virtual_rig.render import render
-from node_agent.virtual_rig.rig import paper_rig
-from node_agent.virtual_rig.scenes.damage import Bar, Damage, Patch
-from node_agent.virtual_rig.scenes.specimen import Cylinder, Limb, Specimen
-from processing.camera import Camera, Intrinsics
-from processing.correlation import CorrelationSettings, Status
-from processing.images import read_gray
-from processing.multiview.tracking import Track, Tracking, track
+from ringdic.correlation import CorrelationSettings, Status
+from ringdic.geometry.camera import Camera, Intrinsics
+from ringdic.multiview.tracking import Track, Tracking, track
+from ringdic.session.images import read_gray
+from ringdic_node.virtual_rig.render import render
+from ringdic_node.virtual_rig.rig import paper_rig
+from ringdic_node.virtual_rig.scenes.damage import Bar, Damage, Patch
+from ringdic_node.virtual_rig.scenes.specimen import Cylinder, Limb, Specimen
 
 ONE_PASS, SECOND, TWO_PASS = Tracking(two_pass=False), Tracking(two_pass=False, order=2), Tracking()
 

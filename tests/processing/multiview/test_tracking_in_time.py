@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-
-from processing.correlation import CorrelationSettings, Status
-from processing.errors import InputError
-from processing.multiview.tracking import Track, Tracking, TrackState, at_reference, track, track_block
+from ringdic.correlation import CorrelationSettings, Status
+from ringdic.errors import InputError
+from ringdic.multiview.tracking import Track, Tracking, TrackState, at_reference, track, track_block
 
 SIZE = 260
 SETTINGS = CorrelationSettings(radius=12, step=10)

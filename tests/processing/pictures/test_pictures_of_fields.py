@@ -6,17 +6,16 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-
-from processing.camera import Camera, Intrinsics
-from processing.errors import InputError
-from processing.evaluation import Evaluated
-from processing.mesh import Mesh
-from processing.pictures.animation import surface_frames, write_animation
-from processing.pictures.overlay import camera_of, overlay
-from processing.pictures.painter import paint
-from processing.pictures.scale import Scale, scale_of
-from processing.pictures.views import from_side, mean_azimuth, through_camera, unrolled
-from processing.results import Results
+from ringdic.errors import InputError
+from ringdic.geometry.camera import Camera, Intrinsics
+from ringdic.mesh.mesh import Mesh
+from ringdic.pictures.animation import surface_frames, write_animation
+from ringdic.pictures.overlay import camera_of, overlay
+from ringdic.pictures.painter import paint
+from ringdic.pictures.scale import Scale, scale_of
+from ringdic.pictures.views import from_side, mean_azimuth, through_camera, unrolled
+from ringdic.results.evaluation import Evaluated
+from ringdic.results.results import Results
 
 RADIUS, AROUND, ALONG = 50.0, 60, 21
 STRETCH = (1.0, 1.1, 1.2)  # along z

@@ -8,14 +8,13 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
-
-from processing.camera import Camera, Intrinsics
-from processing.errors import InputError
-from processing.evaluation import evaluated
-from processing.measure.region import Everything, region_statistics
-from processing.report import write_report
-from processing.results import Results
-from processing.results_writer import write_results
+from ringdic.errors import InputError
+from ringdic.geometry.camera import Camera, Intrinsics
+from ringdic.measure.region import Everything, region_statistics
+from ringdic.report import write_report
+from ringdic.results.evaluation import evaluated
+from ringdic.results.results import Results
+from ringdic.results.writer import write_results
 
 RADIUS, AROUND, ALONG = 50.0, 60, 21
 STEPS = ("0001-specimen", "0002-specimen", "0003-specimen")

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-
-from processing.report.speckle import speckle_size
+from ringdic.report.speckle import speckle_size
 
 
 def disks(diameter: float, seed: int, noise: float) -> np.ndarray:

@@ -9,11 +9,10 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
-
-from processing.correlation.correlate import load_kernels
-from processing.errors import ComputationError, InputError
-from processing.settings import CorrelationGroup
-from processing.tasks import (
+from ringdic.correlation.correlate import load_kernels
+from ringdic.errors import ComputationError, InputError
+from ringdic.settings import CorrelationGroup
+from ringdic.tasks import (
     Arrays,
     LocalExecutor,
     Memory,

@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-
-from processing.calibration.parameters import PER_CAMERA, Parameters
-from processing.camera import Camera, Intrinsics
-from processing.deformation import deformation
-from processing.uncertainty.calibration import CameraCovariance, shares, sigma_of, stretch_sigma_by_cameras
-from processing.uncertainty.position import position_gain
-from processing.weighted_triangulation import triangulate_weighted
+from ringdic.calibration.parameters import PER_CAMERA, Parameters
+from ringdic.geometry.camera import Camera, Intrinsics
+from ringdic.geometry.weighted_triangulation import triangulate_weighted
+from ringdic.strain.deformation import deformation
+from ringdic.uncertainty.calibration import CameraCovariance, shares, sigma_of, stretch_sigma_by_cameras
+from ringdic.uncertainty.position import position_gain
 
 STEPS = np.array([1.0, 1.0, 0.5, 1.0, 1.0, 1e-3, 1e-2, 1e-4, 1e-4, 1e-2, 1e-4, 1e-4, 1e-4, 0.05, 0.05, 0.05])
 IDS = ("a", "b", "c")

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-
-from processing.uncertainty.noise import camera_noise, flat_noise, rest_noise
-from processing.uncertainty.texture import Texture, texture_map
+from ringdic.uncertainty.noise import camera_noise, flat_noise, rest_noise
+from ringdic.uncertainty.texture import Texture, texture_map
 
 
 def blots(noise: float, seed: int = 0, size: int = 400) -> np.ndarray:

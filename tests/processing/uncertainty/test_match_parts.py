@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-
-from processing.correlation import CorrelationSettings, correlate, prepare_current, prepare_reference
-from processing.uncertainty.matches import MatchParts, match_parts
-from processing.uncertainty.texture import Texture, texture_map
+from ringdic.correlation import CorrelationSettings, correlate, prepare_current, prepare_reference
+from ringdic.uncertainty.matches import MatchParts, match_parts
+from ringdic.uncertainty.texture import Texture, texture_map
 
 SIZE = 170
 SPECKLES = np.random.default_rng(11).uniform(-20.0, SIZE + 20.0, (2, 420))

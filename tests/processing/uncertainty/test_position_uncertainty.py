@@ -1,16 +1,15 @@
 """How points scatter when their pixels do, against trials and against the triangulation's own derivatives."""
 
 import numpy as np
-
-from processing.camera import Camera
-from processing.uncertainty.position import (
+from ringdic.geometry.camera import Camera
+from ringdic.geometry.weighted_triangulation import triangulate_weighted
+from ringdic.uncertainty.position import (
     along_surface,
     covariance,
     position_gain,
     reference_covariance,
     step_covariance,
 )
-from processing.weighted_triangulation import triangulate_weighted
 
 SIZE = (2464, 3280)
 RADIUS = 57.0

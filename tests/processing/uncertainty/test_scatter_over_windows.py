@@ -4,11 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-
-from processing.mesh import Mesh
-from processing.strain_window import strain_window
-from processing.uncertainty.strain import overlap
-from processing.uncertainty.window import window_scatter
+from ringdic.mesh.mesh import Mesh
+from ringdic.strain.window import strain_window
+from ringdic.uncertainty.strain import overlap
+from ringdic.uncertainty.window import window_scatter
 
 RADIUS_PX, PX_A_MM = 20, 10.0
 REACH = (2 * RADIUS_PX + 1) / PX_A_MM

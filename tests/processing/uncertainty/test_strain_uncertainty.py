@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-
-from processing.deformation import deformation
-from processing.uncertainty.strain import corners_alike, overlap, stretch_sigma
+from ringdic.strain.deformation import deformation
+from ringdic.uncertainty.strain import corners_alike, overlap, stretch_sigma
 
 
 def disc(radius: int) -> tuple[np.ndarray, np.ndarray]:

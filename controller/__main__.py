@@ -1,5 +1,0 @@
-"""``python -m controller …`` is ``ringdic …``."""
-
-from controller.cli import main
-
-main()

@@ -1,0 +1,5 @@
+"""``python -m ringdic_controller …`` is ``ringdic …``."""
+
+from ringdic_controller.cli.app import main
+
+main()

@@ -1,0 +1,1 @@
+"""The sessions on the disk, and the catalogue of them."""

@@ -1,0 +1,1 @@
+"""Processing jobs and the child processes that carry them out."""

@@ -1,0 +1,472 @@
+"""The controller's capture round as a state machine: an event comes in, actions go out. Standard library only.
+
+::
+
+    arming       SendArm until every expected camera has answered or the arm deadline passes
+                 → refused     a camera is not armed and the operator did not override
+                 → triggering  OpenCapture (the record exists before any camera fires), SendTrigger
+    triggering   SendTrigger again to whoever has not answered, until the planned moment
+                 → collecting  the moment has passed
+    collecting   images are pushed by the nodes; after a while AskInventory and FetchImage pull what is missing
+                 → closed      nothing is pending, or whoever is pending has gone, or the deadline passed
+
+Every expected camera ends ok, late or failed(reason). An image that arrives after the close is archived all the
+same and turns the camera's status to late; `judge` decides about every image alone from the archive's record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from ringdic_node.wire import (
+    ArmReply,
+    CaptureKey,
+    Failure,
+    Inventory,
+    Manifest,
+    TriggerReply,
+)
+
+MS = 1_000_000
+SECOND = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Waits of a round, ns: `lead` from the trigger's sending to its moment, `collect` from there to the deadline."""
+
+    arm: int = 15 * SECOND
+    arm_retry: int = 3 * SECOND
+    lead: int = 400 * MS
+    trigger_retry: int = 80 * MS
+    pull_after: int = 3 * SECOND
+    pull_every: int = 3 * SECOND
+    collect: int = 60 * SECOND
+    gone_grace: int = 2 * SECOND
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value <= 0:
+                raise ValueError(f"the round's wait '{name}' must be positive, not {value} ns")
+
+
+# Events ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ArmAnswered:
+    reply: ArmReply
+
+
+@dataclass(frozen=True)
+class CaptureOpened:
+    """The archive has made the capture's folder and record."""
+
+    key: CaptureKey
+
+
+@dataclass(frozen=True)
+class TriggerAnswered:
+    reply: TriggerReply
+
+
+@dataclass(frozen=True)
+class ImageArchived:
+    manifest: Manifest
+
+
+@dataclass(frozen=True)
+class FailureReported:
+    failure: Failure
+
+
+@dataclass(frozen=True)
+class InventoryAnswered:
+    inventory: Inventory
+
+
+@dataclass(frozen=True)
+class NodeGone:
+    camera: str
+
+
+@dataclass(frozen=True)
+class NodeBack:
+    camera: str
+
+
+@dataclass(frozen=True)
+class Tick:
+    """Time has passed."""
+
+
+Event = (
+    ArmAnswered
+    | CaptureOpened
+    | TriggerAnswered
+    | ImageArchived
+    | FailureReported
+    | InventoryAnswered
+    | NodeGone
+    | NodeBack
+    | Tick
+)
+
+
+# Actions -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SendArm:
+    cameras: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class OpenCapture:
+    """Make the record; answer with CaptureOpened. `unarmed` tells why cameras will not take part."""
+
+    fire_at_ns: int
+    unarmed: dict[str, str]
+
+
+@dataclass(frozen=True)
+class SendTrigger:
+    cameras: tuple[str, ...]
+    key: CaptureKey
+
+
+@dataclass(frozen=True)
+class AskInventory:
+    cameras: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class FetchImage:
+    manifest: Manifest
+
+
+@dataclass(frozen=True)
+class NoteOutcome:
+    """A camera's outcome changed: tell whoever watches."""
+
+    camera: str
+    outcome: Outcome
+
+
+@dataclass(frozen=True)
+class RefuseRound:
+    reasons: dict[str, str]
+
+
+@dataclass(frozen=True)
+class CloseCapture:
+    outcomes: dict[str, Outcome]
+
+
+Action = SendArm | OpenCapture | SendTrigger | AskInventory | FetchImage | NoteOutcome | RefuseRound | CloseCapture
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How one camera stands: pending, ok or failed, with the reason in words."""
+
+    status: str = "pending"
+    reason: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.status not in ("pending", "ok", "failed"):
+            raise ValueError(f"no such outcome: {self.status!r}")
+        if self.status == "failed" and not self.reason:
+            raise ValueError("a failed outcome must tell the reason")
+
+
+class CaptureRound:
+    """One capture of all cameras, from arming to the close.
+
+    Parameters
+    ----------
+    cameras
+        Ids of the expected cameras.
+    absent
+        Those of them that are not connected as the round begins.
+    override : bool
+        Fire although cameras are not armed; those end as failed with their reason.
+    now : int
+        ns, wall clock of the controller, as in every later call.
+    """
+
+    def __init__(
+        self,
+        cameras: Iterable[str],
+        timing: Timing,
+        now: int,
+        *,
+        absent: Iterable[str] = (),
+        override: bool = False,
+    ) -> None:
+        self.cameras = tuple(cameras)
+        if not self.cameras or len(set(self.cameras)) != len(self.cameras):
+            raise ValueError("a capture needs at least one camera and no camera twice")
+        self.timing = timing
+        self.state = "arming"
+        self.key: CaptureKey | None = None
+        self.outcomes = {camera: Outcome() for camera in self.cameras}
+        self._override = override
+        self._arm_deadline = now + timing.arm
+        self._next_send = now
+        self._armed: dict[str, ArmReply] = {}
+        self._refusals: dict[str, str] = {}
+        self._verdicts: dict[str, TriggerReply] = {}
+        self._gone = dict.fromkeys(absent, now)
+        self._next_pull = 0
+
+    @property
+    def over(self) -> bool:
+        return self.state in ("closed", "refused")
+
+    @property
+    def deadline(self) -> int | None:
+        """ns, when the round closes whatever happens; None before the capture is open."""
+        return None if self.key is None else self.key.fire_at_ns + self.timing.collect
+
+    @property
+    def pending(self) -> tuple[str, ...]:
+        return tuple(camera for camera in self.cameras if self.outcomes[camera].status == "pending")
+
+    def handle(self, event: Event, now: int) -> list[Action]:
+        """Take one event; return what to do, in order. After the end nothing is done any more."""
+        if self.over:
+            return []
+        actions: list[Action] = []
+        match event:
+            case ArmAnswered():
+                self._note_arm(event.reply)
+            case CaptureOpened():
+                actions += self._opened(event.key, now)
+            case TriggerAnswered():
+                actions += self._note_verdict(event.reply)
+            case ImageArchived():
+                if self._expects(event.manifest.node, event.manifest.key):
+                    actions += self._settle(event.manifest.node, Outcome("ok"))
+            case FailureReported():
+                actions += self._note_failure(event.failure)
+            case InventoryAnswered():
+                actions += self._note_inventory(event.inventory, now)
+            case NodeGone():
+                self._gone.setdefault(event.camera, now)
+            case NodeBack():
+                self._gone.pop(event.camera, None)
+            case Tick():
+                pass
+        return actions + self._advance(now)
+
+    def _expects(self, camera: str, key: CaptureKey) -> bool:
+        return camera in self.outcomes and self.key == key
+
+    def _advance(self, now: int) -> list[Action]:
+        if self.state == "arming":
+            return self._advance_arming(now)
+        if self.state == "triggering":
+            return self._advance_triggering(now)
+        if self.state == "collecting":
+            return self._advance_collecting(now)
+        return []
+
+    # Arming
+
+    def _note_arm(self, reply: ArmReply) -> None:
+        if reply.node not in self.outcomes or self.state != "arming":
+            return
+        if reply.armed:
+            self._armed[reply.node] = reply
+            self._refusals.pop(reply.node, None)
+        elif reply.node not in self._armed:
+            self._refusals[reply.node] = reply.reason
+
+    def _advance_arming(self, now: int) -> list[Action]:
+        missing = tuple(camera for camera in self.cameras if camera not in self._armed)
+        # A camera that is not there cannot arm; one that refused may still come round before the deadline.
+        absent = all(camera in self._gone and now - self._gone[camera] >= self.timing.gone_grace for camera in missing)
+        if missing and not absent and now < self._arm_deadline:
+            if now < self._next_send:
+                return []
+            self._next_send = now + self.timing.arm_retry
+            return [SendArm(missing)]
+        reasons = {camera: self._why_not_armed(camera) for camera in missing}
+        if missing and (not self._override or len(missing) == len(self.cameras)):
+            self.state = "refused"
+            return [RefuseRound(reasons)]
+        self.state = "opening"
+        notes: list[Action] = []
+        for camera, reason in reasons.items():
+            notes += self._settle(camera, Outcome("failed", reason))
+        return [*notes, OpenCapture(self._moment(now), reasons)]
+
+    def _why_not_armed(self, camera: str) -> str:
+        if camera in self._refusals:
+            return f"not armed: {self._refusals[camera]}"
+        if camera in self._gone:
+            return "not armed: the node is not connected"
+        return f"not armed: no answer within {self.timing.arm / SECOND:g} s"
+
+    def _moment(self, now: int) -> int:
+        """The planned moment, ns: far enough ahead, and on the frame grid if a node told one."""
+        earliest = now + self.timing.lead
+        for camera in self.cameras:
+            reply = self._armed.get(camera)
+            if reply and reply.frame_time_ns is not None and reply.frame_period_ns:
+                frames = -((reply.frame_time_ns - earliest) // reply.frame_period_ns)
+                return reply.frame_time_ns + frames * reply.frame_period_ns
+        return earliest
+
+    # Triggering
+
+    def _opened(self, key: CaptureKey, now: int) -> list[Action]:
+        if self.state != "opening":
+            return []
+        self.key = key
+        self.state = "triggering"
+        self._next_send = now
+        self._next_pull = key.fire_at_ns + self.timing.pull_after
+        return []
+
+    def _note_verdict(self, reply: TriggerReply) -> list[Action]:
+        if not self._expects(reply.node, reply.key):
+            return []
+        known = self._verdicts.get(reply.node)
+        if known is None or known.verdict == "not armed":
+            self._verdicts[reply.node] = reply
+        if reply.verdict == "late":
+            return self._settle(reply.node, Outcome("failed", reply.reason or "the trigger came too late"))
+        return []
+
+    def _advance_triggering(self, now: int) -> list[Action]:
+        assert self.key is not None
+        if now >= self.key.fire_at_ns:
+            self.state = "collecting"
+            return self._advance_collecting(now)
+        unanswered = tuple(
+            camera
+            for camera in self.pending
+            if camera not in self._verdicts or self._verdicts[camera].verdict == "not armed"
+        )
+        if not unanswered or now < self._next_send:
+            return []
+        self._next_send = now + self.timing.trigger_retry
+        return [SendTrigger(unanswered, self.key)]
+
+    # Collecting
+
+    def _note_failure(self, failure: Failure) -> list[Action]:
+        if not self._expects(failure.node, failure.key):
+            return []
+        return self._settle(failure.node, Outcome("failed", failure.reason))
+
+    def _note_inventory(self, inventory: Inventory, now: int) -> list[Action]:
+        key, camera = self.key, inventory.node
+        if key is None or camera not in self.outcomes or self.outcomes[camera].status == "ok":
+            return []
+        for manifest in inventory.manifests:
+            if manifest.key == key:
+                return [FetchImage(manifest)]
+        for failure in inventory.failures:
+            if failure.key == key:
+                return self._note_failure(failure)
+        # Asked after the moment, so a trigger still on its way will be judged late by the node.
+        if inventory.capturing != key and now > key.fire_at_ns + self.timing.pull_after:
+            return self._settle(camera, Outcome("failed", self._why_missing(camera)))
+        return []
+
+    def _why_missing(self, camera: str) -> str:
+        verdict = self._verdicts.get(camera)
+        if verdict is None:
+            return "the trigger did not reach the node"
+        if verdict.verdict == "not armed":
+            return f"not armed when the trigger came: {verdict.reason}"
+        return "the node accepted the trigger but holds no image; it was probably restarted before it had stored one"
+
+    def _advance_collecting(self, now: int) -> list[Action]:
+        assert self.key is not None
+        pending = self.pending
+        gone = [c for c in pending if c in self._gone and now - self._gone[c] >= self.timing.gone_grace]
+        if len(gone) < len(pending) and now < self.key.fire_at_ns + self.timing.collect:
+            if now < self._next_pull:
+                return []
+            self._next_pull = now + self.timing.pull_every
+            return [AskInventory(tuple(c for c in pending if c not in gone))]
+        actions: list[Action] = []
+        for camera in pending:
+            actions += self._settle(camera, Outcome("failed", self._why_unfinished(camera)))
+        self.state = "closed"
+        return [*actions, CloseCapture(dict(self.outcomes))]
+
+    def _why_unfinished(self, camera: str) -> str:
+        verdict = self._verdicts.get(camera)
+        taken = "after it had accepted the trigger" if verdict and verdict.verdict == "accepted" else ""
+        if camera in self._gone:
+            return " ".join(f"the node disappeared {taken}".split()) + ", before its image arrived"
+        if verdict is None:
+            return "the node did not answer the trigger and no image arrived by the deadline"
+        return f"no image arrived within {self.timing.collect / SECOND:g} s of the planned moment"
+
+    def _settle(self, camera: str, outcome: Outcome) -> list[Action]:
+        """Set the outcome; an archived image is never overruled by a report of failure."""
+        known = self.outcomes[camera]
+        if known == outcome or known.status == "ok":
+            return []
+        self.outcomes[camera] = outcome
+        return [NoteOutcome(camera, outcome)]
+
+
+# Judging images ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What to do with an image: archive, repeat (it is there already), unknown (no such capture) or corrupt."""
+
+    verdict: str
+    reason: str = ""
+
+
+def judge(
+    manifest: Manifest, sha256: str, length: int, fire_at_ns: int | None, archived: Mapping[str, str | None]
+) -> Judgement:
+    """Decide about one image from its manifest, what really arrived, and the archive's record.
+
+    Parameters
+    ----------
+    sha256, length
+        Of the bytes that arrived.
+    fire_at_ns
+        The planned moment in the archive's record; None: there is no such capture here.
+    archived
+        Per expected camera of the record, the hash of its archived image or None.
+    """
+    if sha256 != manifest.sha256 or length != manifest.bytes:
+        return Judgement("corrupt", f"{length} bytes with another checksum than the {manifest.bytes} promised")
+    if fire_at_ns is None or fire_at_ns != manifest.key.fire_at_ns:
+        return Judgement("unknown", f"no capture {manifest.key} was made here at that moment")
+    if manifest.node not in archived:
+        return Judgement("unknown", f"camera {manifest.node} is not in capture {manifest.key}")
+    if archived[manifest.node] == sha256:
+        return Judgement("repeat")
+    return Judgement("archive")
+
+
+@dataclass(frozen=True)
+class Skew:
+    """Spread of the frames' measured times, ns."""
+
+    skew_ns: int | None
+    exceeded: bool | None
+
+    @classmethod
+    def of(cls, times_ns: Iterable[int | None], tolerance_ns: int | None) -> Skew:
+        """From the measured times; None where fewer than two cameras measured one."""
+        known = [time for time in times_ns if time is not None]
+        if len(known) < 2:
+            return cls(None, None)
+        skew = max(known) - min(known)
+        return cls(skew, None if tolerance_ns is None else skew > tolerance_ns)

@@ -1,0 +1,172 @@
+"""Images on their way from the network into the archive: queued, checked, stored, acknowledged.
+
+An image is acknowledged only after it is durable in the archive under its own checksum. Whatever is not
+acknowledged stays with its node and comes again, so this room may drop an image at any time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from ringdic_node.wire import CaptureKey, Failure, Manifest
+
+from ringdic_controller.archive.writer import Archive
+from ringdic_controller.rig.capture import judge
+from ringdic_controller.rig.rounds import capture_event
+
+log = logging.getLogger(__name__)
+
+INBOX_BYTES = 512 << 20
+ARCHIVISTS = 4  # threads: one waits for the disk while another computes a checksum
+
+_Image = tuple[str, CaptureKey, str]  # node, capture, SHA-256
+
+
+class Intake:
+    """A bounded queue of images and the threads that archive them.
+
+    Parameters
+    ----------
+    acknowledge : callable (manifest, verdict)
+        Sends an acknowledgement: ``archived`` or ``unknown``.
+    on_archived : callable (manifest)
+        Told after every image that is safe, repeats included.
+    on_event : callable (dict)
+        Told when a capture's record has changed.
+    limit : int
+        Bytes that may wait; an image beyond it is dropped, for it will be pulled later.
+    """
+
+    def __init__(
+        self,
+        archive: Archive,
+        acknowledge: Callable[[Manifest, str], None],
+        on_archived: Callable[[Manifest], None],
+        on_event: Callable[[dict[str, Any]], None],
+        *,
+        limit: int = INBOX_BYTES,
+    ) -> None:
+        self._archive = archive
+        self._acknowledge = acknowledge
+        self._on_archived = on_archived
+        self._on_event = on_event
+        self._limit = limit
+        self._waiting = 0
+        self._here: set[_Image] = set()
+        self._lock = threading.Lock()
+        self._inbox: queue.Queue[tuple[Manifest, bytes] | None] = queue.Queue()
+        self._threads = [
+            threading.Thread(target=self._work, name=f"archivist-{k}", daemon=True) for k in range(ARCHIVISTS)
+        ]
+
+    def start(self) -> None:
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self, timeout: float) -> None:
+        """Archive what has arrived, then end; wait at most `timeout` seconds for it."""
+        deadline = time.monotonic() + timeout
+        for _ in self._threads:
+            self._inbox.put(None)
+        for thread in self._threads:
+            thread.join(max(deadline - time.monotonic(), 0.0))
+
+    def has_room(self, size: int) -> bool:
+        """Whether an image of `size` bytes would be taken."""
+        with self._lock:
+            return self._waiting + size <= self._limit
+
+    def holds(self, manifest: Manifest) -> bool:
+        """Whether this very image waits here already: it came again, or was pulled while it was being pushed."""
+        with self._lock:
+            return _image(manifest) in self._here
+
+    def put(self, manifest: Manifest, image: bytes) -> bool:
+        """Queue an image; returns at once, False if there was no room. One that waits here already is not queued."""
+        with self._lock:
+            if _image(manifest) in self._here:
+                return True
+            if self._waiting + len(image) > self._limit:
+                log.warning("the inbox is full; the image of %s from %s will be pulled", manifest.key, manifest.node)
+                return False
+            self._waiting += len(image)
+            self._here.add(_image(manifest))
+        self._inbox.put((manifest, image))
+        return True
+
+    def _work(self) -> None:
+        while (parcel := self._inbox.get()) is not None:
+            manifest, image = parcel
+            try:
+                self.take(manifest, image)
+            except (OSError, ValueError) as error:  # a full disk, a damaged record: the node keeps the image
+                log.error("the image of %s from %s is not archived: %s", manifest.key, manifest.node, error)
+            finally:
+                with self._lock:
+                    self._waiting -= len(image)
+                    self._here.discard(_image(manifest))
+                del parcel, image  # not held until the next one comes
+
+    def take(self, manifest: Manifest, image: bytes) -> None:
+        """Check one image, archive it and acknowledge it, or tell the node that it is unknown here."""
+        capture = self._archive.capture(manifest.key.session, manifest.key.capture_id)
+        record = capture.record() if capture else None
+        sha256 = hashlib.sha256(image).hexdigest()
+        judgement = judge(
+            manifest,
+            sha256,
+            len(image),
+            record["fire_at_ns"] if record else None,
+            {camera: entry["sha256"] for camera, entry in record["cameras"].items()} if record else {},
+        )
+        if judgement.verdict == "corrupt":
+            log.error("image of %s from %s refused: %s", manifest.key, manifest.node, judgement.reason)
+            return
+        if judgement.verdict == "unknown" or capture is None:
+            log.warning("image from %s is not wanted: %s", manifest.node, judgement.reason)
+            self._acknowledge(manifest, "unknown")
+            return
+        new = judgement.verdict == "archive"
+        if new:
+            capture.store(manifest.node, manifest, image, sha256=sha256)
+        self._acknowledge(manifest, "archived")
+        self._on_archived(manifest)
+        if new:  # last: whoever watches must not keep the node waiting
+            self._on_event(capture_event(capture.record()))
+
+    def wants(self, manifest: Manifest) -> bool:
+        """Whether an image that a node holds should be pulled; acknowledges it if it is safe already."""
+        capture = self._archive.capture(manifest.key.session, manifest.key.capture_id)
+        if capture is None:
+            return False
+        record = capture.record()
+        if record["fire_at_ns"] != manifest.key.fire_at_ns or manifest.node not in record["cameras"]:
+            return False
+        if record["cameras"][manifest.node]["sha256"] == manifest.sha256:
+            self._acknowledge(manifest, "archived")  # the acknowledgement was lost
+            return False
+        # While a capture is open its round pulls; two transfers would only compete.
+        return bool(record["state"] == "closed")
+
+    def note_failure(self, failure: Failure) -> None:
+        """Put a node's own reason into the record of a capture that has no image of it."""
+        capture = self._archive.capture(failure.key.session, failure.key.capture_id)
+        if capture is None:
+            return
+        record = capture.record()
+        entry = record["cameras"].get(failure.node)
+        if record["fire_at_ns"] != failure.key.fire_at_ns or entry is None or entry["status"] != "failed":
+            return
+        if entry["reason"] != failure.reason:
+            capture.fail(failure.node, failure.reason)
+            self._on_event(capture_event(capture.record()))
+
+
+def _image(manifest: Manifest) -> _Image:
+    return manifest.node, manifest.key, manifest.sha256

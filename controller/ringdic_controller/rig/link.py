@@ -1,0 +1,439 @@
+"""The live rig: Zenoh router, roster of nodes, capture rounds, archiving and reconciliation.
+
+The only contact of the controller with Zenoh. The router runs inside this process; nodes connect to it.
+Zenoh's callbacks only enqueue: images go to the intake, which archives them in a thread of its own. Another thread
+asks the nodes, when they appear and at an interval, what they still hold.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import zenoh
+from ringdic.errors import ComputationError, InputError
+from ringdic_node.wire import (
+    NETWORK,
+    Ack,
+    Arm,
+    ArmReply,
+    Failure,
+    Fetch,
+    Inventory,
+    Keys,
+    Manifest,
+    Status,
+    Trigger,
+    TriggerReply,
+    WireError,
+    decode,
+    decode_as,
+    encode,
+)
+
+from ringdic_controller.archive.writer import Archive, SessionWriter
+from ringdic_controller.rig import capture as steps
+from ringdic_controller.rig.capture import Timing
+from ringdic_controller.rig.intake import Intake
+from ringdic_controller.rig.rounds import run_round
+
+log = logging.getLogger(__name__)
+
+INVENTORY_TIMEOUT = 5.0
+FETCH_TIMEOUT = 30.0
+
+
+class RigBusyError(ComputationError):
+    """A capture is under way already."""
+
+
+@dataclass
+class _Node:
+    """What is known of one camera's node."""
+
+    alive: bool = False
+    status: Status | None = None
+    seen_ns: int = 0
+    offset_ms: float | None = None
+    quickest_ns: int = 0
+
+    def note_offset(self, round_trip_ns: int, offset_ns: int) -> None:
+        """Keep the clock's offset as seen over a quick round trip; half the round trip bounds its error."""
+        if self.offset_ms is None or round_trip_ns <= 1.5 * self.quickest_ns:
+            self.offset_ms = offset_ns / 1e6
+            self.quickest_ns = min(round_trip_ns, self.quickest_ns or round_trip_ns)
+
+
+class RigLink:
+    """The rig's nodes as the rest of the controller sees them; a context manager.
+
+    Parameters
+    ----------
+    rig_name : str
+    cameras : list of str
+        Ids of the expected cameras, in ring order.
+    endpoint : str
+        Where nodes connect, like ``tcp/0.0.0.0:7447``; the port must be a definite one.
+    archive : Archive
+    on_event : callable (dict)
+        Told about ``node`` and ``capture`` changes, from several threads.
+    tolerance_ns : int
+        Largest skew of a capture that is not flagged.
+    reconcile_s : float
+        Interval at which nodes are asked what they hold.
+    """
+
+    def __init__(
+        self,
+        rig_name: str,
+        cameras: list[str],
+        endpoint: str,
+        archive: Archive,
+        on_event: Callable[[dict[str, Any]], None],
+        *,
+        timing: Timing | None = None,
+        tolerance_ns: int = 1_000_000,
+        reconcile_s: float = 10.0,
+    ) -> None:
+        self.cameras = list(cameras)
+        self._keys = Keys(rig_name)
+        self._endpoint = endpoint
+        self._archive = archive
+        self._on_event = on_event
+        self._timing = timing or Timing()
+        self._tolerance_ns = tolerance_ns
+        self._reconcile_s = reconcile_s
+        self._lock = threading.Lock()
+        self._nodes = {camera: _Node() for camera in self.cameras}
+        self._intake = Intake(
+            archive, self._acknowledge, lambda manifest: self._tell_round(steps.ImageArchived(manifest)), on_event
+        )
+        self._round_events: queue.Queue[steps.Event] | None = None
+        self._visits: queue.Queue[str | None] = queue.Queue()
+        self._stop = threading.Event()
+        self._capturing = threading.Lock()
+
+    def __enter__(self) -> RigLink:
+        for name in self._archive.close_unfinished("the controller was restarted before the image arrived"):
+            log.warning("capture %s was left open by an earlier run and is closed", name)
+        try:
+            self._session = zenoh.open(_router_config(self._endpoint))
+        except zenoh.ZError as error:
+            reason = str(error).split(" at /")[0].lstrip("[")
+            raise InputError(
+                f"the controller cannot listen on '{self._endpoint}' ({reason}); "
+                "choose another endpoint, or end the program that uses it"
+            ) from error
+        keys = self._keys
+        self._subscribers = [
+            self._session.declare_subscriber(keys.image("*"), self._receive_image),
+            self._session.declare_subscriber(keys.node("*", "status"), self._receive_status),
+            self._session.liveliness().declare_subscriber(keys.alive("*"), self._receive_alive, history=True),
+        ]
+        self._reconciler = threading.Thread(target=self._reconcile, name="reconciler", daemon=True)
+        self._intake.start()
+        self._reconciler.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop.set()
+        self._visits.put(None)
+        self._intake.stop(timeout=INVENTORY_TIMEOUT)
+        self._reconciler.join(timeout=INVENTORY_TIMEOUT)
+        self._session.close()
+
+    # The roster
+
+    def roster(self) -> list[dict[str, Any]]:
+        """The expected cameras in ring order with what is known of their nodes."""
+        with self._lock:
+            return [self._entry(camera, node) for camera, node in self._nodes.items()]
+
+    @staticmethod
+    def _entry(camera: str, node: _Node) -> dict[str, Any]:
+        status = node.status
+        own = status.clock_offset_ms if status else None
+        return {
+            "id": camera,
+            "alive": node.alive,
+            "state": (status.state if status else "starting") if node.alive else "absent",
+            "armed": bool(node.alive and status and status.armed),
+            "spool_free": status.spool_free if status else None,
+            "spool_images": status.spool_images if status else None,
+            "versions": status.versions if status else {},
+            "clock_offset_ms": own if own is not None else node.offset_ms,
+            "last_seen": node.seen_ns / 1e9 if node.seen_ns else None,
+        }
+
+    def wait_for_nodes(self, timeout: float) -> list[str]:
+        """Wait until every expected node is alive; return those that are not when the time (s) is over."""
+        deadline = time.monotonic() + timeout
+        while True:
+            with self._lock:
+                absent = [camera for camera, node in self._nodes.items() if not node.alive]
+            if not absent or time.monotonic() >= deadline:
+                return absent
+            time.sleep(0.05)
+
+    def preview(self, camera: str, timeout: float = 3.0) -> bytes | None:
+        """A small PGM of the camera's newest frame, or None if there is none."""
+        for reply in self._session.get(self._keys.node(camera, "preview"), timeout=timeout):
+            if reply.ok is not None:
+                return reply.ok.payload.to_bytes()
+        return None
+
+    def _receive_alive(self, sample: zenoh.Sample) -> None:
+        camera = str(sample.key_expr).rsplit("/", 1)[1]
+        alive = sample.kind == zenoh.SampleKind.PUT
+        with self._lock:
+            node = self._nodes.get(camera)
+            if node is None:
+                return
+            node.alive = alive
+            node.seen_ns = time.time_ns()
+            entry = self._entry(camera, node)
+        log.info("node %s %s", camera, "appeared" if alive else "disappeared")
+        self._tell_round(steps.NodeBack(camera) if alive else steps.NodeGone(camera))
+        if alive:
+            self._visits.put(camera)
+        self._on_event({"type": "node", "node": entry})
+
+    def _receive_status(self, sample: zenoh.Sample) -> None:
+        try:
+            message = decode(sample.payload.to_bytes())
+        except WireError as error:
+            log.warning("a status on %s breaks the contract: %s", sample.key_expr, error)
+            return
+        if isinstance(message, Failure):
+            self._note_failure(message)
+        elif isinstance(message, Status):
+            self._note_status(message)
+
+    def _note_status(self, status: Status) -> None:
+        with self._lock:
+            node = self._nodes.get(status.node)
+            if node is None:
+                return
+            before = self._entry(status.node, node)
+            node.status, node.seen_ns = status, time.time_ns()
+            entry = self._entry(status.node, node)
+        watched = ("alive", "state", "armed", "spool_images")
+        if any(before[name] != entry[name] for name in watched):
+            self._on_event({"type": "node", "node": entry})
+
+    def _note_failure(self, failure: Failure) -> None:
+        self._tell_round(steps.FailureReported(failure))
+
+    # Images
+
+    def _receive_image(self, sample: zenoh.Sample) -> None:
+        try:
+            manifest = decode_as(Manifest, sample.attachment.to_bytes() if sample.attachment else b"")
+        except WireError as error:
+            log.warning("an image on %s has no usable manifest: %s", sample.key_expr, error)
+            return
+        if self._intake.has_room(len(sample.payload)) and not self._intake.holds(manifest):
+            self._intake.put(manifest, sample.payload.to_bytes())
+
+    def _acknowledge(self, manifest: Manifest, verdict: str) -> None:
+        ack = Ack(manifest.node, manifest.key, manifest.sha256, verdict)
+        try:
+            self._session.put(
+                self._keys.node(manifest.node, "ack"),
+                encode(ack),
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.INTERACTIVE_HIGH,
+            )
+        except zenoh.ZError as error:  # the node sends its image again, and is answered again
+            log.warning("an acknowledgement to %s could not be sent: %s", manifest.node, error)
+
+    # Reconciliation
+
+    def _reconcile(self) -> None:
+        due = time.monotonic() + self._reconcile_s
+        while not self._stop.is_set():
+            try:
+                camera = self._visits.get(timeout=max(due - time.monotonic(), 0.0))
+            except queue.Empty:
+                due = time.monotonic() + self._reconcile_s
+                with self._lock:
+                    alive = [name for name, node in self._nodes.items() if node.alive]
+                for name in alive:
+                    if self._stop.is_set():
+                        return
+                    self._visit(name)
+            else:
+                if camera is None:
+                    return
+                self._visit(camera)
+
+    def _visit(self, camera: str) -> None:
+        """Reconcile one node; trouble with it must not keep the others from their turn."""
+        try:
+            self._reconcile_node(camera)
+        except (OSError, ValueError, zenoh.ZError) as error:
+            if not self._stop.is_set():
+                log.error("node %s could not be reconciled: %s", camera, error)
+
+    def _reconcile_node(self, camera: str) -> None:
+        """Ask one node for its status and its inventory; fetch what the archive lacks."""
+        sent = time.time_ns()
+        for status in self._answers(camera, "status", Status):
+            received = time.time_ns()
+            with self._lock:
+                self._nodes[camera].note_offset(received - sent, status.time_ns - (sent + received) // 2)
+            self._note_status(status)
+        for inventory in self._answers(camera, "inventory", Inventory):
+            for failure in inventory.failures:
+                self._intake.note_failure(failure)
+            for manifest in inventory.manifests:
+                if self._intake.wants(manifest):
+                    self.fetch(manifest)
+
+    def fetch(self, manifest: Manifest) -> None:
+        """Pull an image that a node holds; it enters the inbox like a pushed one. Returns at once."""
+        if self._intake.holds(manifest):
+            return
+
+        def receive(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                self._intake.put(manifest, reply.ok.payload.to_bytes())
+            elif reply.err is not None:
+                log.warning("node %s does not give %s: %s", manifest.node, manifest.key, reply.err.payload.to_string())
+
+        self._session.get(
+            self._keys.node(manifest.node, "fetch"),
+            receive,
+            payload=encode(Fetch(manifest.key)),
+            timeout=FETCH_TIMEOUT,
+            priority=zenoh.Priority.DATA,
+        )
+
+    def _answers(self, camera: str, verb: str, answer: type[Any]) -> Iterator[Any]:
+        replies = self._session.get(
+            self._keys.node(camera, verb),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=INVENTORY_TIMEOUT,
+            priority=zenoh.Priority.INTERACTIVE_HIGH,
+        )
+        for reply in replies:
+            message = _decoded(reply, answer)
+            if message is not None and message.node == camera:
+                yield message
+
+    # Captures
+
+    def capture(
+        self,
+        session: SessionWriter,
+        kind: str,
+        *,
+        override: bool = False,
+        settings: dict[str, Any] | None = None,
+    ) -> dict[str, Any]:
+        """Capture one image with every camera into `session`; return the closed record.
+
+        Blocks until the round closes, at most the sum of its waits. The cameras are locked to `settings`, or else
+        to the ``[capture]`` table of the session's rig.toml.
+
+        Raises
+        ------
+        CaptureRefusedError
+            Not every camera is armed and `override` is not given, or none is armed.
+        RigBusyError
+            Another capture is under way.
+        """
+        if not self._capturing.acquire(blocking=False):
+            raise RigBusyError("a capture is under way; wait until it has closed")
+        events: queue.Queue[steps.Event] = queue.Queue()
+        try:
+            with self._lock:
+                self._round_events = events
+                absent = [camera for camera, node in self._nodes.items() if not node.alive]
+            return run_round(
+                self,
+                events,
+                session,
+                kind,
+                cameras=self.cameras,
+                absent=absent,
+                timing=self._timing,
+                tolerance_ns=self._tolerance_ns,
+                override=override,
+                settings=session.camera_settings if settings is None else settings,
+                on_event=self._on_event,
+            )
+        finally:
+            with self._lock:
+                self._round_events = None
+            self._capturing.release()
+
+    def _tell_round(self, event: steps.Event) -> None:
+        with self._lock:
+            events = self._round_events
+        if events is not None:
+            events.put(event)
+
+    def ask(
+        self,
+        camera: str,
+        question: Arm | Trigger | None,
+        on_answer: Callable[[Any], None],
+        timeout: float,
+    ) -> None:
+        """Put a question of a round to one node: arm, trigger, or (None) its inventory; returns at once.
+
+        `on_answer` is called from Zenoh's thread with a well-formed answer, or never.
+        """
+        verb, answer = ("inventory", Inventory) if question is None else _ANSWERS[type(question)]
+
+        def receive(reply: zenoh.Reply) -> None:
+            message = _decoded(reply, answer)
+            if message is not None and message.node == camera:
+                on_answer(message)
+
+        urgent = isinstance(question, Trigger)
+        self._session.get(
+            self._keys.node(camera, verb),
+            receive,
+            payload=encode(question) if question is not None else b"",
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout,
+            priority=zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.INTERACTIVE_HIGH,
+            express=urgent,
+        )
+
+
+_ANSWERS: dict[type[Any], tuple[str, type[Any]]] = {Arm: ("arm", ArmReply), Trigger: ("trigger", TriggerReply)}
+
+
+def _decoded(reply: zenoh.Reply, answer: type[Any]) -> Any | None:
+    """The reply's message; None, with a line in the log, for a refusal or a breach of the contract."""
+    if reply.ok is None:
+        reason = reply.err.payload.to_string() if reply.err else "no reason given"
+        log.warning("a question to a node went without its answer: %s", reason)
+        return None
+    try:
+        return decode_as(answer, reply.ok.payload.to_bytes())
+    except WireError as error:
+        log.warning("an answer on %s breaks the contract: %s", reply.ok.key_expr, error)
+        return None
+
+
+def _router_config(endpoint: str) -> zenoh.Config:
+    """Zenoh's configuration of the controller: the router that all nodes connect to."""
+    config = zenoh.Config()
+    for key, value in {"mode": "router", "listen/endpoints": [endpoint], **NETWORK}.items():
+        config.insert_json5(key, json.dumps(value))
+    return config

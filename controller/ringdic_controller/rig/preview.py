@@ -1,0 +1,25 @@
+"""Small pictures of archived images, for the page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from ringdic.session.images import read_gray
+
+
+def preview_jpeg(path: Path, width: int = 320) -> bytes:
+    """A JPEG of an image file, at most ``width`` px wide; 16-bit images are stretched to their own range.
+
+    Raises ringdic.errors.InputError if the file is missing or no image.
+    """
+    image = read_gray(path)
+    if image.shape[1] > width:
+        height = max(1, round(image.shape[0] * width / image.shape[1]))
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    if image.dtype != np.uint8:
+        low, high = np.percentile(image, [0.5, 99.5])
+        image = np.clip((image - low) * (255.0 / max(high - low, 1.0)), 0, 255).astype(np.uint8)
+    _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])
+    return bytes(jpeg)

@@ -1,0 +1,201 @@
+"""One capture round performed: the round decides, this loop asks nodes, keeps the record and tells who watches."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import queue
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+from ringdic.errors import ComputationError
+from ringdic_node.wire import Arm, CaptureKey, Manifest, Trigger
+
+from ringdic_controller.archive.writer import CaptureWriter, SessionWriter
+from ringdic_controller.rig import capture as steps
+from ringdic_controller.rig.capture import SECOND, CaptureRound, Timing
+
+TRIGGER_ANSWER_TIMEOUT = 5.0
+INVENTORY_TIMEOUT = 5.0
+HEARTBEAT = 0.02
+
+
+class CaptureRefusedError(ComputationError):
+    """A capture was not fired, because cameras are not armed. `reasons` tells why, by camera."""
+
+    def __init__(self, reasons: dict[str, str]) -> None:
+        self.reasons = reasons
+        told = "; ".join(f"{camera}: {reason}" for camera, reason in reasons.items())
+        super().__init__(f"not captured, because not every camera is armed ({told}); mend it or override")
+
+
+class Nodes(Protocol):
+    """What a round needs of the network."""
+
+    def ask(
+        self, camera: str, question: Arm | Trigger | None, on_answer: Callable[[Any], None], timeout: float
+    ) -> None: ...
+
+    def fetch(self, manifest: Manifest) -> None: ...
+
+
+def run_round(
+    nodes: Nodes,
+    events: queue.Queue[steps.Event],
+    session: SessionWriter,
+    kind: str,
+    *,
+    cameras: Sequence[str],
+    absent: Sequence[str],
+    timing: Timing,
+    tolerance_ns: int,
+    override: bool,
+    settings: dict[str, Any],
+    on_event: Callable[[dict[str, Any]], None],
+    wall_ns: Callable[[], int] = time.time_ns,
+) -> dict[str, Any]:
+    """Run one capture round to its end; return the closed record.
+
+    `events` brings what happens meanwhile: archived images, failures, nodes that go and come back.
+    Raises CaptureRefusedError if the round refuses to fire.
+    """
+    machine = CaptureRound(cameras, timing, wall_ns(), absent=absent, override=override)
+    performer = _Performer(nodes, events, session, kind, tuple(cameras), timing, tolerance_ns, settings, on_event)
+    performer.tell_waiting("arming")
+    event: steps.Event = steps.Tick()
+    while True:
+        for action in machine.handle(event, wall_ns()):
+            performer.perform(action)
+        if machine.over:
+            break
+        try:
+            event = events.get(timeout=HEARTBEAT)
+        except queue.Empty:
+            event = steps.Tick()
+    return performer.record()
+
+
+class _Performer:
+    """Performs the actions of one round."""
+
+    def __init__(
+        self,
+        nodes: Nodes,
+        events: queue.Queue[steps.Event],
+        session: SessionWriter,
+        kind: str,
+        cameras: tuple[str, ...],
+        timing: Timing,
+        tolerance_ns: int,
+        settings: dict[str, Any],
+        on_event: Callable[[dict[str, Any]], None],
+    ) -> None:
+        self._nodes = nodes
+        self._events = events
+        self._session = session
+        self._kind = kind
+        self._cameras = cameras
+        self._timing = timing
+        self._tolerance_ns = tolerance_ns
+        self._on_event = on_event
+        self._scene = session.count(kind)
+        self._writer: CaptureWriter | None = None
+        canonical = json.dumps(settings, sort_keys=True, separators=(",", ":")).encode()
+        self._arm = Arm(session.name, kind, settings, hashlib.sha256(canonical).hexdigest(), cameras)
+
+    def record(self) -> dict[str, Any]:
+        """The capture's record as it stands."""
+        assert self._writer is not None
+        return self._writer.record()
+
+    def perform(self, action: steps.Action) -> None:
+        match action:
+            case steps.SendArm():
+                for camera in action.cameras:
+                    self._nodes.ask(
+                        camera,
+                        self._arm,
+                        lambda reply: self._events.put(steps.ArmAnswered(reply)),
+                        self._timing.arm / SECOND,
+                    )
+            case steps.OpenCapture():
+                self._open(action)
+            case steps.SendTrigger():
+                for camera in action.cameras:
+                    self._nodes.ask(
+                        camera,
+                        Trigger(action.key, self._kind, self._scene),
+                        lambda reply: self._events.put(steps.TriggerAnswered(reply)),
+                        TRIGGER_ANSWER_TIMEOUT,
+                    )
+            case steps.AskInventory():
+                for camera in action.cameras:
+                    self._nodes.ask(
+                        camera,
+                        None,
+                        lambda reply: self._events.put(steps.InventoryAnswered(reply)),
+                        INVENTORY_TIMEOUT,
+                    )
+            case steps.FetchImage():
+                self._nodes.fetch(action.manifest)
+            case steps.NoteOutcome():
+                self._note(action)
+            case steps.RefuseRound():
+                self.tell_waiting("refused", action.reasons)
+                raise CaptureRefusedError(action.reasons)
+            case steps.CloseCapture():
+                assert self._writer is not None
+                reasons = {camera: outcome.reason or "" for camera, outcome in action.outcomes.items()}
+                self._on_event(capture_event(self._writer.close(reasons)))
+
+    def _open(self, action: steps.OpenCapture) -> None:
+        self._writer = self._session.begin_capture(
+            self._kind,
+            self._cameras,
+            fire_at_ns=action.fire_at_ns,
+            tolerance_ns=self._tolerance_ns,
+            override=bool(action.unarmed),
+        )
+        self._events.put(
+            steps.CaptureOpened(CaptureKey(self._session.name, self._writer.capture_id, action.fire_at_ns))
+        )
+        for camera, reason in action.unarmed.items():
+            self._writer.fail(camera, reason)
+        self._on_event(capture_event(self._writer.record()))
+
+    def _note(self, action: steps.NoteOutcome) -> None:
+        if self._writer is None or action.outcome.status != "failed":
+            return  # an image's arrival is told by whoever archived it
+        self._writer.fail(action.camera, action.outcome.reason or "")
+        self._on_event(capture_event(self._writer.record()))
+
+    def tell_waiting(self, state: str, reasons: dict[str, str] | None = None) -> None:
+        """Tell of a round that has no record (yet)."""
+        self._on_event(
+            {
+                "type": "capture",
+                "session": self._session.name,
+                "capture_id": None,
+                "kind": self._kind,
+                "state": state,
+                "skew_ns": None,
+                "skew_exceeded": None,
+                "cameras": {
+                    camera: {
+                        "status": "failed" if camera in (reasons or {}) else "pending",
+                        "reason": (reasons or {}).get(camera),
+                    }
+                    for camera in self._cameras
+                },
+            }
+        )
+
+
+def capture_event(record: dict[str, Any]) -> dict[str, Any]:
+    """What those who watch are told of a capture's record."""
+    told = {name: record[name] for name in ("session", "capture_id", "kind", "state", "skew_ns", "skew_exceeded")}
+    cameras = {
+        camera: {"status": entry["status"], "reason": entry["reason"]} for camera, entry in record["cameras"].items()
+    }
+    return {"type": "capture", **told, "cameras": cameras}

@@ -1,0 +1,81 @@
+"""Arrays of a results file as plain little-endian numbers with tags: triangles, positions, fields."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Depends, Query, Request, Response
+from numpy.typing import NDArray
+from ringdic.results.results import read_field, read_mesh, read_positions
+
+from ringdic_controller.service.routes.etag import forever, unchanged
+
+_BINARY: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
+Version = Annotated[str | None, Query(description="The header's version; with it the answer may be kept for ever")]
+Removed = Annotated[bool, Query(description="After the rigid motion of the whole surface has been taken out")]
+
+
+def add_arrays(router: APIRouter, prefix: str, locate: Callable[..., Path]) -> None:
+    """Serve the arrays of the results file that ``locate`` finds by the parameters of the path, under ``prefix``."""
+
+    def faces(path: Annotated[Path, Depends(locate)], request: Request, v: Version = None) -> Response:
+        """Vertex indices; normals point outwards."""
+        headers = _tagged(path, "faces", v)
+        if unchanged(request, headers):
+            return Response(status_code=304, headers=headers)
+        return _binary(read_mesh(path).faces.astype("<u4"), headers)
+
+    def positions(
+        path: Annotated[Path, Depends(locate)],
+        step: int,
+        request: Request,
+        rigid_motion_removed: Removed = False,
+        v: Version = None,
+    ) -> Response:
+        """World frame of the target; NaN where not measured. Step 0 is the reference."""
+        headers = _tagged(path, f"positions-{step}-{rigid_motion_removed:d}", v)
+        if unchanged(request, headers):
+            return Response(status_code=304, headers=headers)
+        return _binary(read_positions(path, step, rigid_motion_removed).astype("<f4"), headers)
+
+    def field(
+        path: Annotated[Path, Depends(locate)],
+        name: str,
+        step: int,
+        request: Request,
+        rigid_motion_removed: Removed = False,
+        v: Version = None,
+    ) -> Response:
+        """NaN where not measured; the header's table of fields tells unit and location."""
+        values, location = read_field(path, name, step, rigid_motion_removed)
+        headers = _tagged(path, f"{name}-{step}-{rigid_motion_removed:d}", v) | {"X-Location": location}
+        if unchanged(request, headers):
+            return Response(status_code=304, headers=headers)
+        return _binary(values.astype("<f4"), headers)
+
+    for part, endpoint, summary in (
+        ("faces", faces, "Triangles: uint32 (faces, 3)"),
+        ("positions/{step}", positions, "Vertices at one step: float32 (points, 3) mm"),
+        ("fields/{name}/{step}", field, "One field at one step: float32 (points,) or (faces,)"),
+    ):
+        router.get(f"{prefix}/{part}", response_class=Response, responses=_BINARY, summary=summary)(endpoint)
+
+
+def version_of(path: Path) -> str:
+    """Changes only if other results are put in a file's place."""
+    found = path.stat()
+    return f"{found.st_mtime_ns:x}-{found.st_size:x}"
+
+
+def _tagged(path: Path, name: str, asked: str | None) -> dict[str, str]:
+    version = version_of(path)
+    return forever(f"{version}-{name}", revalidate=asked != version)
+
+
+def _binary(array: NDArray[Any], headers: dict[str, str]) -> Response:
+    shape = ",".join(str(n) for n in array.shape)
+    content = np.ascontiguousarray(array).tobytes()
+    return Response(
+        content, media_type="application/octet-stream", headers=headers | {"X-Type": array.dtype.name, "X-Shape": shape}
+    )

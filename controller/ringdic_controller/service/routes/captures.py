@@ -1,0 +1,103 @@
+"""Captures: begin one, follow it, read its record and images."""
+
+from dataclasses import asdict
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Query, Request, Response, status
+from fastapi.responses import FileResponse
+from pydantic import BaseModel
+
+from ringdic_controller.rig.preview import preview_jpeg
+from ringdic_controller.service.desk import Desk, NotFoundError, Round
+from ringdic_controller.service.routes.desk import TheDesk
+from ringdic_controller.service.routes.etag import forever, unchanged
+
+router = APIRouter(tags=["captures"])
+
+
+class NewCapture(BaseModel):
+    """``override``: fire although cameras are missing or not armed; those end as failed."""
+
+    kind: Literal["board", "target", "specimen", "static"]
+    override: bool = False
+
+
+@router.post(
+    "/captures",
+    response_model=Round,
+    status_code=status.HTTP_202_ACCEPTED,
+    summary="Begin a capture in the current session",
+)
+def begin(new: NewCapture, desk: TheDesk) -> dict[str, Any]:
+    """Answers at once; ``/rounds/{id}`` and the live events tell how it goes. 409 says why it cannot be taken."""
+    return asdict(desk.capture(new.kind, override=new.override))
+
+
+@router.get("/rounds/{round_id}", response_model=Round, summary="How a begun capture stands")
+def one_round(round_id: str, desk: TheDesk) -> dict[str, Any]:
+    """``state`` is arming, open, closed or refused; ``capture_id`` names the record once there is one."""
+    return asdict(desk.round(round_id))
+
+
+@router.get("/sessions/{session}/captures", summary="The capture records of a session, in order")
+def captures(session: str, desk: TheDesk) -> list[dict[str, Any]]:
+    """Per camera: status, reason, SHA-256, size, measured time, exposure, metadata."""
+    desk.session(session)
+    return desk.catalogue.captures(session)
+
+
+@router.get("/sessions/{session}/captures/{capture_id}", summary="One capture record")
+def capture(session: str, capture_id: str, desk: TheDesk) -> dict[str, Any]:
+    """404 if there is none."""
+    try:
+        return desk.catalogue.capture(session, capture_id)
+    except KeyError as error:
+        raise NotFoundError(f"Session '{session}' has no capture '{capture_id}'.") from error
+
+
+@router.get(
+    "/sessions/{session}/captures/{capture_id}/images/{camera}",
+    response_class=FileResponse,
+    summary="One image, byte for byte as archived",
+)
+def image(session: str, capture_id: str, camera: str, desk: TheDesk) -> FileResponse:
+    """The file's SHA-256 is the one of the record."""
+    file, sha256 = _image(desk, session, capture_id, camera)
+    path = desk.catalogue.path(session) / "captures" / capture_id / file
+    if not path.is_file():
+        raise NotFoundError(f"The image {file} of capture '{capture_id}' is not in its folder any more.")
+    return FileResponse(path, filename=f"{session}-{capture_id}-{file}", headers={"X-SHA256": sha256})
+
+
+@router.get(
+    "/sessions/{session}/captures/{capture_id}/images/{camera}/preview",
+    response_class=Response,
+    responses={200: {"content": {"image/jpeg": {}}}},
+    summary="One image made small",
+)
+def preview(
+    session: str,
+    capture_id: str,
+    camera: str,
+    desk: TheDesk,
+    request: Request,
+    width: Annotated[int, Query(ge=16, le=2048)] = 320,
+) -> Response:
+    """A JPEG of at most ``width`` px."""
+    file, sha256 = _image(desk, session, capture_id, camera)
+    headers = forever(f"{sha256[:32]}-{width}")
+    if unchanged(request, headers):
+        return Response(status_code=304, headers=headers)
+    path = desk.catalogue.path(session) / "captures" / capture_id / file
+    return Response(preview_jpeg(path, width), media_type="image/jpeg", headers=headers)
+
+
+def _image(desk: Desk, session: str, capture_id: str, camera: str) -> tuple[str, str]:
+    """File name and checksum of an archived image; only what the record names can be had."""
+    entry = capture(session, capture_id, desk).get("cameras", {}).get(camera)
+    if entry is None or not entry.get("file"):
+        raise NotFoundError(f"Capture '{capture_id}' has no image of camera '{camera}'.")
+    file = str(entry["file"])
+    if "/" in file or "\\" in file or file.startswith("."):
+        raise NotFoundError(f"Capture '{capture_id}' names no usable file for camera '{camera}'.")
+    return file, str(entry.get("sha256") or "")

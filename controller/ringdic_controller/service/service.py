@@ -1,0 +1,134 @@
+"""The controller as a service: archive, router, jobs and the web server put together."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from threading import current_thread, main_thread
+from types import FrameType
+
+import uvicorn
+from ringdic.errors import InputError
+from ringdic.session.rig import parse_rig, read_rig
+
+from ringdic_controller.archive.writer import Archive
+from ringdic_controller.jobs.children import Command, Processing, WarmChild, serving_command
+from ringdic_controller.rig.capture import Timing
+from ringdic_controller.rig.link import RigLink
+from ringdic_controller.service.app import create_app
+from ringdic_controller.service.config import ControllerConfig
+from ringdic_controller.service.desk import Desk
+
+logger = logging.getLogger(__name__)
+
+TOLERANCE_NS = 1_000_000  # skew that is not flagged, unless rig.toml says otherwise
+SHUTDOWN_LIMIT = 2  # seconds; an open event stream would keep the server alive for ever
+
+
+@contextmanager
+def open_desk(
+    config: ControllerConfig, processing: Command | Processing | None = None, timing: Timing | None = None
+) -> Iterator[Desk]:
+    """The desk with everything behind it: archive, router and nodes if the configuration names a rig, jobs.
+
+    ``processing`` replaces the warm child that carries out the jobs, ``timing`` the waits of a capture round. Raises
+    InputError for a bad rig.toml.
+    """
+    text = None
+    if config.rig is not None:
+        read_rig(config.rig)  # its errors name the file
+        text = config.rig.read_text(encoding="utf-8")
+    if config.settings is not None and not config.settings.is_file():
+        raise InputError(f"{config.settings}: no such settings file")
+    desk = Desk(config.archive, processing or WarmChild(serving_command(), config.settings), text, live=config.live)
+    try:
+        archive = Archive(config.archive)
+        if text is None:
+            desk.connect(archive, None)
+            yield desk
+            return
+        rig = parse_rig(text)
+        tolerance_us = rig.capture.tolerance_us
+        tolerance_ns = TOLERANCE_NS if tolerance_us is None else round(tolerance_us * 1000)
+        cameras = [camera.id for camera in rig.cameras]
+        with RigLink(
+            rig.name, cameras, config.endpoint, archive, desk.on_event, timing=timing, tolerance_ns=tolerance_ns
+        ) as ring:
+            desk.connect(archive, ring)
+            yield desk
+    finally:
+        desk.close()
+
+
+def serve(desk: Desk, config: ControllerConfig, on_ready: Callable[[str], None] | None = None) -> None:
+    """Serve the page and the HTTP interface until SIGINT or SIGTERM; ``on_ready`` is told the address.
+
+    Raises InputError if the port is taken.
+    """
+    listener = _listen(config)
+    host = f"[{config.host}]" if ":" in config.host else config.host
+    address = f"http://{host}:{listener.getsockname()[1]}"
+    server = uvicorn.Server(
+        uvicorn.Config(create_app(desk), log_level="warning", timeout_graceful_shutdown=SHUTDOWN_LIMIT)
+    )
+    logger.info("the page is at %s", address)
+    with listener, _ended_by_signal(server):
+        if on_ready:
+            on_ready(address)
+        server.run([listener])
+
+
+def run_controller(config: ControllerConfig, on_ready: Callable[[str], None] | None = None) -> None:
+    """Run the controller until it is told to end. Without a rig it shows the archive's sessions."""
+    with open_desk(config) as desk:
+        serve(desk, config, on_ready)
+
+
+def free_endpoint(config: ControllerConfig) -> ControllerConfig:
+    """The same configuration with a Zenoh endpoint on loopback whose port is free at this moment."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return replace(config, endpoint=f"tcp/127.0.0.1:{probe.getsockname()[1]}")
+
+
+@contextmanager
+def _ended_by_signal(server: uvicorn.Server) -> Iterator[None]:
+    """SIGINT and SIGTERM end the server and nothing more, so that what was opened is closed in order.
+
+    The server raises the signals that it caught once more when it has ended; they must not end the process then.
+    """
+    if current_thread() is not main_thread():
+        yield
+        return
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        server.should_exit = True
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _listen(config: ControllerConfig) -> socket.socket:
+    family = socket.AF_INET6 if ":" in config.host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        if os.name == "posix":  # elsewhere it would let two servers share the port
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((config.host, config.port))
+        listener.listen(128)
+    except OSError as error:
+        listener.close()
+        raise InputError(
+            f"http://{config.host}:{config.port} cannot be served ({error.strerror}); "
+            "choose another [http] port in the controller's configuration"
+        ) from error
+    return listener

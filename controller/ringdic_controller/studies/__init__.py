@@ -1,0 +1,1 @@
+"""What proves the system: the demo, the validation, the benchmarks."""

@@ -1,0 +1,84 @@
+"""What was measured against what is true: shape, displacement, stretch."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from ringdic.results.results import read_results
+from ringdic_node.virtual_rig.scenes import Limb
+
+from ringdic_controller.studies.truth import errors, face_middles
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One row: measured minus true. mean and rms (about zero), and the largest; in ``unit``; ``true`` for scale."""
+
+    quantity: str
+    step: str
+    true: str
+    mean: float
+    rms: float
+    largest: float
+    unit: str
+    lost: int
+
+    def row(self) -> dict[str, str]:
+        """The figure as text."""
+        digits = 4 if self.unit == "mm" else 5
+        return {
+            "measured − true": self.quantity,
+            "step": self.step,
+            "true values": self.true,
+            "mean": f"{self.mean:+.{digits}f}",
+            "RMS": f"{self.rms:.{digits}f}",
+            "largest": f"{self.largest:.{digits}f}",
+            "unit": self.unit or "–",
+            "lost": f"{self.lost:,}",
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """The figure as JSON values."""
+        return asdict(self)
+
+
+def compare_with_truth(results_file: Path, limb: Limb) -> list[Figure]:
+    """Every step of the results against the limb's formulas; step k of the results is step k of the limb."""
+    results = read_results(results_file)
+    found = errors(results, limb)
+    reference = limb.position(found.theta, found.z, 0)
+    radii = _span(np.hypot(*reference.T[:2]), "mm")
+    figures = [_figure("distance from the surface", "reference", radii, found.distance, "mm")]
+    middles = face_middles(found.theta, found.z, results.faces)
+    for step, name in list(enumerate(results.steps))[1:]:
+        length = np.linalg.norm(limb.position(found.theta, found.z, step) - reference, axis=1)
+        error = np.linalg.norm(found.displacement[step], axis=1)
+        figures.append(_figure("displacement", name, _span(length, "mm"), error, "mm"))
+        for k, true in enumerate(limb.stretches(*middles, step)):
+            figures.append(_figure(f"stretch λ{k + 1}", name, _span(true), found.stretches[step, :, k], ""))
+    return figures
+
+
+def _figure(quantity: str, step: str, true: str, error: Array, unit: str) -> Figure:
+    known = error[np.isfinite(error)]
+    return Figure(
+        quantity,
+        step,
+        true,
+        float(known.mean()),
+        float(np.sqrt(np.mean(known**2))),
+        float(np.abs(known).max()),
+        unit,
+        int(len(error) - len(known)),
+    )
+
+
+def _span(values: Array, unit: str = "") -> str:
+    digits = 2 if unit else 3
+    return f"{values.min():.{digits}f} … {values.max():.{digits}f}"

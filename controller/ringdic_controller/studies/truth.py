@@ -1,0 +1,127 @@
+"""What was measured against what the virtual rig knows to be true: shape, displacement, stretch, coverage."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from ringdic.results.results import Results
+from ringdic_node.virtual_rig.lens import VirtualCamera
+from ringdic_node.virtual_rig.scenes import Cylinder, Limb, Specimen
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Surface = Cylinder | Limb
+
+TURN = 2 * np.pi
+_CELL = 0.5  # mm of the grid on which areas are counted
+_SHIFT = 4  # bits of a cell that a corner's place is rounded to
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Measured minus true for the results of one surface.
+
+    theta, z : (N,) material coordinates of the vertices, rad and mm. distance : (N,) of the reference vertices from
+    the true surface, outside positive, mm. displacement : (F, N, 3) mm, NaN where lost.
+    stretches : (F, M, 2) of λ1, λ2, NaN where lost.
+    """
+
+    theta: Array
+    z: Array
+    distance: Array
+    displacement: Array
+    stretches: Array
+
+
+def errors(results: Results, surface: Surface, steps: Sequence[int] | None = None) -> Errors:
+    """Every vertex and face against the formulas of the surface. The material point is the nearest at the reference.
+
+    steps : of the surface, one for each step of the results, the first 0; None if they are numbered alike.
+    """
+    steps = range(len(results.steps)) if steps is None else steps
+    theta, z, distance = surface.material_coordinates(results.vertices_ref)
+    reference = surface.position(theta, z, 0)
+    middles = face_middles(theta, z, results.faces)
+    displacement, stretches = np.empty((len(steps), len(theta), 3)), np.empty((len(steps), len(results.faces), 2))
+    for k, step in enumerate(steps):
+        moved = surface.position(theta, z, step) - reference
+        displacement[k] = results.vertices[k] - results.vertices_ref - moved
+        true = surface.stretches(*middles, step)
+        found = results.deformation(k)
+        stretches[k] = np.stack([found.lambda1 - true[0], found.lambda2 - true[1]], axis=1)
+    return Errors(theta, z, distance, displacement, stretches)
+
+
+def face_middles(theta: Array, z: Array, faces: NDArray[np.integer]) -> tuple[Array, Array]:
+    """Material coordinates of the middles of triangles (M, 3), (M,) rad and (M,) mm; a triangle may span the seam."""
+    corners = theta[faces]
+    corners = corners[:, :1] + np.mod(corners - corners[:, :1] + np.pi, TURN) - np.pi
+    return corners.mean(axis=1), z[faces].mean(axis=1)
+
+
+@dataclass(frozen=True)
+class SurfaceGrid:
+    """The speckled band of a specimen as cells of material coordinates, with what each camera sees of them.
+
+    theta, z : (rows, columns) of the cells, z along the rows. area : mm² of each in the reference.
+    """
+
+    specimen: Specimen
+    theta: Array
+    z: Array
+    area: Array
+
+    @classmethod
+    def of(cls, specimen: Specimen) -> SurfaceGrid:
+        """Cells of about half a millimetre."""
+        low, high = specimen.band
+        across, along = round(TURN * 57.0 / _CELL), round((high - low) / _CELL)
+        theta, z = np.meshgrid(
+            (np.arange(across) + 0.5) * TURN / across, low + (np.arange(along) + 0.5) * (high - low) / along
+        )
+        tangents = specimen.surface.tangents(theta, z, 0)
+        area = np.linalg.norm(np.cross(tangents[..., 0, :], tangents[..., 1, :]), axis=-1)
+        return cls(specimen, theta, z, area * TURN / across * (high - low) / along)
+
+    def views(self, cameras: Sequence[VirtualCamera], incidence_deg: float = 60.0) -> tuple[Mask, Mask]:
+        """Which cameras see each cell, at the specimen's step, more upright than an angle and inside their image.
+
+        Returns (C, rows, columns) twice: whether it is seen, and whether nothing spoils that view: no bar, no
+        reflection, and the speckles are there.
+        """
+        step, damage = self.specimen.step, self.specimen.damage
+        xyz = self.specimen.surface.position(self.theta, self.z, step).reshape(-1, 3)
+        tangents = self.specimen.surface.tangents(self.theta, self.z, step).reshape(-1, 2, 3)
+        normals = np.cross(tangents[:, 0], tangents[:, 1])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        seen = np.zeros((len(cameras), len(xyz)), dtype=bool)
+        clean = seen.copy()
+        for k, camera in enumerate(cameras):
+            towards = camera.centre - xyz
+            cosine = np.sum(normals * towards, axis=1) / np.linalg.norm(towards, axis=1)
+            facing = np.flatnonzero(cosine > np.cos(np.radians(incidence_deg)))
+            px = camera.project(xyz[facing])
+            inside = facing[(px > 0).all(axis=1) & (px < [camera.width - 1, camera.height - 1]).all(axis=1)]
+            seen[k, inside] = True
+            clean[k, inside] = ~damage.spoilt(camera.centre, xyz[inside], normals[inside])
+        clean &= ~damage.worn(self.theta, self.z).ravel()
+        return seen.reshape(-1, *self.theta.shape), clean.reshape(-1, *self.theta.shape)
+
+    def covered(self, theta: Array, z: Array, faces: NDArray[np.integer]) -> Mask:
+        """Which cells lie under triangles (M, 3) between vertices at material coordinates (N,)."""
+        picture = np.zeros(self.theta.shape, np.uint8)
+        rows, columns = len(self.z), len(self.z[0])
+        low, high = self.specimen.band
+        corners = theta[faces]
+        corners = corners[:, :1] % TURN + (corners - corners[:, :1] + np.pi) % TURN - np.pi
+        y = (z[faces] - low) * rows / (high - low) - 0.5
+        for turn in (-TURN, 0.0, TURN):
+            x = (corners + turn) * columns / TURN - 0.5
+            near = (x.max(axis=1) > -1) & (x.min(axis=1) < columns)
+            for triangle in np.rint(np.stack([x[near], y[near]], axis=-1) * 2**_SHIFT).astype(np.int32):
+                cv2.fillConvexPoly(picture, triangle, 255, shift=_SHIFT)
+        return picture > 0

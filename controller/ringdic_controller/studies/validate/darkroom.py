@@ -1,0 +1,67 @@
+"""Images of the simulated rig, rendered once and kept."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+from ringdic_node.virtual_rig.lens import VirtualCamera
+from ringdic_node.virtual_rig.render import STAMP, render
+from ringdic_node.virtual_rig.scenes import Scene
+
+PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One image to take. seed : of the sensor's noise. jpeg : its quality, or None for an image without loss."""
+
+    camera: VirtualCamera
+    scene: Scene
+    seed: int
+    jpeg: int | None = None
+
+    @property
+    def key(self) -> str:
+        """The same for the same image: of camera, scene, noise, coding and renderer."""
+        camera = self.camera
+        view = (camera.id, camera.width, camera.height)
+        exact = [values.tobytes() for values in (camera.lens, camera.R, camera.t)]
+        told = f"{STAMP} {view} {exact} {self.scene!r} {self.seed} {self.jpeg}"
+        return hashlib.sha256(told.encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Darkroom:
+    """A folder of rendered images, each under a key of everything it depends on."""
+
+    folder: Path
+
+    def path(self, shot: Shot) -> Path:
+        """Where an image lies once it is developed."""
+        return self.folder / f"{shot.camera.id}-{shot.key}.{'png' if shot.jpeg is None else 'jpg'}"
+
+    def develop(self, shots: Sequence[Shot], progress: Callable[[float], None] = lambda _: None) -> list[Path]:
+        """Render what is not there yet, on all cores, and tell where each image lies."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        paths = {self.path(shot): shot for shot in shots}
+        missing = [shot for path, shot in paths.items() if not path.is_file()]
+        with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+            for done, _ in enumerate(pool.map(self._take, missing), start=1):
+                progress(done / len(missing))
+        return [self.path(shot) for shot in shots]
+
+    def _take(self, shot: Shot) -> None:
+        path = self.path(shot)
+        if path.is_file():  # another process was faster
+            return
+        coding = PNG if shot.jpeg is None else [cv2.IMWRITE_JPEG_QUALITY, shot.jpeg]
+        _, coded = cv2.imencode(path.suffix, render(shot.camera, shot.scene, shot.seed), coding)
+        aside = path.with_name(f".{path.stem}-{os.getpid()}.partial")
+        aside.write_bytes(coded.tobytes())
+        aside.replace(path)

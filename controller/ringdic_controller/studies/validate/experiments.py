@@ -1,0 +1,202 @@
+"""The paper's experiments in order: images, sessions, both ways of processing, figures."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ringdic.calibration.rig import Ring, calibrate_ring
+from ringdic.geometry.camera import Camera
+from ringdic.jobs.pipeline import process_session
+from ringdic.progress import Progress, Report, silent
+from ringdic.results.results import Results, read_results
+from ringdic.session.folder import read_session
+from ringdic.session.rig import Rig, parse_rig
+from ringdic.settings import CalibrationGroup, Settings
+from ringdic_node.virtual_rig.scenes import Cylinder, Specimen
+
+from ringdic_controller.studies.validate.calibration import ExactRays, figure_6, table_1, table_2, true_camera
+from ringdic_controller.studies.validate.cylinder import Run, apart, diameter, figure_7a, figure_7b, printed
+from ringdic_controller.studies.validate.darkroom import Darkroom, Shot
+from ringdic_controller.studies.validate.figures import PAPER, Figure, Findings
+from ringdic_controller.studies.validate.folders import make_session
+from ringdic_controller.studies.validate.limb import LimbRun, figure_9, spoilt
+from ringdic_controller.studies.validate.scenery import Scenery
+
+#: Kinds of capture of the scenes of an experiment.
+_KINDS = {"boards": "board", "target": "target", "printed": "target"}
+EXPERIMENTS = ("calibration", "cylinder", "printed", "limb", "spoilt")
+_SCENES = {
+    "calibration": ("boards", "target"),
+    "cylinder": ("boards", "target", "cylinder"),
+    "printed": ("boards", "printed", "cylinder"),
+    "limb": ("boards", "target", "limb"),
+    "spoilt": ("boards", "target", "spoilt"),
+}
+
+
+@dataclass
+class Validation:
+    """The rig, the folder of everything written, and the ways of processing by name.
+
+    Sessions and results that are there already are used again where they were made with the same settings; a run is
+    not repeated when the program changes: remove ``sessions/*/results`` for that.
+    """
+
+    folder: Path
+    scenery: Scenery
+    ways: Mapping[str, Settings]
+    report: Report = silent
+    clock: Callable[[], float] = time.monotonic
+    seconds: dict[str, float] = field(default_factory=dict)
+    rig: Rig = field(init=False)
+    true: dict[str, Camera] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.rig = parse_rig(self.scenery.rig.rig_toml())
+        self.true = {camera.id: true_camera(camera) for camera in self.scenery.rig.cameras}
+        self.darkroom = Darkroom(self.folder / "images")
+
+    @property
+    def pairs(self) -> tuple[tuple[str, str], ...]:
+        """Adjacent pairs of the ring."""
+        return self.rig.pairs
+
+    def run(self, experiments: Sequence[str] = EXPERIMENTS) -> dict[str, Findings]:
+        """The findings of the experiments by figure of the paper."""
+        found: dict[str, Findings] = {}
+        rings = self._rings()
+        if "calibration" in experiments:
+            found |= self._calibration(rings)
+        if "cylinder" in experiments:
+            found |= self._cylinder(rings)
+        if "printed" in experiments:
+            runs = {way: Run.of(results) for way, results in self._process("printed", 1).items()}
+            found["printed"] = printed(runs)
+        if "limb" in experiments or "spoilt" in experiments:
+            found |= self._limb("spoilt" in experiments)
+        return found
+
+    def render(self, experiments: Sequence[str] = EXPERIMENTS) -> None:
+        """Every image that is not there yet."""
+        for name in dict.fromkeys(("moved", *(name for each in experiments for name in _SCENES[each]))):
+            self._develop(name)
+
+    def _calibration(self, rings: Mapping[str, Ring]) -> dict[str, Findings]:
+        self._develop("moved")
+        images = {id_: self.darkroom.path(shot) for id_, shot in self.scenery.shots("moved")[0].items()}
+        uncorrected = {"paper's, no correction": self._uncorrected()} if PAPER in self.ways else {}
+        return {
+            "table_1": table_1(rings, self.true, self.scenery.scale),
+            "table_2": table_2({**rings, **uncorrected}, self.pairs),
+            "figure_6": figure_6({**rings, **uncorrected}, self.rig, images, self.pairs),
+        }
+
+    def _cylinder(self, rings: Mapping[str, Ring]) -> dict[str, Findings]:
+        results = self._process("cylinder")
+        runs = {way: Run.of(each) for way, each in results.items()}
+        uncorrected = {id_: each.camera for id_, each in self._uncorrected().cameras.items()}
+        rays = ExactRays.of(self.true, self.pairs)
+        return {
+            "diameter": diameter(runs, self.pairs),
+            "apart": apart(runs, rays, self.true, uncorrected),
+            "figure_7a": figure_7a(runs, self.pairs),
+            "figure_7b": figure_7b(runs, Cylinder(), self.pairs),
+        }
+
+    def _limb(self, with_spoilt: bool) -> dict[str, Findings]:
+        cameras = self.scenery.rig.cameras
+        scenes = _specimens(self.scenery, "limb")
+        clean = {way: LimbRun.of(results, scenes) for way, results in self._process("limb").items()}
+        found = {"figure_9": figure_9(clean, scenes, cameras)}
+        if with_spoilt:
+            scenes = _specimens(self.scenery, "spoilt")
+            runs = {way: LimbRun.of(results, scenes) for way, results in self._process("spoilt").items()}
+            found["spoilt"] = spoilt(runs, clean, scenes, cameras)
+        return found
+
+    def _rings(self) -> dict[str, Ring]:
+        """The cameras as each way calibrates them; kept in the calibration's session for all others."""
+        session = read_session(self._session("calibration"))
+        rings = {}
+        for way, settings in self.ways.items():
+            began = self.clock()
+            rings[way] = calibrate_ring(session, settings.calibration, self._step(f"calibrate, {way}"))
+            self._took(f"calibration, {way}", began)
+        return rings
+
+    def _uncorrected(self) -> Ring:
+        session = read_session(self._session("calibration"))
+        return calibrate_ring(session, CalibrationGroup(method="dlt", distortion=False))
+
+    def _process(self, name: str, steps: int | None = None) -> dict[str, Results]:
+        """The results of every way over an experiment; those there already with the same settings are read."""
+        session = self._session(name, steps)
+        found = {}
+        for way, settings in self.ways.items():
+            run = _run_with(session, settings)
+            if run is None:
+                began = self.clock()
+                run = process_session(session, settings, self._renamed(f"{name}, {way}"))
+                self._took(f"{name}, {way}", began)
+            found[way] = read_results(run / "results.h5")
+        return found
+
+    def _session(self, name: str, steps: int | None = None) -> Path:
+        captures: list[tuple[str, Mapping[str, Shot]]] = []
+        for scenes in _SCENES[name]:
+            self._develop(scenes)
+            kind = _KINDS.get(scenes, "specimen")
+            shots = self.scenery.shots(scenes)
+            captures += [(kind, each) for each in (shots[:steps] if kind == "specimen" else shots)]
+        calibrated = self.folder / "sessions" / "calibration"
+        path = self.folder / "sessions" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return make_session(
+            path,
+            self.scenery.rig.rig_toml(),
+            captures,
+            self.darkroom,
+            calibration=None if path == calibrated else calibrated,
+        )
+
+    def _develop(self, name: str) -> None:
+        shots = [shot for scene in self.scenery.shots(name) for shot in scene.values()]
+        began = self.clock()
+        rendered = sum(not self.darkroom.path(shot).is_file() for shot in shots)
+        self.darkroom.develop(shots, lambda done: self.report(Progress("render", done, name)))
+        if rendered:
+            self._took(f"render {name}, {rendered} images", began)
+
+    def _step(self, stage: str) -> Callable[[float, str], None]:
+        return lambda done, message: self.report(Progress(stage, done, message))
+
+    def _renamed(self, what: str) -> Report:
+        def report(progress: Progress) -> None:
+            message = f"{progress.stage} {progress.message}".strip()
+            self.report(Progress(what, progress.done, message, progress.rate, progress.left_s))
+
+        return report
+
+    def _took(self, what: str, began: float) -> None:
+        self.seconds[what] = round(self.seconds.get(what, 0.0) + self.clock() - began, 1)
+
+
+def figures(found: Mapping[str, Findings]) -> list[Figure]:
+    """All figures in order."""
+    return [figure for each in found.values() for figure in each.figures]
+
+
+def _specimens(scenery: Scenery, name: str) -> list[Specimen]:
+    return [scene for scene in scenery.scenes(name) if isinstance(scene, Specimen)]
+
+
+def _run_with(session: Path, settings: Settings) -> Path | None:
+    """The newest run of a session that was made with these settings."""
+    wanted = settings.to_toml()
+    for run in reversed(read_session(session).runs()):
+        if (run / "settings.toml").read_text(encoding="utf-8") == wanted:
+            return run
+    return None

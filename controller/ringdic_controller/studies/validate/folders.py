@@ -1,0 +1,44 @@
+"""Session folders of rendered images, in the form that captures and imports make."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from ringdic_controller.archive.writer import SessionWriter
+from ringdic_controller.studies.validate.darkroom import Darkroom, Shot
+
+
+def make_session(
+    path: Path,
+    rig_toml: str,
+    captures: Sequence[tuple[str, Mapping[str, Shot]]],
+    darkroom: Darkroom,
+    *,
+    calibration: Path | None = None,
+    wall_ns: Callable[[], int] = time.time_ns,
+) -> Path:
+    """The session at ``path`` with these captures, each a kind and an image a camera; one that is there is kept.
+
+    Images share their file with the darkroom. calibration : a session whose kept calibrations are taken over: they
+    lie under keys of the images, so what does not fit is not used.
+    """
+    if not (path / "session.json").is_file():
+        shutil.rmtree(path, ignore_errors=True)
+        aside = path.with_name(f".partial-{path.name}")
+        shutil.rmtree(aside, ignore_errors=True)
+        writer = SessionWriter.create(aside, path.name, rig_toml, "import", wall_ns)
+        for kind, shots in captures:
+            capture = writer.begin_capture(kind, list(shots))
+            for id_, shot in shots.items():
+                size = shot.camera.width, shot.camera.height
+                capture.store_file(id_, darkroom.path(shot), *size, link=True)
+            capture.close()
+        aside.rename(path)
+    if calibration is not None and (calibration / "calibration").is_dir():
+        (path / "calibration").mkdir(exist_ok=True)
+        for kept in (calibration / "calibration").glob("*.json"):
+            shutil.copy2(kept, path / "calibration" / kept.name)
+    return path

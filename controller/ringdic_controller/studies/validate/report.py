@@ -1,0 +1,104 @@
+"""The findings as a table on the terminal, as JSON, and as a page of Markdown with plots."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ringdic_controller.studies.validate.figures import BETTER, PAPER, Figure
+
+#: What tells of the systematic errors of calibration and matching is this many times larger the paper's way.
+_SEEN = 3.0
+#: The paper's figures of quality, by experiment and the beginning of their name.
+_QUALITY = (
+    ("Table 2", "control points, RMS"),
+    ("Fig. 6", "5 mm stage: superimposed RMS"),
+    ("Fig. 6", "5 mm stage: length"),
+    ("Fig. 7a", "merging mismatch, mean"),
+    ("Fig. 7b", "displacement, STD, all views, first step"),
+    ("Fig. 7b", "|E|, median, first step"),
+    ("diameter", "bias, all views"),
+)
+
+
+def rows(figures: Sequence[Figure], ways: Sequence[str]) -> list[dict[str, str]]:
+    """The figures as rows of a table; a column for every way that has a value anywhere, none that is empty."""
+    names = list(dict.fromkeys([*ways, *(way for figure in figures for way in figure.values)]))
+    table = [figure.row(names) for figure in figures]
+    filled = [name for name in (table[0] if table else {}) if any(row[name] for row in table)]
+    return [{name: row[name] for name in filled} for row in table]
+
+
+def blindness(figures: Sequence[Figure]) -> list[dict[str, str]]:
+    """Which figures of quality see that the paper's way is wrong: rows of both ways' magnitudes and a verdict."""
+    table = []
+    for experiment, name in _QUALITY:
+        for figure in figures:
+            both = {PAPER, BETTER} <= figure.values.keys()
+            if figure.experiment != experiment or not figure.quantity.startswith(name) or not both:
+                continue
+            paper, better = abs(figure.values[PAPER]), abs(figure.values[BETTER])
+            table.append(
+                {
+                    "figure": f"{experiment}: {figure.quantity}",
+                    "paper": figure.paper,
+                    PAPER: figure.text(paper),
+                    BETTER: figure.text(better),
+                    "sees the errors": "yes" if paper > _SEEN * better else "no",
+                }
+            )
+    return table
+
+
+def summary(figures: Sequence[Figure], about: Mapping[str, Any]) -> dict[str, Any]:
+    """Everything as JSON values."""
+    judged = [figure for figure in figures if figure.reached is not None]
+    return {
+        **about,
+        "reached": sum(bool(figure.reached) for figure in judged),
+        "aimed_at": len(judged),
+        "missed": [f"{figure.experiment}: {figure.quantity}" for figure in judged if not figure.reached],
+        "blindness": blindness(figures),
+        "figures": [figure.to_dict() for figure in figures],
+    }
+
+
+def write(
+    folder: Path, figures: Sequence[Figure], ways: Sequence[str], about: Mapping[str, Any], plots: Mapping[str, Path]
+) -> dict[str, Any]:
+    """Write ``validation.json`` and ``validation.md`` and return the summary."""
+    found = summary(figures, about)
+    (folder / "validation.json").write_text(json.dumps(found, indent=1, ensure_ascii=False), encoding="utf-8")
+    (folder / "validation.md").write_text(_page(figures, ways, found, plots), encoding="utf-8")
+    return found
+
+
+def _page(figures: Sequence[Figure], ways: Sequence[str], found: Mapping[str, Any], plots: Mapping[str, Path]) -> str:
+    lines = [
+        "# The paper's experiments on the virtual rig",
+        "",
+        f"{found['cameras']} cameras of {found['size'][0]} × {found['size'][1]} px, subset radius "
+        f"{found['radius_px']} px, step {found['step_px']} px; {found['reached']} of {found['aimed_at']} aims reached.",
+        "The paper: D. Solav et al., IEEE Access 6 (2018) 30520.",
+        "",
+        *_table(rows(figures, ways)),
+        *(f"{figure.experiment}, {figure.quantity}: {figure.note}" for figure in figures if figure.note),
+        "",
+    ]
+    blind = blindness(figures)
+    if blind:
+        lines += ["## Which figures see the systematic errors of the paper's way", "", *_table(blind)]
+    lines += [
+        *(f"![{name}]({path.name})" for name, path in plots.items()),
+        "",
+        *_table([{"step": name, "seconds": f"{value:.1f}"} for name, value in found["seconds"].items()]),
+    ]
+    return "\n".join(lines)
+
+
+def _table(table: Sequence[Mapping[str, str]]) -> list[str]:
+    head = list(table[0]) if table else []
+    rows = ("| " + " | ".join(row[name].replace("|", "\\|") for name in head) + " |" for row in table)
+    return ["| " + " | ".join(head) + " |", "|" + "---|" * len(head), *rows, ""]

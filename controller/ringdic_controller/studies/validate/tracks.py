@@ -1,0 +1,99 @@
+"""The pixels that a run's points rest on, camera by camera, whichever way it went."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from ringdic.geometry.camera import Camera
+from ringdic.geometry.triangulation import triangulate
+from ringdic.results.results import Results
+from scipy.interpolate import CloughTocher2DInterpolator
+from scipy.spatial import cKDTree
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Pixels of the measured points, those too that the merging of pairs takes out.
+
+    cameras : C ids. px : (F, C, N, 2), NaN where a camera did not measure a point. reference : (C, N, 2), where each
+    was matched between the cameras; tracking in time sets out from the place that all views together give.
+    """
+
+    cameras: tuple[str, ...]
+    px: Array
+    reference: Array
+
+    @classmethod
+    def of(cls, results: Results) -> Tracks:
+        """From the matches that the results keep."""
+        ids = tuple(camera.id for camera in results.cameras)
+        alone = all(len(matches.cameras) == 1 for matches in results.matches)
+        count = len(results.vertices_ref) if alone else sum(len(matches.xy) for matches in results.matches)
+        px = np.full((len(results.steps), len(ids), count, 2), np.nan)
+        reference = np.full((len(ids), count, 2), np.nan)
+        offset = 0
+        for matches in results.matches:
+            used = np.flatnonzero(matches.vertex >= 0) if alone else np.arange(len(matches.xy))
+            row = matches.vertex[used] if alone else offset + used
+            good = np.where(matches.status[:, used, None] == 0, 1.0, np.nan)
+            for k, id_ in enumerate(matches.cameras):
+                camera = ids.index(id_)
+                px[:, camera, row] = matches.px[:, k][:, used] * good
+                reference[camera, row] = matches.xy[used] if alone else px[0, camera, row]
+            offset += len(matches.xy)
+        return cls(ids, px, reference)
+
+    def reconstruct(self, cameras: Mapping[str, Camera]) -> Array:
+        """The reference as other cameras would have it, from all views alike. (N, 3) mm."""
+        return triangulate([cameras[id_] for id_ in self.cameras], self.reference)
+
+    def of_pair(self, cameras: Mapping[str, Camera], pair: tuple[str, str], step: int | None = None) -> Array:
+        """The points as a pair alone has them. (N, 3) mm, NaN where one of its cameras has no view.
+
+        step : as tracked in time; None is the reference as matched between the cameras.
+        """
+        chosen = [self.cameras.index(id_) for id_ in pair]
+        px = self.reference[chosen] if step is None else self.px[step, chosen]
+        return triangulate([cameras[id_] for id_ in pair], px)
+
+    def neighbours(self, pairs: tuple[tuple[str, str], ...]) -> Iterator[tuple[tuple[str, str], tuple[str, str]]]:
+        """Pairs of a ring that share a camera, each with the next."""
+        following = {first: (first, second) for first, second in pairs}
+        for pair in pairs:
+            if pair[1] in following:
+                yield pair, following[pair[1]]
+
+
+def mismatch(tracks: Tracks, cameras: Mapping[str, Camera], pairs: tuple[tuple[str, str], ...]) -> Array:
+    """Distances between the same surface from two pairs that share a camera, (n,) mm (Fig. 7a).
+
+    Where the pairs have vertices in common these are compared; where they do not, one pair's surface is carried to
+    the other's points over the image of the camera they share, by cubic interpolation.
+    """
+    distances = []
+    for one, other in tracks.neighbours(pairs):
+        X, Y = tracks.of_pair(cameras, one), tracks.of_pair(cameras, other)
+        both = np.isfinite(X).all(axis=1) & np.isfinite(Y).all(axis=1)
+        if both.sum() > 10:
+            distances.append(np.linalg.norm(X[both] - Y[both], axis=1))
+            continue
+        shared = tracks.reference[tracks.cameras.index(one[1])]
+        source, wanted = (np.flatnonzero(np.isfinite(each).all(axis=1)) for each in (X, Y))
+        if len(source) < 10 or not len(wanted):
+            continue
+        carried = CloughTocher2DInterpolator(shared[source], X[source])(shared[wanted])
+        known = np.isfinite(carried).all(axis=1) & (_gap(shared[source], shared[wanted]) < 1.5)
+        distances.append(np.linalg.norm(carried[known] - Y[wanted[known]], axis=1))
+    return np.concatenate(distances) if distances else np.zeros(0)
+
+
+def _gap(source: Array, wanted: Array) -> Array:
+    """Distance of points from the nearest of others, in units of these points' usual spacing."""
+    tree = cKDTree(source)
+    spacing = float(np.median(tree.query(source[:2000], k=2)[0][:, 1]))
+    return np.asarray(tree.query(wanted)[0]) / spacing

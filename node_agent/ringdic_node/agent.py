@@ -1,0 +1,412 @@
+"""The node's state machine: an event comes in, actions go out. No input or output happens here.
+
+States and what moves them (anything not listed leaves the state alone)::
+
+    state       event                       next state
+    idle        ArmAsked                    arming      LockCamera
+    arming      CameraLocked                armed       Answer(armed) to every waiting question
+    arming      CameraRefused               idle        Answer(not armed)
+    armed       ArmAsked, same settings     armed       Answer(armed)
+    armed       ArmAsked, other settings    arming      LockCamera
+    armed       Triggered, in time          capturing   Answer(accepted), TakeFrame
+    armed       Triggered, too late         armed       Answer(late), Report(failure)
+    capturing   FrameSpooled                armed       Publish
+    capturing   FrameLost                   idle        Report(failure); the camera must be locked anew
+
+Laws: a capture is taken at most once, however often its trigger arrives. A spooled image is published
+again and again, ever less often, until an acknowledgement with its own hash arrives; only then is it freed.
+An image that the controller declares unknown is kept but not published any more.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from ringdic_node.clock import Instant
+from ringdic_node.wire import (
+    Ack,
+    Arm,
+    ArmReply,
+    CaptureKey,
+    Failure,
+    Inventory,
+    Manifest,
+    Trigger,
+    TriggerReply,
+)
+
+REMEMBERED = 200  # failures and answers kept for repeated questions
+
+
+# Events ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ArmAsked:
+    message: Arm
+    question: int
+
+
+@dataclass(frozen=True)
+class CameraLocked:
+    """The camera holds the settings with this hash; `reply` is what to tell whoever asked."""
+
+    reply: ArmReply
+
+
+@dataclass(frozen=True)
+class CameraRefused:
+    settings_hash: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Triggered:
+    message: Trigger
+    question: int
+
+
+@dataclass(frozen=True)
+class FrameSpooled:
+    manifest: Manifest
+
+
+@dataclass(frozen=True)
+class FrameLost:
+    key: CaptureKey
+    reason: str
+
+
+@dataclass(frozen=True)
+class Sent:
+    """A publication has left, or failed to leave; neither says that it arrived."""
+
+    key: CaptureKey
+
+
+@dataclass(frozen=True)
+class Acknowledged:
+    message: Ack
+
+
+@dataclass(frozen=True)
+class InventoryAsked:
+    question: int
+
+
+@dataclass(frozen=True)
+class FetchAsked:
+    key: CaptureKey
+    question: int
+
+
+@dataclass(frozen=True)
+class Tick:
+    """Time has passed."""
+
+
+Event = (
+    ArmAsked
+    | CameraLocked
+    | CameraRefused
+    | Triggered
+    | FrameSpooled
+    | FrameLost
+    | Sent
+    | Acknowledged
+    | InventoryAsked
+    | FetchAsked
+    | Tick
+)
+
+
+# Actions -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LockCamera:
+    settings: dict[str, Any]
+    settings_hash: str
+
+
+@dataclass(frozen=True)
+class TakeFrame:
+    """Capture the frame nearest to the trigger's moment and spool it."""
+
+    trigger: Trigger
+
+
+@dataclass(frozen=True)
+class Publish:
+    manifest: Manifest
+
+
+@dataclass(frozen=True)
+class Free:
+    """Remove the image from the spool and leave a tombstone."""
+
+    key: CaptureKey
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Report:
+    failure: Failure
+
+
+@dataclass(frozen=True)
+class Answer:
+    question: int
+    message: ArmReply | TriggerReply | Inventory
+
+
+@dataclass(frozen=True)
+class AnswerImage:
+    question: int
+    manifest: Manifest
+
+
+@dataclass(frozen=True)
+class Decline:
+    question: int
+    reason: str
+
+
+Action = LockCamera | TakeFrame | Publish | Free | Report | Answer | AnswerImage | Decline
+
+
+@dataclass
+class _Parcel:
+    """A spooled image on its way: when it is due again and after how long a wait."""
+
+    manifest: Manifest
+    due_ns: int
+    wait_ns: int
+    sending: bool = False
+    unwanted: bool = False
+
+
+class Agent:
+    """One node's decisions.
+
+    Parameters
+    ----------
+    node : str
+        This node's id.
+    spooled, freed
+        What the spool held when the process started: images to deliver and tombstones.
+    now : Instant
+        The moment of the start; the spooled images are due at once.
+    resend_after_ns, resend_at_most_ns : int
+        First and longest wait for an acknowledgement before the image is published again.
+    """
+
+    def __init__(
+        self,
+        node: str,
+        now: Instant,
+        *,
+        spooled: Iterable[Manifest] = (),
+        freed: Iterable[CaptureKey] = (),
+        resend_after_ns: int = 5_000_000_000,
+        resend_at_most_ns: int = 60_000_000_000,
+    ) -> None:
+        self.node = node
+        self._resend_after = resend_after_ns
+        self._resend_at_most = resend_at_most_ns
+        self._lock_reply: ArmReply | None = None
+        self._arming: Arm | None = None
+        self._waiting: list[tuple[int, str]] = []
+        self._capturing: Trigger | None = None
+        self._parcels = {m.key: _Parcel(m, now.monotonic_ns, resend_after_ns) for m in spooled}
+        self._freed: OrderedDict[CaptureKey, None] = OrderedDict.fromkeys(freed)
+        self._failures: OrderedDict[CaptureKey, Failure] = OrderedDict()
+        self._verdicts: OrderedDict[CaptureKey, TriggerReply] = OrderedDict()
+
+    @property
+    def state(self) -> str:
+        if self._capturing is not None:
+            return "capturing"
+        if self._arming is not None:
+            return "arming"
+        return "armed" if self._lock_reply is not None else "idle"
+
+    @property
+    def armed(self) -> bool:
+        return self._lock_reply is not None
+
+    @property
+    def spooled(self) -> int:
+        """Number of images that wait for an acknowledgement."""
+        return len(self._parcels)
+
+    def handle(self, event: Event, now: Instant) -> list[Action]:
+        """Take one event; return what to do, in order."""
+        match event:
+            case ArmAsked():
+                return self._arm(event)
+            case CameraLocked():
+                return self._locked(event.reply)
+            case CameraRefused():
+                return self._refused(event)
+            case Triggered():
+                return self._triggered(event, now)
+            case FrameSpooled():
+                return self._frame_spooled(event.manifest, now)
+            case FrameLost():
+                return self._frame_lost(event)
+            case Sent():
+                return self._sent(event.key, now)
+            case Acknowledged():
+                return self._acknowledged(event.message)
+            case InventoryAsked():
+                return [Answer(event.question, self.inventory())]
+            case FetchAsked():
+                return self._fetch(event)
+            case Tick():
+                return self._due(now)
+
+    def inventory(self) -> Inventory:
+        """What this node holds, as it tells the controller."""
+        return Inventory(
+            node=self.node,
+            manifests=tuple(parcel.manifest for parcel in self._parcels.values()),
+            failures=tuple(self._failures.values()),
+            capturing=self._capturing.key if self._capturing else None,
+        )
+
+    # Arming
+
+    def _arm(self, event: ArmAsked) -> list[Action]:
+        wanted = event.message
+        if self._capturing is not None:
+            reason = f"a capture is under way ({self._capturing.key})"
+            reply = ArmReply(self.node, armed=False, settings_hash=wanted.settings_hash, reason=reason)
+            return [Answer(event.question, reply)]
+        if self._arming is not None:
+            # One lock at a time: the same settings share its answer, others are told to ask again.
+            if self._arming.settings_hash == wanted.settings_hash:
+                self._waiting.append((event.question, wanted.settings_hash))
+                return []
+            return [
+                Answer(
+                    event.question,
+                    ArmReply(
+                        self.node,
+                        armed=False,
+                        settings_hash=wanted.settings_hash,
+                        reason="the camera is being locked to other settings; ask again",
+                    ),
+                )
+            ]
+        if self._lock_reply is not None and self._lock_reply.settings_hash == wanted.settings_hash:
+            return [Answer(event.question, self._lock_reply)]
+        self._lock_reply = None
+        self._arming = wanted
+        self._waiting = [(event.question, wanted.settings_hash)]
+        return [LockCamera(wanted.settings, wanted.settings_hash)]
+
+    def _locked(self, reply: ArmReply) -> list[Action]:
+        if self._arming is None or reply.settings_hash != self._arming.settings_hash:
+            return []
+        self._lock_reply = reply
+        return self._answer_waiting(reply)
+
+    def _refused(self, event: CameraRefused) -> list[Action]:
+        if self._arming is None or event.settings_hash != self._arming.settings_hash:
+            return []
+        return self._answer_waiting(
+            ArmReply(self.node, armed=False, settings_hash=event.settings_hash, reason=event.reason)
+        )
+
+    def _answer_waiting(self, reply: ArmReply) -> list[Action]:
+        waiting, self._waiting, self._arming = self._waiting, [], None
+        return [Answer(question, reply) for question, _ in waiting]
+
+    # Capturing
+
+    def _triggered(self, event: Triggered, now: Instant) -> list[Action]:
+        trigger, key = event.message, event.message.key
+        known = self._verdicts.get(key)
+        if known is not None:
+            return [Answer(event.question, known)]
+        if key in self._parcels or key in self._freed:
+            return [Answer(event.question, TriggerReply(self.node, key, "accepted"))]
+        if self.state != "armed":
+            reason = f"the node is {self.state}"
+            return [Answer(event.question, TriggerReply(self.node, key, "not armed", reason))]
+        behind = now.wall_ns - key.fire_at_ns
+        if behind > 0:
+            reason = f"the trigger arrived {behind / 1e6:.1f} ms after its moment by this node's clock"
+            verdict = TriggerReply(self.node, key, "late", reason)
+            self._remember(self._verdicts, key, verdict)
+            return [Answer(event.question, verdict), *self._fail(key, reason)]
+        verdict = TriggerReply(self.node, key, "accepted")
+        self._remember(self._verdicts, key, verdict)
+        self._capturing = trigger
+        return [Answer(event.question, verdict), TakeFrame(trigger)]
+
+    def _frame_spooled(self, manifest: Manifest, now: Instant) -> list[Action]:
+        if self._capturing is not None and self._capturing.key == manifest.key:
+            self._capturing = None
+        if manifest.key in self._parcels or manifest.key in self._freed:
+            return []
+        self._parcels[manifest.key] = _Parcel(manifest, now.monotonic_ns, self._resend_after)
+        return self._due(now)
+
+    def _frame_lost(self, event: FrameLost) -> list[Action]:
+        if self._capturing is not None and self._capturing.key == event.key:
+            self._capturing = None
+            self._lock_reply = None
+        return self._fail(event.key, event.reason)
+
+    def _fail(self, key: CaptureKey, reason: str) -> list[Action]:
+        failure = Failure(self.node, key, reason)
+        self._remember(self._failures, key, failure)
+        return [Report(failure)]
+
+    @staticmethod
+    def _remember(memory: OrderedDict[CaptureKey, Any], key: CaptureKey, value: object) -> None:
+        memory[key] = value
+        while len(memory) > REMEMBERED:
+            memory.popitem(last=False)
+
+    # Delivering
+
+    def _due(self, now: Instant) -> list[Action]:
+        actions: list[Action] = []
+        for parcel in self._parcels.values():
+            if not parcel.sending and not parcel.unwanted and parcel.due_ns <= now.monotonic_ns:
+                parcel.sending = True
+                actions.append(Publish(parcel.manifest))
+        return actions
+
+    def _sent(self, key: CaptureKey, now: Instant) -> list[Action]:
+        parcel = self._parcels.get(key)
+        if parcel is not None:
+            parcel.sending = False
+            parcel.due_ns = now.monotonic_ns + parcel.wait_ns
+            parcel.wait_ns = min(2 * parcel.wait_ns, self._resend_at_most)
+        return []
+
+    def _acknowledged(self, ack: Ack) -> list[Action]:
+        parcel = self._parcels.get(ack.key)
+        if parcel is None or ack.node != self.node or ack.sha256 != parcel.manifest.sha256:
+            return []
+        if ack.verdict == "unknown":
+            parcel.unwanted = True
+            return []
+        del self._parcels[ack.key]
+        self._remember(self._freed, ack.key, None)
+        return [Free(ack.key, ack.sha256)]
+
+    def _fetch(self, event: FetchAsked) -> list[Action]:
+        parcel = self._parcels.get(event.key)
+        if parcel is None:
+            return [Decline(event.question, f"node {self.node} holds no image of {event.key}")]
+        if parcel.sending:
+            return [Decline(event.question, f"node {self.node} is sending the image of {event.key} at this moment")]
+        return [AnswerImage(event.question, parcel.manifest)]

@@ -1,0 +1,67 @@
+"""A camera that delivers images from files: real bytes at full size, and nothing to compute."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ringdic_node.cameras.camera import CameraError, Frame, Lock, Shot, check_settings
+from ringdic_node.clock import Clock, sleep_until
+
+_HEADER = re.compile(rb"P5\s+(\d+)\s+(\d+)\s+(\d+)\s")
+
+
+class PlaybackCamera:
+    """Every frame is the image of the file, read once; or each capture has a file of its own.
+
+    Parameters
+    ----------
+    image : str
+        A binary PGM file (P5, no comments), 8 or 16 bit. Raises CameraError if it is none. With ``{kind}`` and
+        ``{scene}`` in its name, the capture's kind and how many of that kind came before it are put in their places.
+    """
+
+    def __init__(self, clock: Clock, *, image: str = "") -> None:
+        self._clock = clock
+        self._image = image
+        self._pixels = None if "{" in image else read_pgm(Path(image))
+
+    def lock(self, settings: Mapping[str, Any]) -> Lock:
+        check_settings(settings)
+        return Lock(metadata=dict(settings), sync="simulated")
+
+    def capture(self, shot: Shot) -> Frame:
+        pixels = self._pixels
+        if pixels is None:
+            pixels = read_pgm(Path(self._image.replace("{kind}", shot.kind).replace("{scene}", str(shot.scene))))
+        sleep_until(self._clock, shot.fire_at_ns)
+        return Frame(pixels, shot.fire_at_ns)
+
+    def versions(self) -> dict[str, str]:
+        return {"camera": "playback"}
+
+    def close(self) -> None:
+        pass
+
+
+def read_pgm(path: Path) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
+    """The pixels (height, width) of a binary PGM file without comments. Raises CameraError."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise CameraError(f"{path}: cannot be read ({error.strerror}); name a PGM file") from error
+    header = _HEADER.match(content)
+    if header is None:
+        raise CameraError(f"{path}: not a binary PGM file; the camera plays back PGM only")
+    width, height, deepest = (int(number) for number in header.groups())
+    bytes_each = 1 if deepest < 256 else 2
+    if len(content) - header.end() != width * height * bytes_each:
+        raise CameraError(f"{path}: the file is cut off or too long for {width} x {height} pixels; write it anew")
+    if bytes_each == 1:
+        return np.frombuffer(content, np.uint8, offset=header.end()).reshape(height, width)
+    return np.frombuffer(content, ">u2", offset=header.end()).reshape(height, width).astype(np.uint16)

@@ -1,0 +1,95 @@
+"""A camera of the simulated rig: it renders what the real one would see at the planned moment.
+
+A node shows itself to the controller only after its camera is built, and the camera warms its renderer up first:
+whoever is alive renders at full speed.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ringdic_node.cameras.camera import CameraError, Frame, Lock, Shot, check_settings
+from ringdic_node.clock import Clock, sleep_until
+
+
+class VirtualCamera:
+    """One camera of the rig with the paper's geometry. Importing the renderer needs the extra `virtual`.
+
+    Parameters
+    ----------
+    camera : str
+        Id of a camera of the simulated rig, ``cam_01`` and so on.
+    cameras, scale, seed
+        Size of the ring, scale of the images, seed of the rig's scatter and of the noise.
+    specimen : str
+        ``limb`` or ``cylinder``.
+    jitter_us, offset_us : float
+        Standard deviation of a frame's time, and of this camera's constant delay, about the moment; µs.
+    """
+
+    def __init__(
+        self,
+        camera: str,
+        clock: Clock,
+        *,
+        cameras: int = 12,
+        scale: float = 0.25,
+        seed: int = 0,
+        specimen: str = "limb",
+        jitter_us: float = 30.0,
+        offset_us: float = 20.0,
+    ) -> None:
+        try:
+            from ringdic_node.virtual_rig.render import warm_up
+            from ringdic_node.virtual_rig.rig import paper_rig
+
+            ring = {lens.id: lens for lens in paper_rig(cameras=cameras, scale=scale, seed=seed).cameras}
+            warm_up(specimen)
+        except ImportError as error:
+            raise CameraError(
+                f"the simulated rig cannot be loaded ({error}); install the extra: pip install 'ringdic[virtual]'"
+            ) from error
+        except ValueError as error:
+            raise CameraError(f"the simulated rig cannot be built: {error}") from error
+        if camera not in ring:
+            raise CameraError(f"the simulated rig has no camera '{camera}'; it has {', '.join(ring)}")
+        self._lens = ring[camera]
+        self.camera = camera
+        self._clock = clock
+        self._seed = seed
+        self._specimen = specimen
+        self._random = np.random.default_rng([seed, zlib.crc32(camera.encode())])
+        self._jitter_us = jitter_us
+        self._offset_us = float(self._random.normal(0.0, offset_us))
+        self._exposure_us = 5000.0
+
+    def lock(self, settings: Mapping[str, Any]) -> Lock:
+        check_settings(settings)
+        self._exposure_us = float(settings.get("exposure_us", self._exposure_us))
+        return Lock(metadata={"ExposureTime": self._exposure_us, **settings}, sync="simulated")
+
+    def capture(self, shot: Shot) -> Frame:
+        from ringdic_node.virtual_rig.render import render
+        from ringdic_node.virtual_rig.scenes import scene
+
+        seen = scene(shot.kind, shot.scene, specimen=self._specimen, seed=self._seed)
+        noise = zlib.crc32(f"{self._seed}/{self.camera}/{shot.kind}/{shot.scene}".encode())
+        sleep_until(self._clock, shot.fire_at_ns)
+        pixels = render(self._lens, seen, noise)
+        delay_us = self._offset_us + self._random.normal(0.0, self._jitter_us)
+        return Frame(
+            pixels=pixels,
+            time_ns=shot.fire_at_ns + round(1000 * delay_us),
+            exposure_us=self._exposure_us,
+            metadata={"scene": f"{shot.kind} {shot.scene}", "specimen": self._specimen},
+        )
+
+    def versions(self) -> dict[str, str]:
+        return {"camera": "virtual"}
+
+    def close(self) -> None:
+        pass

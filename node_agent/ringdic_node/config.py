@@ -1,0 +1,154 @@
+"""The node's configuration file, checked when read.
+
+::
+
+    rig = "ring-12"
+    id = "cam_01"
+    controller = "tcp/192.168.1.10:7447"
+    spool = "/var/lib/ringdic/spool"
+    camera = "pi"                       # or "virtual", "pattern", "playback"
+
+    [pi]                                # settings of the camera chosen, all optional
+    size = [3280, 2464]
+    sync = "client"
+
+A relative spool folder is relative to the configuration file, and so is the image of a playback.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from ringdic_node.cameras.camera import Camera
+from ringdic_node.clock import Clock
+from ringdic_node.wire import WireError, checked_name
+
+
+class ConfigError(ValueError):
+    """The configuration cannot be used; the text names the file, the key and what to do."""
+
+
+_CAMERA_KEYS: dict[str, dict[str, type | tuple[type, ...]]] = {
+    "pi": {"size": list, "raw": bool, "sync": str, "tuning": str, "period_us": (int, float), "settle_frames": int},
+    "virtual": {
+        "cameras": int,
+        "scale": (int, float),
+        "seed": int,
+        "specimen": str,
+        "jitter_us": (int, float),
+        "offset_us": (int, float),
+    },
+    "pattern": {
+        "width": int,
+        "height": int,
+        "delay": (int, float),
+        "jitter_us": (int, float),
+        "seed": int,
+    },
+    "playback": {"image": str},
+}
+
+
+@dataclass(frozen=True)
+class NodeConfig:
+    """Everything a node needs to know before it starts. Waits in seconds."""
+
+    rig: str
+    id: str
+    controller: str
+    spool: Path
+    camera: str
+    camera_settings: Mapping[str, Any] = field(default_factory=dict)
+    spool_reserve_mb: int = 64
+    resend_s: float = 5.0
+    status_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        try:
+            checked_name("rig", self.rig)
+            checked_name("id", self.id)
+        except WireError as error:
+            raise ConfigError(str(error)) from error
+        if self.camera not in _CAMERA_KEYS:
+            raise ConfigError(f"camera '{self.camera}' is none of {', '.join(_CAMERA_KEYS)}")
+        if not re.fullmatch(r"(tcp|tls|quic)/\S+:\d+(#\S*)?", self.controller):
+            raise ConfigError(f"controller '{self.controller}' is no endpoint; write it like tcp/192.168.1.10:7447")
+        if self.resend_s <= 0 or self.status_s <= 0 or self.spool_reserve_mb < 0:
+            raise ConfigError("resend_s and status_s must be positive, spool_reserve_mb not negative")
+        known = _CAMERA_KEYS[self.camera]
+        for name, value in self.camera_settings.items():
+            if name not in known:
+                raise ConfigError(f"[{self.camera}] unknown key '{name}'; known are {', '.join(known)}")
+            if not isinstance(value, known[name]) or (isinstance(value, bool) and known[name] is not bool):
+                raise ConfigError(f"[{self.camera}] {name} cannot be {value!r}")
+
+
+def read_config(path: Path) -> NodeConfig:
+    """The configuration in the TOML file `path`; raises ConfigError."""
+    path = Path(path)
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path}: no such file; write the node's configuration there") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: {error}") from error
+    try:
+        return _parse(table, path.parent)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def _parse(table: dict[str, Any], folder: Path) -> NodeConfig:
+    plain = {f.name for f in fields(NodeConfig)} - {"camera_settings"}
+    sections = set(_CAMERA_KEYS)
+    for key in table:
+        if key not in plain | sections:
+            raise ConfigError(f"unknown key '{key}'; known are {', '.join(sorted(plain | sections))}")
+    for key in ("rig", "id", "controller", "spool", "camera"):
+        if not isinstance(table.get(key), str):
+            raise ConfigError(f"the key '{key}' is missing or not a text in quotes")
+    numbers = {}
+    for key in ("spool_reserve_mb", "resend_s", "status_s"):
+        if key in table:
+            if not isinstance(table[key], int | float) or isinstance(table[key], bool):
+                raise ConfigError(f"{key} must be a number, not {table[key]!r}")
+            numbers[key] = table[key]
+    settings = table.get(table["camera"], {})
+    if not isinstance(settings, dict):
+        raise ConfigError(f"[{table['camera']}] must be a table")
+    if table["camera"] == "playback" and isinstance(settings.get("image"), str):
+        settings = {**settings, "image": str(folder / settings["image"])}
+    return NodeConfig(
+        rig=table["rig"],
+        id=table["id"],
+        controller=table["controller"],
+        spool=folder / table["spool"],
+        camera=table["camera"],
+        camera_settings=settings,
+        **numbers,
+    )
+
+
+def make_camera(config: NodeConfig, clock: Clock) -> Camera:
+    """The camera that the configuration names; imported only here, so that a node loads no other."""
+    settings = dict(config.camera_settings)
+    if config.camera == "pattern":
+        from ringdic_node.cameras.pattern import PatternCamera
+
+        return PatternCamera(config.id, clock, **settings)
+    if config.camera == "playback":
+        from ringdic_node.cameras.playback import PlaybackCamera
+
+        return PlaybackCamera(clock, **settings)
+    if config.camera == "virtual":
+        from ringdic_node.cameras.virtual import VirtualCamera
+
+        return VirtualCamera(config.id, clock, **settings)
+    from ringdic_node.cameras.pi import PiCamera
+
+    return PiCamera(clock, **settings)

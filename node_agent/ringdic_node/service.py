@@ -1,0 +1,283 @@
+"""The node's shell: it performs what the agent decides, on a camera, a spool and a link.
+
+Three threads: the main loop feeds the agent one event at a time; one thread uses the camera and the disk;
+one thread sends images, because sending blocks while the network is busy.
+"""
+
+from __future__ import annotations
+
+import logging
+import platform
+import queue
+import threading
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+
+import numpy as np
+import numpy.typing as npt
+
+from ringdic_node import agent as steps
+from ringdic_node.agent import Agent
+from ringdic_node.cameras.camera import Camera, CameraError, Frame, Shot
+from ringdic_node.clock import Clock, clock_offset
+from ringdic_node.config import NodeConfig
+from ringdic_node.link import NodeLink
+from ringdic_node.spool import Spool, SpoolError, digest
+from ringdic_node.wire import (
+    Ack,
+    Arm,
+    ArmReply,
+    Fetch,
+    Keys,
+    Manifest,
+    Status,
+    Trigger,
+    WireError,
+    decode_as,
+    encode,
+)
+
+log = logging.getLogger(__name__)
+
+PREVIEW_WIDTH = 480
+
+
+class ServiceError(RuntimeError):
+    """The node cannot go on; the text tells why. Its supervisor should start it anew."""
+
+
+class NodeService:
+    """One node: agent, camera, spool and link joined."""
+
+    def __init__(self, config: NodeConfig, camera: Camera, spool: Spool, clock: Clock) -> None:
+        self.config = config
+        self._camera = camera
+        self._spool = spool
+        self._clock = clock
+        self._events: queue.Queue[steps.Event | Callable[[], None]] = queue.Queue()
+        self._camera_work: queue.Queue[steps.LockCamera | steps.TakeFrame | None] = queue.Queue()
+        self._parcels: queue.Queue[steps.Publish | steps.AnswerImage | None] = queue.Queue()
+        self._stop = threading.Event()
+        self._preview: npt.NDArray[np.uint8] | None = None
+        self._offset = clock_offset()
+        self._versions = {**_versions(), **camera.versions()}
+        self._agent = Agent(
+            config.id,
+            clock.now(),
+            spooled=spool.manifests(),
+            freed=spool.tombstones(),
+            resend_after_ns=round(config.resend_s * 1e9),
+        )
+
+    def stop(self) -> None:
+        """Ask the main loop to end; may be called from a signal handler or another thread."""
+        self._stop.set()
+
+    def run(self) -> None:
+        """Serve until stopped. Raises ServiceError if one of its threads has died."""
+        keys = Keys(self.config.rig)
+        with NodeLink(keys, self.config.id, self.config.controller, self._receive, self._receive_ack) as link:
+            self._link = link
+            workers = [
+                threading.Thread(target=self._use_camera, name="camera", daemon=True),
+                threading.Thread(target=self._send_images, name="sender", daemon=True),
+            ]
+            for worker in workers:
+                worker.start()
+            log.info("node %s of rig %s serves; %d images wait", self.config.id, self.config.rig, self._agent.spooled)
+            try:
+                self._loop(workers)
+            finally:
+                self._camera_work.put(None)
+                self._parcels.put(None)
+        self._camera.close()
+
+    def _loop(self, workers: list[threading.Thread]) -> None:
+        told: tuple[object, ...] = ()
+        next_status = 0
+        while not self._stop.is_set():
+            try:
+                event = self._events.get(timeout=0.1)
+            except queue.Empty:
+                event = steps.Tick()
+            if isinstance(event, steps.Event):
+                for action in self._agent.handle(event, self._clock.now()):
+                    self._perform(action)
+            else:
+                event()
+            now = self._clock.now().monotonic_ns
+            state = (self._agent.state, self._agent.spooled)
+            if state != told or now >= next_status:
+                told, next_status = state, now + round(self.config.status_s * 1e9)
+                self._link.publish_status(self._status())
+            for worker in workers:
+                if not worker.is_alive():
+                    raise ServiceError(f"the node's {worker.name} thread has died; its traceback is above")
+
+    def _status(self) -> Status:
+        return Status(
+            node=self.config.id,
+            state=self._agent.state,
+            armed=self._agent.armed,
+            time_ns=self._clock.now().wall_ns,
+            spool_free=self._spool.free,
+            spool_images=self._agent.spooled,
+            versions=self._versions,
+            clock_offset_ms=self._offset[0] if self._offset else None,
+        )
+
+    # What comes in, from Zenoh's threads: decode and enqueue, no more
+
+    def _receive(self, verb: str, payload: bytes, question: int) -> None:
+        try:
+            self._events.put(self._event(verb, payload, question))
+        except WireError as error:
+            log.warning("a question (%s) breaks the contract: %s", verb, error)
+            self._link.decline(question, str(error))
+
+    def _event(self, verb: str, payload: bytes, question: int) -> steps.Event | Callable[[], None]:
+        match verb:
+            case "arm":
+                return steps.ArmAsked(decode_as(Arm, payload), question)
+            case "trigger":
+                return steps.Triggered(decode_as(Trigger, payload), question)
+            case "inventory":
+                return steps.InventoryAsked(question)
+            case "fetch":
+                return steps.FetchAsked(decode_as(Fetch, payload).key, question)
+            case "status":
+                return lambda: self._link.answer(question, encode(self._status()))
+            case "preview":
+                return lambda: self._answer_preview(question)
+        raise WireError(f"no such question: {verb}")
+
+    def _receive_ack(self, payload: bytes) -> None:
+        try:
+            self._events.put(steps.Acknowledged(decode_as(Ack, payload)))
+        except WireError as error:
+            log.warning("an acknowledgement breaks the contract: %s", error)
+
+    # What goes out
+
+    def _perform(self, action: steps.Action) -> None:
+        match action:
+            case steps.LockCamera() | steps.TakeFrame():
+                self._camera_work.put(action)
+            case steps.Publish() | steps.AnswerImage():
+                self._parcels.put(action)
+            case steps.Free():
+                try:
+                    self._spool.remove(action.key, action.sha256)
+                except SpoolError as error:
+                    log.error("a delivered image stays in the spool: %s", error)
+            case steps.Report():
+                log.error("capture %s failed: %s", action.failure.key, action.failure.reason)
+                self._link.publish_status(action.failure)
+            case steps.Answer():
+                self._link.answer(action.question, encode(action.message))
+            case steps.Decline():
+                self._link.decline(action.question, action.reason)
+
+    def _answer_preview(self, question: int) -> None:
+        if self._preview is None:
+            self._link.decline(question, "no frame has been taken yet")
+            return
+        height, width = self._preview.shape
+        self._link.answer(question, f"P5\n{width} {height}\n255\n".encode() + self._preview.tobytes())
+
+    # The camera's thread
+
+    def _use_camera(self) -> None:
+        while (work := self._camera_work.get()) is not None:
+            if isinstance(work, steps.LockCamera):
+                self._events.put(self._lock(work))
+            else:
+                self._events.put(self._take(work.trigger))
+
+    def _lock(self, work: steps.LockCamera) -> steps.Event:
+        try:
+            held = self._camera.lock(work.settings)
+        except CameraError as error:
+            return steps.CameraRefused(work.settings_hash, str(error))
+        self._offset = clock_offset()
+        return steps.CameraLocked(
+            ArmReply(
+                node=self.config.id,
+                armed=True,
+                settings_hash=work.settings_hash,
+                locked=held.metadata,
+                sync=held.sync,
+                clock_offset_ms=self._offset[0] if self._offset else None,
+                clock_error_ms=self._offset[1] if self._offset else None,
+                frame_time_ns=held.frame_time_ns,
+                frame_period_ns=held.frame_period_ns,
+                spool_free=self._spool.free,
+                versions=self._versions,
+            )
+        )
+
+    def _take(self, trigger: Trigger) -> steps.Event:
+        shot = Shot(trigger.key.fire_at_ns, trigger.kind, trigger.scene)
+        try:
+            frame = self._camera.capture(shot)
+            parts = frame.pgm()
+            manifest = make_manifest(self.config.id, trigger, frame, parts)
+            self._spool.store(manifest, parts)
+        except (CameraError, SpoolError, WireError) as error:
+            return steps.FrameLost(trigger.key, str(error))
+        self._preview = shrink(frame)
+        return steps.FrameSpooled(manifest)
+
+    # The sender's thread
+
+    def _send_images(self) -> None:
+        while (work := self._parcels.get()) is not None:
+            key = work.manifest.key
+            try:
+                image = self._spool.read(key)
+            except SpoolError as error:  # acknowledged and freed since, or the disk is failing
+                log.warning("%s", error)
+                if isinstance(work, steps.AnswerImage):
+                    self._link.decline(work.question, str(error))
+            else:
+                if isinstance(work, steps.AnswerImage):
+                    self._link.answer(work.question, image, work.manifest)
+                else:
+                    self._link.publish_image(work.manifest, image)
+            if isinstance(work, steps.Publish):
+                self._events.put(steps.Sent(key))
+
+
+def make_manifest(node: str, trigger: Trigger, frame: Frame, parts: tuple[bytes, bytes]) -> Manifest:
+    """The manifest of a frame written as `parts`."""
+    sha256, length = digest(parts)
+    return Manifest(
+        node=node,
+        key=trigger.key,
+        kind=trigger.kind,
+        sha256=sha256,
+        bytes=length,
+        width=frame.width,
+        height=frame.height,
+        time_ns=frame.time_ns,
+        exposure_us=frame.exposure_us,
+        metadata=frame.metadata,
+    )
+
+
+def shrink(frame: Frame) -> npt.NDArray[np.uint8]:
+    """Every n-th pixel of the frame, at most `PREVIEW_WIDTH` wide, 8 bit."""
+    stride = -(-frame.width // PREVIEW_WIDTH)
+    small = frame.pixels[::stride, ::stride]
+    shift = 8 if small.dtype == np.uint16 else 0
+    return np.ascontiguousarray((small >> shift).astype(np.uint8))
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for package in ("ringdic", "eclipse-zenoh"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed as a package"
+    return found

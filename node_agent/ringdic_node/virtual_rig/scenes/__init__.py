@@ -1,0 +1,33 @@
+"""What stands in the ring, each scene with its exact truth."""
+
+from __future__ import annotations
+
+from ringdic_node.virtual_rig.scenes.board import Board
+from ringdic_node.virtual_rig.scenes.damage import Bar, Damage, Patch
+from ringdic_node.virtual_rig.scenes.specimen import Cylinder, Limb, Specimen
+from ringdic_node.virtual_rig.scenes.target import Target
+
+Scene = Board | Target | Specimen
+
+__all__ = ["Bar", "Board", "Cylinder", "Damage", "Limb", "Patch", "Scene", "Specimen", "Target", "scene"]
+
+_SPECIMENS = {"limb": Limb, "cylinder": Cylinder}
+
+
+def scene(kind: str, index: int, specimen: str = "limb", seed: int = 0) -> Scene:
+    """The scene of a capture: ``index`` is the pose of a board, the step of a specimen.
+
+    kind : board, target, specimen, or static (the specimen at rest). specimen : limb or cylinder.
+    Raises ValueError for a kind, an index or a specimen that does not exist.
+    """
+    if index < 0:
+        raise ValueError(f"the scenes of a kind are counted from 0, not {index}")
+    if kind == "board":
+        return Board(index, seed)
+    if kind == "target":
+        return Target()
+    if kind not in ("specimen", "static"):
+        raise ValueError(f"there is no scene of kind '{kind}'; use board, target, specimen or static")
+    if specimen not in _SPECIMENS:
+        raise ValueError(f"there is no specimen '{specimen}'; use {' or '.join(_SPECIMENS)}")
+    return Specimen(_SPECIMENS[specimen](), index if kind == "specimen" else 0, seed)

@@ -1,0 +1,102 @@
+"""What spoils the images of a specimen: speckles worn off, reflections of lamps, bars before the body.
+
+Positions are in the world, mm; worn patches lie on the body, in its material coordinates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic_node.virtual_rig.texture import RADIUS
+
+Array = NDArray[np.float64]
+
+GLARE_PEAK = 3.0  # radiance of a lamp's reflection; 1 saturates
+GLARE_WIDTH = 0.03  # rad, standard deviation of the lobe about the mirror's direction
+BAR = 0.10  # radiance of a bar
+_GLARING = 0.3  # radiance added above which a speckle pattern is spoilt
+
+
+@dataclass(frozen=True)
+class Patch:
+    """An ellipse where the speckles are worn off: middle at theta (rad), z (mm), half axes along arc and height, mm."""
+
+    theta: float
+    z: float
+    half_arc: float
+    half_height: float
+
+
+@dataclass(frozen=True)
+class Bar:
+    """An opaque round bar with round ends, from one point to another, mm."""
+
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    radius: float
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Everything that spoils a specimen's images at one step. lamps : positions, mm, mirrored by a glossy body."""
+
+    patches: tuple[Patch, ...] = ()
+    lamps: tuple[tuple[float, float, float], ...] = ()
+    bars: tuple[Bar, ...] = ()
+
+    def arrays(self) -> tuple[Array, Array, Array]:
+        """Patches (k, 4) as arc, z and half axes; lamps (m, 3); bars (b, 7) as start, end, radius. All mm."""
+        patches = [
+            (each.theta % (2 * np.pi) * RADIUS, each.z, each.half_arc, each.half_height) for each in self.patches
+        ]
+        bars = [(*bar.start, *bar.end, bar.radius) for bar in self.bars]
+        return (
+            np.array(patches, dtype=float).reshape(-1, 4),
+            np.array(self.lamps, dtype=float).reshape(-1, 3),
+            np.array(bars, dtype=float).reshape(-1, 7),
+        )
+
+    def worn(self, theta: Array, z: Array) -> NDArray[np.bool_]:
+        """Which material points (n,) have lost their speckles."""
+        off = np.zeros(np.shape(theta), dtype=bool)
+        for patch in self.patches:
+            arc = (np.asarray(theta) - patch.theta + np.pi) % (2 * np.pi) - np.pi
+            off |= (RADIUS * arc / patch.half_arc) ** 2 + ((z - patch.z) / patch.half_height) ** 2 < 1.0
+        return off
+
+    def spoilt(self, centre: Array, xyz: Array, normals: Array) -> NDArray[np.bool_]:
+        """Which points a camera sees behind a bar or in a reflection.
+
+        centre : (3,) of the camera; xyz : (n, 3) points of the surface, mm; normals : (n, 3) of unit length, outwards.
+        """
+        towards = centre - xyz
+        distance = np.linalg.norm(towards, axis=1)
+        view = towards / distance[:, None]
+        glare = np.zeros(len(xyz))
+        for lamp in self.lamps:
+            light = np.array(lamp) - xyz
+            light /= np.linalg.norm(light, axis=1, keepdims=True)
+            half = view + light
+            half /= np.linalg.norm(half, axis=1, keepdims=True)
+            facing = np.sum(light * normals, axis=1) > 0
+            angle_squared = 2.0 * (1.0 - np.sum(half * normals, axis=1))
+            glare += np.where(facing, GLARE_PEAK * np.exp(-0.5 * angle_squared / GLARE_WIDTH**2), 0.0)
+        hidden = np.zeros(len(xyz), dtype=bool)
+        for bar in self.bars:
+            hidden |= _gap(centre, xyz, np.array(bar.start), np.array(bar.end)) < bar.radius
+        return np.asarray(hidden | (glare > _GLARING))
+
+
+def _gap(centre: Array, xyz: Array, start: Array, end: Array) -> Array:
+    """Least distance of each line of sight, from the centre to a point (n, 3), from a segment. (n,) mm."""
+    d, e = xyz - centre, end - start
+    w = centre - start
+    a, b, c = np.sum(d * d, axis=1), d @ e, float(e @ e)
+    f, g = d @ w, float(e @ w)
+    det = np.maximum(a * c - b * b, 1e-12)
+    s = np.clip((a * g - b * f) / det, 0.0, 1.0)
+    t = np.clip((b * s - f) / a, 0.0, 1.0)
+    return np.asarray(np.linalg.norm(w + t[:, None] * d - s[:, None] * e, axis=1))

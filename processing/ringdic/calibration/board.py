@@ -1,0 +1,79 @@
+"""The corners of a checkerboard in an image, found coarsely and refined at full resolution."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.session.rig import Board
+
+Array = NDArray[np.float64]
+
+#: Long sides to which an image is brought to look for the board, px: smallest first, because it is fastest.
+_SEARCH_SIZES = (1000, 2000)
+
+
+def board_points(board: Board) -> Array:
+    """Inner corners on the board, in the order of :func:`find_corners`. (n, 2) mm, (0, 0) at the first corner."""
+    across, along = board.inner_corners
+    y, x = np.mgrid[:along, :across]
+    return np.column_stack([x.ravel(), y.ravel()]) * float(board.square_mm)
+
+
+def find_corners(image: NDArray[np.generic], inner_corners: tuple[int, int]) -> Array | None:
+    """Inner corners of the checkerboard, or None where the whole board is not found.
+
+    image : (height, width) grey, uint8, uint16 or float in 0 … 255.
+    inner_corners : (across, along).
+
+    Returns (n, 2) px, first index running fastest along ``across``. Which end of the board comes first is
+    arbitrary, which intrinsics do not feel. Sub-pixel positions: the point to which all grey gradients around the
+    corner are perpendicular (Förstner & Gülch 1987).
+    """
+    grey = _as_uint8(image)
+    rough = _search(grey, inner_corners)
+    if rough is None:
+        return None
+    spacing = _spacing(rough, inner_corners)
+    half = int(np.clip(round(0.35 * spacing), 2, 15))
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-4)
+    start = np.ascontiguousarray(rough, dtype=np.float32).reshape(-1, 1, 2)
+    fine = cv2.cornerSubPix(grey, start.copy(), (half, half), (-1, -1), stop).reshape(-1, 2).astype(float)
+    moved = np.linalg.norm(fine - rough, axis=1)
+    return fine if np.all(moved < 0.35 * spacing) else None
+
+
+def _search(grey: NDArray[np.uint8], inner_corners: tuple[int, int]) -> Array | None:
+    """Corners good to a pixel or so, from the smallest version of the image that shows the board."""
+    height, width = grey.shape
+    for size in _SEARCH_SIZES:
+        scale = min(size / max(height, width), 2.0)
+        method = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+        small = cv2.resize(grey, (round(width * scale), round(height * scale)), interpolation=method).astype(np.uint8)
+        found, corners = cv2.findChessboardCornersSB(small, inner_corners, flags=0)
+        if found:
+            factor = np.array([width / small.shape[1], height / small.shape[0]])
+            return (corners.reshape(-1, 2).astype(float) + 0.5) * factor - 0.5
+    return None
+
+
+def _spacing(corners: Array, inner_corners: tuple[int, int]) -> float:
+    """Smallest distance of neighbouring corners, px."""
+    grid = corners.reshape(inner_corners[1], inner_corners[0], 2)
+    return float(
+        min(
+            np.linalg.norm(np.diff(grid, axis=0), axis=-1).min(),
+            np.linalg.norm(np.diff(grid, axis=1), axis=-1).min(),
+        )
+    )
+
+
+def _as_uint8(image: NDArray[np.generic]) -> NDArray[np.uint8]:
+    if image.ndim != 2:
+        raise ValueError(f"a grey image has two axes, not {image.ndim}")
+    if image.dtype == np.uint8:
+        return np.ascontiguousarray(image, dtype=np.uint8)
+    if image.dtype == np.uint16:
+        return np.ascontiguousarray(image.astype(np.float32) / 257.0 + 0.5).astype(np.uint8)
+    return np.clip(image.astype(np.float32) + 0.5, 0, 255).astype(np.uint8)

@@ -1,0 +1,190 @@
+"""Where the centroid of a printed dot appears: the dot is a patch of a curved surface, not a point.
+
+The centroid of a dot's image is not the projection of its centre: perspective, the curvature of the cylinder and the
+lens weigh its near parts more. With the image ``p(s, z)`` of the sheet's point (s along the arc, z along the axis),
+centroid = ∫∫ p |∂p/∂(s, z)| ds dz / ∫∫ |∂p/∂(s, z)| ds dz over the printed square or disk, here by a rule of sixteen
+nodes. Derivatives by complex steps (Squire & Trapp 1998), exact to round-off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.session.rig import Target
+
+Array = NDArray[np.float64]
+Values = NDArray[Any]  # float64, or complex128 in a complex step
+
+_STEP = 1e-40
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """The printed sheet as it lies round the cylinder.
+
+    radius : of the surface, mm. pitch : of the columns along the arc, mm. tilt : by which the sheet is turned in the
+    surface, rad; positive raises the higher columns.
+    """
+
+    radius: float
+    pitch: float
+    tilt: float = 0.0
+
+    @classmethod
+    def nominal(cls, target: Target) -> Sheet:
+        """The sheet as the rig describes it."""
+        return cls(target.radius_mm, target.column_spacing_mm)
+
+    def seam(self, target: Target) -> float:
+        """Arc from the last column round to the first, mm."""
+        return 2 * np.pi * self.radius - (target.columns - 1) * self.pitch
+
+
+def sheet_points(target: Target, sheet: Sheet, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
+    """Arc and height of dots' centres on the sheet, without print errors. rows, columns : (n,), from 1. (n, 2) mm."""
+    arc, height = _nominal(target, rows, columns)
+    s = arc * (sheet.pitch / target.column_spacing_mm) - sheet.tilt * (height - _middle(target)[1])
+    return np.column_stack([s, height + sheet.tilt * (arc - _middle(target)[0])])
+
+
+def by_sheet(target: Target, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
+    """Derivatives of :func:`sheet_points` by pitch and tilt. (n, 2, 2), last axis the parameter."""
+    arc, height = _nominal(target, rows, columns)
+    D = np.zeros((len(arc), 2, 2))
+    D[:, 0, 0] = arc / target.column_spacing_mm
+    D[:, 0, 1] = -(height - _middle(target)[1])
+    D[:, 1, 1] = arc - _middle(target)[0]
+    return D
+
+
+def _nominal(target: Target, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> tuple[Array, Array]:
+    arc = (np.asarray(columns, dtype=np.float64) - 1) * target.column_spacing_mm
+    return arc, target.first_row_z_mm + (np.asarray(rows, dtype=np.float64) - 1) * target.row_spacing_mm
+
+
+def _middle(target: Target) -> tuple[float, float]:
+    return (
+        0.5 * (target.columns - 1) * target.column_spacing_mm,
+        target.first_row_z_mm + 0.5 * (target.rows - 1) * target.row_spacing_mm,
+    )
+
+
+def wrapped(sz: Array, radius: float) -> Array:
+    """Points of the sheet (..., 2) on the cylinder. (..., 3) mm."""
+    angle = sz[..., 0] / radius
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), sz[..., 1]], axis=-1)
+
+
+def nodes(shape: str, size: float) -> tuple[Array, Array]:
+    """Points on a dot about its centre (16, 2), mm, and their weights (16,), sum 1.
+
+    square : 4 × 4 Gauss-Legendre points of the edge ``size``. circle : of the diameter ``size``, two radii by Gauss's
+    rule in r² and eight angles, exact to the seventh degree.
+    """
+    x: Array
+    w: Array
+    if shape == "square":
+        x, w = (np.asarray(each, dtype=np.float64) for each in np.polynomial.legendre.leggauss(4))
+        return 0.5 * size * np.column_stack([np.tile(x, 4), np.repeat(x, 4)]), np.outer(w, w).ravel() / 4
+    x, w = np.polynomial.legendre.leggauss(2)
+    radius = np.repeat(0.5 * size * np.sqrt((x + 1) / 2), 8)
+    angle = np.tile(np.arange(8) * np.pi / 4, 2)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]), np.repeat(w, 8) / 16
+
+
+@dataclass(frozen=True)
+class Views:
+    """One row for each dot in each image: the camera's state and the dot's place. n rows.
+
+    inner : (n, 10), fx fy s cx cy k1 k2 p1 p2 k3. rotation : (n, 3, 3) and translation : (n, 3), world to camera.
+    sz : (n, 2) arc and height of the dot's centre on the sheet, mm.
+    """
+
+    inner: Array
+    rotation: Array
+    translation: Array
+    sz: Array
+    radius: float
+
+
+def project_patches(views: Views, shape: str, size: float) -> Array:
+    """Centroids of the dots' images. (n, 2) px."""
+    distorted = _centroids(views, nodes(shape, size))
+    return _to_px(views.inner, distorted)
+
+
+def project_centres(views: Views) -> Array:
+    """Images of the dots' centres. (n, 2) px."""
+    return _to_px(views.inner, _centroids(views, (np.zeros((1, 2)), np.ones(1))))
+
+
+def patch_jacobians(views: Views, shape: str, size: float) -> tuple[Array, Array, Array, Array, Array]:
+    """Centroids (n, 2) px and their derivatives.
+
+    Returns px, by inner parameters (n, 2, 10), by pose (n, 2, 6), by sz (n, 2, 2), by the radius (n, 2, 1).
+    The pose moves as ``R ← exp([ω]×) R``, ``t ← t + τ``, six parameters (ω, τ).
+    """
+    rule = nodes(shape, size)
+    distorted = _centroids(views, rule)
+    n = len(distorted)
+    inner = np.zeros((n, 2, 10))
+    inner[:, 0, 0], inner[:, 1, 1], inner[:, 0, 2] = distorted[:, 0], distorted[:, 1], distorted[:, 1]
+    inner[:, 0, 3] = inner[:, 1, 4] = 1.0
+    rest = np.zeros((n, 2, 14))
+    for k in range(14):
+        step = np.zeros(14, dtype=complex)
+        step[k] = 1j * _STEP
+        rest[:, :, k] = _centroids(views, rule, step).imag / _STEP
+    to_px = np.zeros((n, 2, 2))
+    to_px[:, 0, 0], to_px[:, 0, 1], to_px[:, 1, 1] = views.inner[:, 0], views.inner[:, 2], views.inner[:, 1]
+    rest = to_px @ rest
+    inner[:, :, 5:] = rest[:, :, :5]
+    return _to_px(views.inner, distorted), inner, rest[:, :, 5:11], rest[:, :, 11:13], rest[:, :, 13:]
+
+
+def _to_px(inner: Array, distorted: Array) -> Array:
+    fx, fy, s, cx, cy = inner.T[:5]
+    return np.column_stack([fx * distorted[:, 0] + s * distorted[:, 1] + cx, fy * distorted[:, 1] + cy])
+
+
+def _centroids(views: Views, rule: tuple[Array, Array], step: Values | None = None) -> Values:
+    """Centroids in distorted normalised coordinates (n, 2).
+
+    step : (14,) added to k1 k2 p1 p2 k3, ω (3), τ (3), s, z, radius.
+    """
+    offsets, weights = rule
+    d: Values = np.zeros(14) if step is None else step
+    k1, k2, p1, p2, k3 = (views.inner[:, 5 + i, None] + d[i] for i in range(5))
+    radius = views.radius + d[13]
+    angle = (views.sz[:, 0, None] + d[11] + offsets[:, 0]) / radius
+    height = views.sz[:, 1, None] + d[12] + offsets[:, 1]
+    cos, sin = np.cos(angle), np.sin(angle)
+    turn = np.array([[1, -d[7], d[6]], [d[7], 1, -d[5]], [-d[6], d[5], 1]])  # to first order, which is all it needs
+    R = turn @ views.rotation
+    X, Y, Z = (
+        radius * (R[:, i, 0, None] * cos + R[:, i, 1, None] * sin)
+        + R[:, i, 2, None] * height
+        + views.translation[:, i, None]
+        + d[8 + i]
+        for i in range(3)
+    )
+    Xs, Ys, Zs = (R[:, i, 1, None] * cos - R[:, i, 0, None] * sin for i in range(3))
+    Xz, Yz, Zz = (R[:, i, 2, None] for i in range(3))
+    x, y = X / Z, Y / Z
+    # |∂(x, y)/∂(s, z)| without its sign, and then the lens's share; fx fy is the same for the whole dot.
+    area = ((Xs - x * Zs) * (Yz - y * Zz) - (Xz - x * Zz) * (Ys - y * Zs)) / (Z * Z)
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))
+    xx = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
+    yy = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+    xy = x * y * slope + 2 * (p1 * x + p2 * y)
+    weight = weights * area * (xx * yy - xy * xy)
+    x_d = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    y_d = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    total = weight.sum(axis=1)
+    return np.stack([(weight * x_d).sum(axis=1) / total, (weight * y_d).sum(axis=1) / total], axis=-1)

@@ -1,0 +1,35 @@
+"""The options that several commands share, and the results that they choose."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from ringdic.results.evaluation import Evaluated
+
+Session = Annotated[Path, typer.Argument(help="The session folder.")]
+Run = Annotated[int | None, typer.Option(help="Number of the processing run; the newest unless given.")]
+Reference = Annotated[str, typer.Option(help="What a step is compared with: first or previous.")]
+WithoutRigidMotion = Annotated[bool, typer.Option("--without-rigid-motion", help="Move each step back first.")]
+Window = Annotated[float | None, typer.Option(metavar="MM", help="Strain window; the run's own unless given.")]
+SethHill = Annotated[float | None, typer.Option(metavar="M", help="Strains of this exponent as well.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
+
+
+def results_of(
+    session: Path,
+    run: int | None,
+    reference: str,
+    without_rigid_motion: bool = False,
+    window: float | None = None,
+    exponent: float | None = None,
+) -> Evaluated:
+    """The results of a run as the options evaluate them. Raises InputError for a run that is not there."""
+    from ringdic.results.evaluation import Evaluation, evaluated
+    from ringdic.session.folder import newest_results
+
+    how = Evaluation.of(reference, without_rigid_motion, window, exponent)
+    return evaluated(newest_results(session, run), how)

@@ -1,0 +1,149 @@
+"""``ringdic report``, ``ringdic overlay`` and ``ringdic animate``: results as a page, as pictures, as films."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ringdic.cli.console import narrated, say
+from ringdic.cli.options import AsJson, Reference, Run, Session, Window, WithoutRigidMotion, results_of
+from ringdic.errors import InputError
+from ringdic.progress import Progress
+
+if TYPE_CHECKING:
+    from ringdic.pictures.scale import Scale
+    from ringdic.results.evaluation import Evaluated
+    from ringdic.session.folder import Session as Captured
+
+FieldName = Annotated[str, typer.Option("--field", help="Field that gives the colours.")]
+Limits = Annotated[str | None, typer.Option(metavar="LOW,HIGH", help="Of the colours; from all steps unless given.")]
+Opacity = Annotated[float, typer.Option(min=0.0, max=1.0, help="Of the colours over the photograph.")]
+Camera = Annotated[str | None, typer.Option(help="Camera whose photographs are used.")]
+
+
+def report(
+    session: Session,
+    out: Annotated[Path | None, typer.Option(help="HTML file; report.html beside the results unless given.")] = None,
+    run: Run = None,
+    as_json: AsJson = False,
+) -> None:
+    """One self-contained HTML page of a run: reporting tables, calibration, noise floor, maps."""
+    from ringdic.report import write_report
+
+    with narrated() as narrate:
+        written = write_report(session, out, run, lambda done: narrate(Progress("report", done)))
+    _told([written], as_json)
+
+
+def overlay(
+    session: Session,
+    field: FieldName = "lambda2",
+    camera: Annotated[list[str] | None, typer.Option(help="Camera; repeatable. All unless given.")] = None,
+    step: Annotated[int | None, typer.Option(help="Step from 0, the reference; the last unless given.")] = None,
+    limits: Limits = None,
+    opacity: Opacity = 0.65,
+    out: Annotated[Path, typer.Option(help="Folder for the pictures, one PNG a camera.")] = Path("."),
+    bar: Annotated[bool, typer.Option(help="The colour bar beside each picture.")] = True,
+    run: Run = None,
+    reference: Reference = "first",
+    without_rigid_motion: WithoutRigidMotion = False,
+    window: Window = None,
+    as_json: AsJson = False,
+) -> None:
+    """A field over the photographs that the cameras took."""
+    from PIL import Image
+
+    from ringdic.pictures.overlay import overlay as laid_over
+    from ringdic.pictures.overlay import photograph, with_bar
+    from ringdic.session.folder import read_session
+
+    seen = results_of(session, run, reference, without_rigid_motion, window)
+    scale = _scale(seen, field, limits)
+    number = _step(seen, step)
+    captured = read_session(session)
+    name = seen.steps[number]
+    cameras = camera or _photographed(captured, name, seen)
+    out.mkdir(parents=True, exist_ok=True)
+    written = []
+    for id_ in cameras:
+        picture = laid_over(seen, id_, photograph(captured, name, id_), scale, number, opacity)
+        path = out / f"{field.replace(':', '-')}-{name}-{id_}.png"
+        Image.fromarray(with_bar(picture, scale) if bar else picture).save(path)
+        written.append(path)
+    _told(written, as_json)
+
+
+def animate(
+    session: Session,
+    out: Annotated[Path, typer.Option(help="The .gif or .mp4 file.")],
+    field: FieldName = "lambda2",
+    camera: Camera = None,
+    azimuth: Annotated[float | None, typer.Option(help="Degrees from which the body is seen.")] = None,
+    limits: Limits = None,
+    seconds: Annotated[float, typer.Option(min=0.02, max=60.0, help="Each step is shown for.")] = 0.8,
+    size: Annotated[int, typer.Option(min=64, max=4096, help="Longer side of the picture, px.")] = 720,
+    opacity: Opacity = 0.65,
+    run: Run = None,
+    reference: Reference = "first",
+    without_rigid_motion: WithoutRigidMotion = False,
+    window: Window = None,
+    as_json: AsJson = False,
+) -> None:
+    """A field over all steps as GIF or MP4: on one camera's photographs, or on the body seen from a side."""
+    from ringdic.pictures.animation import overlay_frames, surface_frames, write_animation
+    from ringdic.pictures.views import mean_azimuth
+    from ringdic.session.folder import read_session
+
+    if camera is not None and azimuth is not None:
+        raise InputError("--camera shows its photographs, --azimuth the body without them; give one of them")
+    seen = results_of(session, run, reference, without_rigid_motion, window)
+    scale = _scale(seen, field, limits)
+    if camera is not None:
+        frames = overlay_frames(seen, read_session(session), camera, scale, size, opacity)
+    else:
+        front = mean_azimuth(seen.results.mesh) if azimuth is None else math.radians(azimuth)
+        frames = surface_frames(seen, scale, front, size)
+    write_animation(out, list(frames), seconds)
+    _told([out], as_json)
+
+
+def _scale(seen: Evaluated, field: str, limits: str | None) -> Scale:
+    from ringdic.pictures.scale import scale_of
+
+    return scale_of(seen, field, None if limits is None else _two(limits))
+
+
+def _two(text: str) -> tuple[float, float]:
+    try:
+        low, high = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(f"--limits {text}: not two numbers with a comma between, such as 0.9,1.1") from None
+    return low, high
+
+
+def _step(seen: Evaluated, step: int | None) -> int:
+    count = len(seen.steps)
+    if step is None:
+        return count - 1
+    if not 0 <= step < count:
+        raise InputError(f"--step {step}: there are {count} steps, from 0, the reference")
+    return step
+
+
+def _photographed(session: Captured, capture_id: str, seen: Evaluated) -> list[str]:
+    """Cameras of the run that have an image in a capture."""
+    images = {id_ for capture in session.captures if capture.id == capture_id for id_ in capture.images}
+    return [camera.id for camera in seen.results.cameras if camera.id in images]
+
+
+def _told(written: list[Path], as_json: bool) -> None:
+    if as_json:
+        paths = [str(path) for path in written]
+        typer.echo(json.dumps({"written": paths[0] if len(paths) == 1 else paths}, ensure_ascii=False))
+    else:
+        for path in written:
+            say(f"written {path}")

@@ -1,0 +1,261 @@
+"""B-spline interpolation of LANES pixels of a row at once.
+
+While the fractional position t = t0 + s l + q l² of the lanes l = 0, 1 … stays inside one pixel interval, lane l needs
+the coefficients at base + l + tap: every tap is one contiguous load for all lanes, no gather. Where t crosses one
+whole number there is one tap more, and the weights move along by a select. The two axes are independent: four cases.
+
+With larger gradients the pixels lie within 32 coefficients of a row: every tap is picked from two loads by a
+permutation, in as many rows as the lanes reach. Beyond that (a stretch of 1.7 or more) each pixel finds its own taps.
+
+Weights are those of the B-spline times 6 (cubic) or 120 (quintic), so g is 36 or 14400 times the grey level: the
+criterion does not mind a contrast.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba as nb
+import numpy as np
+
+from ringdic.correlation.lanes import LANES, WINDOW, floor, load, magnitude, number, picked, put, ramp, select, store
+
+FAST = {"contract", "reassoc", "arcp", "nsz"}
+# What the pixels of a vector cross: nothing, a whole number along an axis or both; WIDE + n: n of them in y, any in x.
+ACROSS_X, ACROSS_Y, WIDE, SCATTERED = 1, 2, 4, -1
+REACH_OF_WINDOW = WINDOW - 1 - 5  # px that the window leaves the pixels for six taps
+_F, _U = np.float32, np.uint64
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _cubic(t):  # type: ignore[no-untyped-def]
+    """Cubic B-spline at the taps -1 … 2 for a fraction t, times 6."""
+    s, t2 = _F(1) - t, t * t
+    s2 = s * s
+    return s2 * s, t2 * (_F(3) * t - _F(6)) + _F(4), s2 * (_F(3) * s - _F(6)) + _F(4), t2 * t
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _quintic(t):  # type: ignore[no-untyped-def]
+    """Quintic B-spline at the taps -2 … 3 for a fraction t, times 120: even and odd parts about t = ½ share factors."""
+    t2, q = t * t, _F(5) * t - _F(2.5)
+    h, f = t2 - t, t2 * t2 * t
+    h2 = h * h
+    a = _F(5) * (h + h2) + (_F(1) - f)
+    k = h2 - _F(3) * h
+    inner, outer = _F(5) * (h2 - _F(5) * h) + _F(46), _F(13.5) - _F(7.5) * k
+    u, v = q * (k + _F(4)), q * (h2 - h - _F(5))
+    u = u + u
+    return a, outer + v, inner - u, inner + u, outer - v, f
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _cubic_across(t):  # type: ignore[no-untyped-def]
+    """The five taps where t in [0, 2) may cross 1."""
+    k, zero = t >= _F(1), _F(0)
+    a, b, c, d = _cubic(select(k, t - _F(1), t))
+    return select(k, zero, a), select(k, a, b), select(k, b, c), select(k, c, d), select(k, d, zero)
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _quintic_across(t):  # type: ignore[no-untyped-def]
+    """The seven taps where t in [0, 2) may cross 1."""
+    k, zero = t >= _F(1), _F(0)
+    a, b, c, d, e, f = _quintic(select(k, t - _F(1), t))
+    first, second, third = select(k, zero, a), select(k, a, b), select(k, b, c)
+    return first, second, third, select(k, c, d), select(k, d, e), select(k, e, f), select(k, f, zero)
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def largest(one, other):  # type: ignore[no-untyped-def]
+    """The larger, lane by lane."""
+    return select(one >= other, one, other)
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _positive(t):  # type: ignore[no-untyped-def]
+    return select(t >= _F(0), t, _F(0))
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _cubic_at(t):  # type: ignore[no-untyped-def]
+    """Cubic B-spline at any distance t, times 6."""
+    a = magnitude(t)
+    one, two = _positive(_F(1) - a), _positive(_F(2) - a)
+    return two * two * two - _F(4) * (one * one * one)
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _quintic_at(t):  # type: ignore[no-untyped-def]
+    """Quintic B-spline at any distance t, times 120."""
+    a = magnitude(t)
+    one, two, three = _positive(_F(1) - a), _positive(_F(2) - a), _positive(_F(3) - a)
+    one2, two2, three2 = one * one, two * two, three * three
+    return three2 * three2 * three - _F(6) * (two2 * two2 * two) + _F(15) * (one2 * one2 * one)
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _cubic_slope(t):  # type: ignore[no-untyped-def]
+    """Derivative of _cubic by t."""
+    s = _F(1) - t
+    b = t * (_F(9) * t - _F(12))
+    a, d = -_F(3) * s * s, _F(3) * t * t
+    return a, b, -a - b - d, d
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _quintic_slope(t):  # type: ignore[no-untyped-def]
+    """Derivative of _quintic by t."""
+    s, t2 = _F(1) - t, t * t
+    a, f = -_F(5) * s * s * s * s, _F(5) * t2 * t2
+    b = -_F(50) + t * (_F(40) + t * (_F(60) + t * (_F(25) * t - _F(80))))
+    c = t * (t2 * (_F(120) - _F(50) * t) - _F(120))
+    d = -s * (s * s * (_F(120) - _F(50) * s) - _F(120))
+    return a, b, c, d, -a - b - c - d - f, f
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _row4(c, p, w):  # type: ignore[no-untyped-def]
+    return w[0] * load(c, p) + w[1] * load(c, p + _U(1)) + w[2] * load(c, p + _U(2)) + w[3] * load(c, p + _U(3))
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _row5(c, p, w):  # type: ignore[no-untyped-def]
+    return _row4(c, p, w) + w[4] * load(c, p + _U(4))
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _row6(c, p, w):  # type: ignore[no-untyped-def]
+    return _row5(c, p, w) + w[5] * load(c, p + _U(5))
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _row7(c, p, w):  # type: ignore[no-untyped-def]
+    return _row6(c, p, w) + w[6] * load(c, p + _U(6))
+
+
+def _make_sum(row: Any, taps: int) -> Any:
+    """Σ of so many rows, each with the taps of ``row``."""
+
+    @nb.njit(forceinline=True, fastmath=FAST)
+    def spline(c, p, stride, wx, wy):  # type: ignore[no-untyped-def]
+        out = wy[0] * row(c, p, wx) + wy[1] * row(c, p + stride, wx)
+        out += wy[2] * row(c, p + _U(2) * stride, wx) + wy[3] * row(c, p + _U(3) * stride, wx)
+        if taps > 4:
+            out += wy[4] * row(c, p + _U(4) * stride, wx)
+        if taps > 5:
+            out += wy[5] * row(c, p + _U(5) * stride, wx)
+        if taps > 6:
+            out += wy[6] * row(c, p + _U(6) * stride, wx)
+        return out
+
+    return spline
+
+
+_c44, _c54, _c45, _c55 = _make_sum(_row4, 4), _make_sum(_row5, 4), _make_sum(_row4, 5), _make_sum(_row5, 5)
+_q66, _q76, _q67, _q77 = _make_sum(_row6, 6), _make_sum(_row7, 6), _make_sum(_row6, 7), _make_sum(_row7, 7)
+
+
+@nb.njit(fastmath=FAST, nogil=True, cache=True)
+def _wide(c, p, stride, tx, sx, qx, ty, sy, qy, rows, quintic, g):  # type: ignore[no-untyped-def]
+    """Any gradients that 32 coefficients of a row cover: taps picked by permutation, ``rows`` more rows of them.
+
+    g : where to put the grey levels.
+    """
+    e = ramp(c)
+    x, y = e * (e * qx + sx) + tx + e, e * (e * qy + sy) + ty
+    whole = floor(x)
+    out, t = ramp(c) * _F(0), x - whole
+    if quintic:
+        w, row = _quintic(t), y + _F(2)
+        for _ in range(rows + _U(6)):
+            taps = w[0] * picked(c, p, whole) + w[1] * picked(c, p, whole + _F(1)) + w[2] * picked(c, p, whole + _F(2))
+            taps += w[3] * picked(c, p, whole + _F(3)) + w[4] * picked(c, p, whole + _F(4))
+            out += _quintic_at(row) * (taps + w[5] * picked(c, p, whole + _F(5)))
+            row -= _F(1)
+            p += stride
+    else:
+        v, row = _cubic(t), y + _F(1)
+        for _ in range(rows + _U(4)):
+            taps = v[0] * picked(c, p, whole) + v[1] * picked(c, p, whole + _F(1))
+            taps += v[2] * picked(c, p, whole + _F(2)) + v[3] * picked(c, p, whole + _F(3))
+            out += _cubic_at(row) * taps
+            row -= _F(1)
+            p += stride
+    store(g, _U(0), out)
+
+
+@nb.njit(fastmath=FAST, nogil=True, cache=True)
+def _scattered(c, p, stride, tx, sx, qx, ty, sy, qy, quintic, g):  # type: ignore[no-untyped-def]
+    """The same for any gradient: every lane finds its own taps. g : where to put them."""
+    for lane in range(LANES):
+        e = _F(lane)
+        x, y = tx + e * (sx + e * qx), ty + e * (sy + e * qy)
+        i, j = math.floor(y), math.floor(x)
+        first = _U(np.int64(p) + np.int64(lane) + np.int64(i) * np.int64(stride) + np.int64(j))
+        out = x * _F(0)
+        if quintic:
+            wx, wy = _quintic(x - _F(j)), _quintic(y - _F(i))
+            for k in range(6):
+                for m in range(6):
+                    out += wy[k] * wx[m] * number(c, first + _U(k) * stride + _U(m))
+        else:
+            vx, vy = _cubic(x - _F(j)), _cubic(y - _F(i))
+            for k in range(4):
+                for m in range(4):
+                    out += vy[k] * vx[m] * number(c, first + _U(k) * stride + _U(m))
+        put(g, lane, out)
+
+
+@nb.njit(nogil=True, cache=True)
+def _general(c, p, stride, case, tx, sx, qx, ty, sy, qy, quintic, g):  # type: ignore[no-untyped-def]
+    if case == SCATTERED:
+        _scattered(c, p, stride, tx, sx, qx, ty, sy, qy, quintic, g)
+    else:
+        _wide(c, p, stride, tx, sx, qx, ty, sy, qy, _U(case - WIDE), quintic, g)
+
+
+def make_interpolation(quintic: bool) -> Any:
+    """The interpolation of one degree."""
+    weights, across = (_quintic, _quintic_across) if quintic else (_cubic, _cubic_across)
+    still, over_x, over_y, over = (_q66, _q76, _q67, _q77) if quintic else (_c44, _c54, _c45, _c55)
+
+    @nb.njit(forceinline=True, fastmath=FAST)
+    def interpolate(c, p, stride, case, tx, sx, qx, ty, sy, qy, spare):  # type: ignore[no-untyped-def]
+        """Grey levels of the current image, those whose taps begin at p + lane where t < 1.
+
+        c : pointer to the coefficients; case : what the lanes cross; spare : pointer to LANES numbers of scratch.
+        """
+        e = ramp(c)
+        x, y = e * (e * qx + sx) + tx, e * (e * qy + sy) + ty
+        if case == 0:
+            g = still(c, p, stride, weights(x), weights(y))
+        elif case == ACROSS_X:
+            g = over_x(c, p, stride, across(x), weights(y))
+        elif case == ACROSS_Y:
+            g = over_y(c, p, stride, weights(x), across(y))
+        elif case == ACROSS_X + ACROSS_Y:
+            g = over(c, p, stride, across(x), across(y))
+        else:
+            _general(c, p, stride, case, tx, sx, qx, ty, sy, qy, quintic, spare)
+            g = load(spare, _U(0))
+        return g
+
+    return interpolate
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def between_pixels(c, p, stride, tx, ty, quintic):  # type: ignore[no-untyped-def]
+    """f, ∂f/∂x and ∂f/∂y of LANES pixels with the same fractions tx, ty; p : the pixel to the upper left."""
+    if quintic:
+        p -= _U(2) * stride + _U(2)
+        wx, wy, sx, sy = _quintic(tx), _quintic(ty), _quintic_slope(tx), _quintic_slope(ty)
+        f = _q66(c, p, stride, wx, wy) * _F(1 / 14400)
+        fx, fy = _q66(c, p, stride, sx, wy) * _F(1 / 14400), _q66(c, p, stride, wx, sy) * _F(1 / 14400)
+    else:
+        p -= stride + _U(1)
+        vx, vy, rx, ry = _cubic(tx), _cubic(ty), _cubic_slope(tx), _cubic_slope(ty)
+        f = _c44(c, p, stride, vx, vy) * _F(1 / 36)
+        fx, fy = _c44(c, p, stride, rx, vy) * _F(1 / 36), _c44(c, p, stride, vx, ry) * _F(1 / 36)
+    return f, fx, fy

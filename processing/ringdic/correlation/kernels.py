@@ -1,0 +1,484 @@
+"""Inverse-compositional Gauss-Newton of one subset, and of many on all cores. Plain numbers and arrays only.
+
+Parameters of a subset, 12: u ux uy uxx uxy uyy v vx vy vxx vxy vyy, so that a pixel at (dx, dy) from the centre
+(x, y) lies in the current image at x + dx + u + ux dx + uy dy + ½ uxx dx² + uxy dx dy + ½ uyy dy², likewise in y
+(Lu & Cary 2000). First order keeps the second derivatives as they come in (zero, or a known curvature): its free
+parameters are six. Criterion: zero-mean normalised sum of squared differences; scheme: Baker & Matthews (2004).
+
+Shape of the code. A subset is packed once into vectors of LANES pixels of one row (``subset``): weight (1, or 0 outside
+the subset and the mask), f and its gradient, so a circle and a mask cost nothing. In an iteration every vector finds
+its place in the current image (``_place``); then one pass interpolates it (``interpolation``) and adds it to all the
+sums that a step needs (``_accumulate``), no value of a pixel is stored. The Hessian comes from moments
+Σ q dx^i dy^k of the products of the gradients, no steepest-descent image is stored either.
+
+What the digits hang on: t is small, so single precision resolves it to 1e-7 px; f and g are taken about a level near
+their mean; lanes are summed in single precision over a strip, everything after that in double. With float64 images
+all of it is double.
+"""
+
+# Numba's cache follows the file of the compiled function alone: after a change in what it imports, remove __pycache__.
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba as nb
+import numpy as np
+
+from ringdic.correlation.interpolation import (
+    ACROSS_X,
+    ACROSS_Y,
+    FAST,
+    REACH_OF_WINDOW,
+    SCATTERED,
+    WIDE,
+    largest,
+    make_interpolation,
+)
+from ringdic.correlation.lanes import (
+    BITS,
+    LANES,
+    chosen,
+    floor,
+    load,
+    pointer,
+    ramp,
+    select,
+    store,
+    store_whole,
+    total,
+)
+from ringdic.correlation.spline import PAD
+from ringdic.correlation.subset import (
+    GX,
+    GY,
+    MOMENTS,
+    REF,
+    add,
+    level_at,
+    moments,
+    normal_matrix,
+    pack,
+    take,
+    template,
+    well_inside,
+)
+from ringdic.correlation.warps import cholesky, compose_inverse, compose_inverse_affine, solve, variance
+
+GOOD, NO_CONVERGENCE, OUTSIDE, NO_TEXTURE = 0, 2, 5, 6
+N_PARAMETERS = 12
+_F, _U = np.float32, np.uint64
+_L = np.uint64(LANES)
+_LAST_DIGIT = 1e-5  # px; steps below it that shrink no more are the rounding of single precision
+_CAUTION = 2.0  # the steps may come to shrink half as fast as the last one did, or as those of other points
+_SHOWN = 4  # points of a chunk that must have made two steps before others may stop after one
+_ALIKE = 2.0  # times their 1 - ZNCC that such a point may have
+_HOPELESS = 6  # steps after which it is foretold whether a point will be there in time
+_SPAN = 3  # steps over which that is judged
+_CHUNK = 64  # points that share their scratch memory
+_SURE = 0.9  # ZNCC of a match that others may follow
+_PAD = PAD
+
+
+@nb.njit(fastmath=FAST, nogil=True, cache=True)
+def _place(fx, fy, p, corner, n, place, cell):  # type: ignore[no-untyped-def]
+    """Where n vectors lie in the current image, LANES of them at a time.
+
+    fx, fy : fraction of the centre's position; corner : (2, m), dx and dy of lane 0, m the multiple of LANES from n on.
+    place : (4, m) fraction and slope, tx sx ty sy, filled; cell : (3, m) int32, filled: column and row of the first
+    tap but for the degree's offset, counted from the centre's pixel, and the case. A vector's own dx and dy are whole
+    and added last, so the rest is small and exact enough in single precision.
+    """
+    kind = place.dtype.type
+    ux, uy, vx, vy = kind(p[1]), kind(p[2]), kind(p[7]), kind(p[8])
+    qx, xy, mx = kind(0.5 * p[3]), kind(p[4]), kind(0.5 * p[5])
+    qy, yx, my = kind(0.5 * p[9]), kind(p[10]), kind(0.5 * p[11])
+    far, one = kind(LANES - 1), kind(1)
+    bend_x, bend_y = abs(qx) * kind(0.25) * far * far, abs(qy) * kind(0.25) * far * far
+    at_x, at_y, number, shape = pointer(corner[0]), pointer(corner[1]), pointer(cell[0]), pointer(place[0])
+    step = _U(place.shape[1])
+    for v in range(_U(0), _U(n), _L):
+        dx, dy = load(at_x, v), load(at_y, v)
+        x = dx * (qx * dx + xy * dy + ux) + dy * (mx * dy + uy) + fx
+        y = dx * (qy * dx + yx * dy + vx) + dy * (my * dy + vy) + fy
+        sx, sy = (qx + qx) * dx + xy * dy + ux, (qy + qy) * dx + yx * dy + vx
+        x_far, y_far = far * (sx + far * qx) + x, far * (sy + far * qy) + y
+        j, i = floor(_smallest(x, x_far) - bend_x), floor(_smallest(y, y_far) - bend_y)
+        wide, high = floor(largest(x, x_far) + bend_x) - j, floor(largest(y, y_far) + bend_y) - i
+        window = select(
+            largest(x, x_far + far) + bend_x - j >= kind(REACH_OF_WINDOW), kind(SCATTERED), high + kind(WIDE)
+        )
+        store_whole(number, v, j + dx)
+        store_whole(number, v + step, i + dy)
+        near = wide * kind(ACROSS_X) + high * kind(ACROSS_Y)
+        store_whole(number, v + step + step, select(largest(wide, high) >= one + one, window, near))
+        store(shape, v, x - j)
+        store(shape, v + step, sx)
+        store(shape, v + step + step, y - i)
+        store(shape, v + step + step + step, sy)
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _smallest(one, other):  # type: ignore[no-untyped-def]
+    return select(one >= other, other, one)
+
+
+@nb.njit(nogil=True, cache=True)
+def _inside(shape, x, y, p, reach):  # type: ignore[no-untyped-def]
+    """Whether all pixels within ``reach`` of the centre clearly lie inside the current image."""
+    x0, y0, r = x + p[0], y + p[6], float(reach)
+    reach_x = r * (1.0 + abs(p[1]) + abs(p[2]) + r * (0.5 * abs(p[3]) + abs(p[4]) + 0.5 * abs(p[5])))
+    reach_y = r * (1.0 + abs(p[7]) + abs(p[8]) + r * (0.5 * abs(p[9]) + abs(p[10]) + 0.5 * abs(p[11])))
+    last_x, last_y = float(shape[1] - 2 * _PAD - 1), float(shape[0] - 2 * _PAD - 1)
+    return x0 > reach_x and y0 > reach_y and x0 + reach_x < last_x and y0 + reach_y < last_y
+
+
+@nb.njit(nogil=True, cache=True)
+def _stays(shape, x, y, p, corner, bits):  # type: ignore[no-untyped-def]
+    """Whether the pixels that count lie in the image, and the others in its padding."""
+    last_x, last_y = float(shape[1] - 2 * _PAD - 1), float(shape[0] - 2 * _PAD - 1)
+    x0, y0 = x + p[0], y + p[6]
+    for v in range(bits.shape[0]):
+        for lane in range(LANES):
+            dx, dy = float(corner[0, v]) + lane, float(corner[1, v])
+            at_x = x0 + dx + dx * (p[1] + 0.5 * p[3] * dx + p[4] * dy) + dy * (p[2] + 0.5 * p[5] * dy)
+            at_y = y0 + dy + dx * (p[7] + 0.5 * p[9] * dx + p[10] * dy) + dy * (p[8] + 0.5 * p[11] * dy)
+            edge = 0.0 if (bits[v] >> lane) & 1 else _PAD - 6.0
+            if not (at_x >= -edge and at_y >= -edge and at_x <= last_x + edge and at_y <= last_y + edge):
+                return False
+    return True
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _by_power(at, row, x, q0, q1, q2, second):  # type: ignore[no-untyped-def]
+    """Lanes of q φ of a strip added to three or six rows of scratch; q_k : Σ q dy^k."""
+    qx = q0 * x
+    add(at, row, q0)
+    add(at, row + 1, qx)
+    add(at, row + 2, q1)
+    if second:
+        add(at, row + 3, _F(0.5) * (qx * x))
+        add(at, row + 4, q1 * x)
+        add(at, row + 5, _F(0.5) * q2)
+
+
+def _make_pass(quintic: bool, second: bool) -> Any:
+    """The pass over a subset of one degree and order."""
+    interpolate = make_interpolation(quintic)
+
+    @nb.njit(fastmath=FAST, nogil=True)
+    def accumulate(  # type: ignore[no-untyped-def]
+        coef, stride, origin, place, cell, bend, px, bits, corner, strips, level, scratch, sums
+    ):  # fmt: skip
+        """One pass over the subset in the current image, g taken about ``level``.
+
+        coef : flat, origin : index of the centre's first tap; place, cell of the vectors; bend : (2,) their quadratic
+        terms; scratch : (17, LANES). sums : (16,), Σg, Σg², Σfg, spare, then Σ g ∂f/∂x φ_k (6) and Σ g ∂f/∂y φ_k (6)
+        with φ = 1 dx dy dx²/2 dxdy dy²/2.
+        """
+        ref, gx, gy = pointer(px[REF]), pointer(px[GX]), pointer(px[GY])
+        c, at_sum, spare, qx, qy = pointer(coef), pointer(scratch), pointer(scratch[16]), bend[0], bend[1]
+        scratch[:] = 0.0
+        for s in range(strips.shape[0] - 1):
+            sg = sgg = sfg = a0 = a1 = a2 = b0 = b1 = b2 = ramp(c) * _F(0)
+            for v in range(_U(strips[s]), _U(strips[s + 1])):
+                at, y = v * _L, corner[1, v]
+                p = _U(origin + np.int64(cell[1, v]) * np.int64(stride) + np.int64(cell[0, v]))
+                tx, sx, ty, sy = place[0, v], place[1, v], place[2, v], place[3, v]
+                g = interpolate(c, p, stride, cell[2, v], tx, sx, qx, ty, sy, qy, spare)
+                g = select(chosen(bits[v]), g - level, _F(0))
+                sg += g
+                sgg += g * g
+                sfg += g * load(ref, at)
+                ga, gb = g * load(gx, at), g * load(gy, at)
+                a0 += ga
+                b0 += gb
+                a1 += ga * y
+                b1 += gb * y
+                if second:
+                    a2 += ga * (y * y)
+                    b2 += gb * (y * y)
+            x = ramp(c) + corner[0, strips[s]]
+            add(at_sum, 0, sg)
+            add(at_sum, 1, sgg)
+            add(at_sum, 2, sfg)
+            _by_power(at_sum, 4, x, a0, a1, a2, second)
+            _by_power(at_sum, 10, x, b0, b1, b2, second)
+        for k in range(16):
+            if k < 3 or k in (4, 5, 6, 10, 11, 12) or (second and k > 3):
+                sums[k] = total(load(at_sum, _U(k) * _L))
+
+    return accumulate
+
+
+_cubic_first, _cubic_second = _make_pass(False, False), _make_pass(False, True)
+_quintic_first, _quintic_second = _make_pass(True, False), _make_pass(True, True)
+
+
+@nb.njit(nogil=True, cache=True)
+def _accumulate(quintic, second, *given):  # type: ignore[no-untyped-def]
+    if quintic:
+        if second:
+            _quintic_second(*given)
+        else:
+            _quintic_first(*given)
+    elif second:
+        _cubic_second(*given)
+    else:
+        _cubic_first(*given)
+
+
+@nb.njit(cache=True, nogil=True)
+def _step(H, sums, sum_J, sum_fJ, mean_g, ratio, terms, b, d):  # type: ignore[no-untyped-def]
+    """The increment d (12,) of the parameters from one pass, and by how much it lowers the sum of squares.
+
+    b : (2 terms,) scratch.
+    """
+    for k in range(terms):
+        b[k] = ratio * (sums[4 + k] - mean_g * sum_J[k]) - sum_fJ[k]
+        b[terms + k] = ratio * (sums[10 + k] - mean_g * sum_J[terms + k]) - sum_fJ[terms + k]
+        d[k], d[6 + k] = b[k], b[terms + k]
+    solve(H, b, 2 * terms)
+    gain = 0.0
+    for k in range(terms):
+        gain += d[k] * b[k] + d[6 + k] * b[terms + k]
+        d[k], d[6 + k] = b[k], b[terms + k]
+    return gain
+
+
+@nb.njit(cache=True, nogil=True)
+def _length(d, radius):  # type: ignore[no-untyped-def]
+    """Square of the motion of the subset's rim under an increment, px²."""
+    r2 = float(radius * radius)
+    first = d[1] ** 2 + d[2] ** 2 + d[7] ** 2 + d[8] ** 2
+    second = d[3] ** 2 + d[5] ** 2 + d[9] ** 2 + d[11] ** 2 + 4 * (d[4] ** 2 + d[10] ** 2)
+    return d[0] ** 2 + d[6] ** 2 + r2 * first + 0.25 * r2 * r2 * second
+
+
+@nb.njit(cache=True, nogil=True)
+def _foretold(moved, previous, second, unlike, shown):  # type: ignore[no-untyped-def]
+    """Square of the next step's length, after one of square ``moved`` and before that ``previous``, 0 for none.
+
+    Steps shrink as the last two tell. After a single one they shrink as those of other points of the same images did,
+    where this one's 1 - ZNCC, ``unlike``, is like theirs. second : whether it was the point's second step. shown : (3,)
+    sums over those points: their number, by what factor their second step was shorter, and their 1 - ZNCC; brought up
+    to date.
+    """
+    if previous == 0.0:
+        if shown[0] < _SHOWN or unlike * shown[0] > _ALIKE * shown[2]:
+            return moved
+        shrinking = shown[1] / shown[0]
+    else:
+        shrinking = math.sqrt(moved / previous)
+        if second:
+            shown[0] += 1.0
+            shown[1] += min(shrinking, 1.0)
+            shown[2] += unlike
+    return moved * min(_CAUTION * shrinking, 1.0) ** 2
+
+
+@nb.njit(cache=True, nogil=True)
+def _keep(kept, size, H, sum_J, sum_fJ, mean_f, norm_f, pixels):  # type: ignore[no-untyped-def]
+    """What does not depend on the current image, written to a row of ``width_of_subset`` numbers."""
+    at = 3
+    kept[0], kept[1], kept[2] = mean_f, norm_f, pixels
+    for i in range(size):
+        kept[at], kept[at + 1] = sum_J[i], sum_fJ[i]
+        at += 2
+        for j in range(i + 1):
+            kept[at] = H[i, j]
+            at += 1
+
+
+@nb.njit(cache=True, nogil=True)
+def _recall(kept, size, H, sum_J, sum_fJ):  # type: ignore[no-untyped-def]
+    """The same read. Returns the mean of f, its norm about that, and the number of pixels."""
+    at = 3
+    for i in range(size):
+        sum_J[i], sum_fJ[i] = kept[at], kept[at + 1]
+        at += 2
+        for j in range(i + 1):
+            H[i, j] = kept[at]
+            at += 1
+    return kept[0], kept[1], kept[2]
+
+
+def width_of_subset(order: int) -> int:
+    """Numbers of a subset that do not depend on the current image."""
+    size = 6 * order
+    return 3 + 2 * size + size * (size + 1) // 2
+
+
+@nb.njit(forceinline=True, nogil=True)
+def _refine_point(  # type: ignore[no-untyped-def]
+    image, gx, gy, coef_ref, stride_ref, mask, shape_ref, coef, shape, x_ref, y_ref, x_cur, y_cur, p,
+    corner, corner_f, offset, uncut, strips, radius, terms, quintic, tolerance, max_iterations, texture, noise,
+    kept, known, row_kept, shown, px, bits, place, cell, bend, lanes, H, moment, vectors, A, B,
+):  # fmt: skip
+    """IC-GN of one subset from the parameters p (12,), refined in place.
+
+    (x_ref, y_ref) and (x_cur, y_cur) : the centre in the two images' own crops; corner, uncut, strips : the template,
+    corner_f the same as floats, filled up to a multiple of LANES; offset : (n,) of lane 0 from the centre in the
+    reference's crop; kept, known : what was found of subsets before, this one's in row ``row_kept``, -1 for none;
+    shown : (3,), how steps have shrunk so far, see ``_foretold``; the rest is scratch. Returns status, ZNCC,
+    iterations, sigma of u and of v (px).
+    """
+    n, size, second, kind = corner.shape[1], 2 * terms, terms == 6, px.dtype.type
+    sums, sum_J, sum_fJ, b, d = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4]
+    d[:] = 0.0
+    column, row = math.floor(x_ref), math.floor(y_ref)
+    level = level_at(image, shape_ref, x_ref, y_ref)
+    direct = x_ref == column and y_ref == row and well_inside(shape_ref, x_ref, y_ref, radius)
+    if not direct:
+        pack(
+            image, gx, gy, coef_ref, stride_ref, mask, shape_ref, x_ref, y_ref, radius, quintic, corner, uncut, px, bits
+        )
+    at_centre = row * shape_ref[1] + column
+    if row_kept >= 0 and known[row_kept]:
+        if direct:
+            take(image, gx, gy, mask, at_centre, offset, level, uncut, px, bits)
+        mean_f, norm_f, pixels = _recall(kept[row_kept], size, H, sum_J, sum_fJ)
+    else:
+        sum_f, sum_ff, count = moments(
+            direct, second,
+            image, gx, gy, mask, at_centre, offset, level, uncut, px, bits, corner_f, strips, lanes,
+            moment,
+        )  # fmt: skip
+        pixels = float(count)
+        if pixels < max(0.15 * (2 * radius + 1) ** 2, 6 * terms):
+            return NO_TEXTURE, np.nan, 0, np.nan, np.nan
+        mean_f = sum_f / pixels
+        norm_f = math.sqrt(max(sum_ff - pixels * mean_f * mean_f, 0.0))
+        normal_matrix(moment, mean_f, terms, H, sum_J, sum_fJ)
+        half_trace = 0.5 * (H[0, 0] + H[terms, terms])
+        spread = math.sqrt((0.5 * (H[0, 0] - H[terms, terms])) ** 2 + H[terms, 0] ** 2)
+        if not half_trace - spread > pixels * texture * texture or not norm_f > 0.0 or not cholesky(H, size):
+            return NO_TEXTURE, np.nan, 0, np.nan, np.nan
+        if row_kept >= 0:
+            _keep(kept[row_kept], size, H, sum_J, sum_fJ, mean_f, norm_f, pixels)
+            known[row_kept] = True
+
+    stride, first_tap = _U(shape[1]), 2 if quintic else 1
+    last_digit = _LAST_DIGIT if px.itemsize == 4 else 0.0
+    about = (level + mean_f) * (14400.0 if quintic else 36.0)  # in the scale of the interpolated g
+    status, zncc, iterations, previous = NO_CONVERGENCE, np.nan, 0, 0.0
+    limit, earlier = tolerance * tolerance, (np.inf, np.inf)
+    for _ in range(max_iterations):
+        iterations += 1
+        if not _inside(shape, x_cur, y_cur, p, radius + LANES) and not _stays(shape, x_cur, y_cur, p, corner, bits):
+            return OUTSIDE, np.nan, iterations, np.nan, np.nan
+        column, row = math.floor(x_cur + p[0]), math.floor(y_cur + p[6])
+        _place(kind(x_cur + p[0] - column), kind(y_cur + p[6] - row), p, corner_f, n, place, cell)
+        origin = (row + _PAD - first_tap) * shape[1] + column + _PAD - first_tap
+        bend[0], bend[1] = 0.5 * p[3], 0.5 * p[9]
+        about = float(kind(about))
+        _accumulate(
+            quintic, second,
+            coef, stride, origin, place, cell, bend, px, bits, corner_f, strips, kind(about), lanes, sums,
+        )  # fmt: skip
+        mean_g = sums[0] / pixels
+        sum_gg = sums[1] - pixels * mean_g * mean_g
+        if not sum_gg > 1e-9 * pixels:
+            return NO_TEXTURE, np.nan, iterations, np.nan, np.nan
+        norm_g = math.sqrt(sum_gg)
+        zncc = min((sums[2] - mean_f * sums[0]) / (norm_f * norm_g), 1.0)
+        gain = _step(H, sums, sum_J, sum_fJ, mean_g, norm_f / norm_g, terms, b, d)
+        about += mean_g
+        moved = _length(d, radius)
+        if not moved < 4.0 * radius * radius:
+            break
+        if not (compose_inverse(p, d, A, B) if second else compose_inverse_affine(p, d)):
+            break
+        left = _foretold(moved, previous, iterations == 2, 1.0 - zncc, shown)
+        if left < limit or 0.0 < previous <= moved < last_digit * last_digit:
+            status = GOOD
+            zncc = min(zncc + 0.5 * gain / (norm_f * norm_f), 1.0)  # where the last step leads
+            break
+        if iterations >= _HOPELESS and moved >= last_digit * last_digit:
+            shrinking = math.log(earlier[1] / moved) / _SPAN
+            if not iterations + math.log(moved / limit) / shrinking < max_iterations:
+                break
+        earlier = (previous, earlier[0])
+        previous = moved
+    if status != GOOD:
+        return status, zncc, iterations, np.nan, np.nan
+    # Residual variance f' - r g' holds both images' noise: √2 σ.
+    scatter = math.sqrt(2.0) * noise
+    if not noise > 0.0:
+        scatter = norm_f * math.sqrt(max(2.0 * (1.0 - zncc), 0.0) / (pixels - size - 2))
+    sigma_u = scatter * math.sqrt(variance(H, b, size, 0))
+    return status, zncc, iterations, sigma_u, scatter * math.sqrt(variance(H, b, size, terms))
+
+
+@nb.njit(cache=True, nogil=True)
+def _follow(source, offset, reach, p):  # type: ignore[no-untyped-def]
+    """p (12,) becomes what the source's parameters (12,) are at an offset (2,) px, unless they say otherwise than p."""
+    dx, dy = offset
+    if max(abs(dx), abs(dy)) > reach:
+        return
+    q = source.copy()
+    for at in (0, 6):
+        xx, xy, yy = source[at + 3], source[at + 4], source[at + 5]
+        q[at] += source[at + 1] * dx + source[at + 2] * dy + 0.5 * xx * dx * dx + xy * dx * dy + 0.5 * yy * dy * dy
+        q[at + 1] += xx * dx + xy * dy
+        q[at + 2] += xy * dx + yy * dy
+    if abs(q[0] - p[0]) < 1.0 and abs(q[6] - p[6]) < 1.0:
+        p[:] = q
+
+
+@nb.njit(cache=True, nogil=True)
+def _scratch(rows, columns, kind):  # type: ignore[no-untyped-def]
+    """(rows, columns) of the type of ``kind``, from a multiple of 64 bytes on: a vector is one line of the cache."""
+    raw = np.empty(rows * columns + 64 // kind.itemsize, kind.dtype)
+    skip = (-raw.ctypes.data % 64) // kind.itemsize
+    return raw[skip : skip + rows * columns].reshape(rows, columns)
+
+
+@nb.njit(cache=True, nogil=True, parallel=True)
+def refine(  # type: ignore[no-untyped-def]
+    image, gx, gy, coef_ref, mask, origin_ref, coef, origin_cur, xy, order, parameters, known,
+    radius, circle, terms, quintic, tolerance, max_iterations, texture, noise, follow,
+    kept, known_subset, row_kept, status, zncc, iterations, sigma,
+):  # fmt: skip
+    """IC-GN of many subsets in parallel; chunks of them are independent of one another, so of the number of threads.
+
+    image, gx, gy, mask : (h, w) crop of the reference at origin_ref (x, y), coef_ref its coefficients, padded.
+    coef : padded coefficients of the crop of the current image at origin_cur.
+    xy : (n, 2) px. order : (n,), that in which the points are taken. parameters : (n, 12), start values in and results
+    out. known : (n,) bool, points to refine.
+    follow : px; a point no farther from the one before it starts from that one's result where it is a good match and
+    agrees with the point's own start value; 0 never. kept : (N, width_of_subset), what was found of N subsets of this
+    reference before, and known_subset : (N,) bool, of which; both filled; row_kept : (n,), each point's row, -1 for
+    none. status, zncc, iterations (n,) and sigma (n, 2) are filled where known.
+    """
+    corner, uncut, strips = template(radius, circle)
+    flat_ref, flat, n = coef_ref.ravel(), coef.ravel(), corner.shape[1]
+    m = (n + LANES - 1) // LANES * LANES
+    corner_f = np.zeros((2, m), coef.dtype)
+    corner_f[:, :n] = corner
+    offset = corner[1] * image.shape[1] + corner[0]
+    image_, gx_, gy_, mask_ = image.ravel(), gx.ravel(), gy.ravel(), mask.ravel()
+    for chunk in nb.prange((xy.shape[0] + _CHUNK - 1) // _CHUNK):
+        px, place, lanes = _scratch(3, n * LANES, flat), _scratch(4, m, flat), _scratch(MOMENTS, LANES, flat)
+        bits, cell, bend = np.empty(n, BITS), np.empty((3, m), np.int32), np.empty(2, coef.dtype)
+        H, moment, vectors = np.empty((2 * terms, 2 * terms)), np.empty((7, 15)), np.empty((5, 16))
+        A, B = np.empty((6, 6)), np.empty((6, 6))
+        before, shown = -1, np.zeros(3)
+        for k in order[chunk * _CHUNK : (chunk + 1) * _CHUNK]:
+            if known[k]:
+                if before >= 0:
+                    _follow(parameters[before], xy[k] - xy[before], follow, parameters[k])
+                result = _refine_point(
+                    image_, gx_, gy_, flat_ref, _U(coef_ref.shape[1]), mask_, image.shape, flat, coef.shape,
+                    xy[k, 0] - origin_ref[0], xy[k, 1] - origin_ref[1], xy[k, 0] - origin_cur[0],
+                    xy[k, 1] - origin_cur[1], parameters[k], corner, corner_f, offset, uncut, strips,
+                    radius, terms, quintic, tolerance, max_iterations, texture, noise,
+                    kept, known_subset, row_kept[k], shown,
+                    px, bits, place, cell, bend, lanes, H, moment, vectors, A, B,
+                )  # fmt: skip
+                status[k] = result[0]
+                zncc[k] = result[1]
+                iterations[k] = result[2]
+                sigma[k, 0] = result[3]
+                sigma[k, 1] = result[4]
+                before = k if follow > 0.0 and result[0] == GOOD and result[1] > _SURE else -1

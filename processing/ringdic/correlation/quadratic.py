@@ -1,0 +1,239 @@
+"""Local least squares: a quadratic of a measured field over the neighbours of every point, on any set of points.
+
+About point i the field is ``f(x_j) = a + b dx + c dy + p dx²/2 + q dx dy + r dy²/2`` with (dx, dy) = x_j - x_i; each
+neighbour weighs as its uncertainty says. The coefficients are the field, its gradient and its second derivatives at
+the point, far less noisy than those of one subset.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.correlation.warps import cholesky, solve
+
+Array = NDArray[np.float64]
+
+_LEAST = 10  # neighbours, itself included, that six coefficients are taken from
+_LEAST_SHARE = 0.3  # of the median sigma: no point weighs more than this lets it
+_RIDGE = 1e-10  # of the trace: points on one line give a large sigma, not an error
+
+
+@dataclass(frozen=True)
+class QuadraticFit:
+    """Local quadratics of a field of k components at n points; NaN where too few neighbours are known.
+
+    value : (n, k). gradient : (n, k, 2) by x, y. curvature : (n, k, 3), second derivatives by xx, xy, yy.
+    value_sigma (n,), curvature_sigma (n, 3) : their standard uncertainties, the neighbours' noise independent.
+    leave_out : (n, k), measured value minus the quadratic of the other points; NaN where not measured.
+    """
+
+    value: Array
+    gradient: Array
+    curvature: Array
+    value_sigma: Array
+    curvature_sigma: Array
+    leave_out: Array
+
+    def carried(self, index: NDArray[np.int64], offset: Array) -> Array:
+        """The field (j, k) at offsets (j, 2) px from the points ``index`` (j,), by their quadratics."""
+        dx, dy = offset[:, 0, None], offset[:, 1, None]
+        (gx, gy), (xx, xy, yy) = np.moveaxis(self.gradient[index], -1, 0), np.moveaxis(self.curvature[index], -1, 0)
+        curved = 0.5 * xx * dx**2 + xy * dx * dy + 0.5 * yy * dy**2
+        return np.asarray(self.value[index] + gx * dx + gy * dy + curved)
+
+
+class Neighbourhoods:
+    """The neighbours within ``window`` of each of the points xy (n, 2), the point itself included."""
+
+    def __init__(self, xy: Array, window: float) -> None:
+        if not window > 0:
+            raise ValueError(f"the window must be positive, not {window}")
+        self.xy = np.ascontiguousarray(xy, dtype=np.float64)
+        self.window = float(window)
+        self._first, self._members = members_within(self.xy, self.xy, self.window)
+
+    def fit(self, values: Array, sigma: Array | None = None) -> QuadraticFit:
+        """Quadratics of a field.
+
+        values : (n, k), a row with NaN is not measured. sigma : (n,) standard uncertainty, 1 if not given.
+        """
+        n, k = values.shape
+        known: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
+        weight = _weights(known, sigma)
+        measured = np.ascontiguousarray(np.where(known[:, None], values, 0.0).T)
+        c, scatter = np.full((n, k, 6), np.nan), np.full((n, 6), np.nan)
+        _fit(self.xy, self._first, self._members, self.window, weight, measured, c, scatter)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            own = weight * scatter[:, 0] ** 2
+            leave_out = np.where(known[:, None], (values - c[..., 0]) / (1.0 - own)[:, None], np.nan)
+        w = self.window
+        return QuadraticFit(
+            c[..., 0], c[..., 1:3] / w, c[..., 3:] / w**2, scatter[:, 0], scatter[:, 3:] / w**2, leave_out
+        )
+
+
+def _weights(known: NDArray[np.bool_], sigma: Array | None) -> Array:
+    if sigma is None:
+        return known.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        ready = known & np.isfinite(sigma) & (sigma > 0)
+    if not ready.any():
+        return known.astype(np.float64)
+    median = float(np.median(sigma[ready]))
+    limited = np.where(ready, np.maximum(np.nan_to_num(sigma, nan=median), _LEAST_SHARE * median), median)
+    return np.where(known, 1.0 / limited**2, 0.0)
+
+
+def members_within(centres: Array, xy: Array, window: float) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Which of the points xy (m, 2) lie within ``window`` of each centre (n, 2).
+
+    Their indices, one centre after the other (k,), and where those of each centre begin, (n + 1,).
+    """
+    low = np.minimum(xy.min(axis=0), centres.min(axis=0)) if len(xy) and len(centres) else np.zeros(2)
+    last = int(max(np.max((xy - low)[:, 0] // window, initial=0), np.max((centres - low)[:, 0] // window, initial=0)))
+    columns = last + 3  # an empty cell on either side
+    cell, of_centre = (_cells(points - low, window, columns) for points in (xy, centres))
+    by_cell = np.argsort(cell, kind="stable")
+    rows = int(max(cell.max(initial=0), of_centre.max(initial=0))) // columns + 2
+    starts = np.searchsorted(cell[by_cell], np.arange(rows * columns + 1))
+    return _within(centres, xy, window, of_centre, columns, by_cell, starts)  # type: ignore[no-any-return]
+
+
+def _cells(xy: Array, side: float, columns: int) -> NDArray[np.int64]:
+    """The number (n,) of the square that holds each point, row by row."""
+    column, row = np.floor(xy / side).astype(np.int64).T + 1
+    return np.asarray(row * columns + column)
+
+
+class LowerQuartiles:
+    """Lower quartiles, about each centre (n, 2), of what is known of the points xy (m, 2) within ``window``."""
+
+    def __init__(self, centres: Array, xy: Array, window: float) -> None:
+        self._first, self._members = members_within(np.asarray(centres, float), np.asarray(xy, float), float(window))
+
+    def __call__(self, values: Array) -> Array:
+        """Of values (m,). (n,), NaN where none is known."""
+        out = np.full(len(self._first) - 1, np.nan)
+        _quartiles(self._first, self._members, np.ascontiguousarray(values, dtype=np.float64), out)
+        return out
+
+
+@nb.njit(cache=True, nogil=True)
+def _within(centres, xy, window, cell, columns, by_cell, starts):  # type: ignore[no-untyped-def]
+    """The members (k,) of all neighbourhoods one after the other, and where each begins (n + 1,).
+
+    cell : (n,) the square of side ``window`` that holds each centre, row by row; by_cell : the points in the order of
+    their cells, starts : where each cell begins among them.
+    """
+    n = len(centres)
+    first = np.zeros(n + 1, np.int64)
+    members = np.empty(0, np.int32)
+    for filling in (False, True):
+        at = 0
+        for i in range(n):
+            first[i] = at
+            for row in (-1, 0, 1):
+                middle = cell[i] + row * columns
+                for slot in range(starts[middle - 1], starts[middle + 2]):
+                    j = by_cell[slot]
+                    if (xy[j, 0] - centres[i, 0]) ** 2 + (xy[j, 1] - centres[i, 1]) ** 2 <= window * window:
+                        if filling:
+                            members[at] = j
+                        at += 1
+        first[n] = at
+        if not filling:
+            members = np.empty(at, np.int32)
+    return first, members
+
+
+@nb.njit(cache=True, nogil=True)
+def _normal_matrix(xy, i, members, window, weight, M):  # type: ignore[no-untyped-def]
+    """M (6, 6), lower half, of the neighbours of point i in units of the window; how many have a weight."""
+    count = 0
+    m00 = m10 = m01 = m20 = m11 = m02 = m30 = m21 = m12 = m03 = m40 = m31 = m22 = m13 = m04 = 0.0
+    for j in members:
+        w = weight[j]
+        if w > 0.0:
+            count += 1
+            x, y = (xy[j, 0] - xy[i, 0]) / window, (xy[j, 1] - xy[i, 1]) / window
+            xx, xy_, yy = x * x, x * y, y * y
+            m00 += w
+            m10 += w * x
+            m01 += w * y
+            m20 += w * xx
+            m11 += w * xy_
+            m02 += w * yy
+            m30 += w * xx * x
+            m21 += w * xx * y
+            m12 += w * x * yy
+            m03 += w * yy * y
+            m40 += w * xx * xx
+            m31 += w * xx * xy_
+            m22 += w * xx * yy
+            m13 += w * xy_ * yy
+            m04 += w * yy * yy
+    M[0, 0], M[1, 0], M[2, 0], M[1, 1], M[2, 1], M[2, 2] = m00, m10, m01, m20, m11, m02
+    M[3, 0], M[3, 1], M[3, 2], M[3, 3] = 0.5 * m20, 0.5 * m30, 0.5 * m21, 0.25 * m40
+    M[4, 0], M[4, 1], M[4, 2], M[4, 3], M[4, 4] = m11, m21, m12, 0.5 * m31, m22
+    M[5, 0], M[5, 1], M[5, 2], M[5, 3], M[5, 4], M[5, 5] = (
+        0.5 * m02, 0.5 * m12, 0.5 * m03, 0.25 * m22, 0.5 * m13, 0.25 * m04,
+    )  # fmt: skip
+    return count
+
+
+@nb.njit(cache=True, nogil=True)
+def _right_side(xy, i, members, window, weight, values, b):  # type: ignore[no-untyped-def]
+    """b (6,) of the neighbours of point i: the values (n,) with the weights."""
+    b0 = b1 = b2 = b3 = b4 = b5 = 0.0
+    for j in members:
+        if weight[j] > 0.0:
+            x, y = (xy[j, 0] - xy[i, 0]) / window, (xy[j, 1] - xy[i, 1]) / window
+            v = weight[j] * values[j]
+            b0 += v
+            b1 += v * x
+            b2 += v * y
+            b3 += v * x * x
+            b4 += v * x * y
+            b5 += v * y * y
+    b[0], b[1], b[2], b[3], b[4], b[5] = b0, b1, b2, 0.5 * b3, b4, 0.5 * b5
+
+
+@nb.njit(cache=True, nogil=True, parallel=True)
+def _fit(xy, first, members, window, weight, values, c, scatter):  # type: ignore[no-untyped-def]
+    """c (n, k, 6), in units of the window, and scatter (n, 6), √ of the diagonal of the inverse normal matrix.
+
+    values : (k, n). weight : (n,), 0 where not measured.
+    """
+    k, n = values.shape
+    for i in nb.prange(n):
+        about = members[first[i] : first[i + 1]]
+        M, e = np.empty((6, 6)), np.empty(6)
+        if _normal_matrix(xy, i, about, window, weight, M) < _LEAST:
+            continue
+        trace = M[0, 0] + M[1, 1] + M[2, 2] + M[3, 3] + M[4, 4] + M[5, 5]
+        for p in range(6):
+            M[p, p] += _RIDGE * trace
+        if not cholesky(M, 6):
+            continue
+        for m in range(k):
+            _right_side(xy, i, about, window, weight, values[m], c[i, m])
+            solve(M, c[i, m], 6)
+        for p in range(6):
+            e[:] = 0.0
+            e[p] = 1.0
+            solve(M, e, 6)
+            scatter[i, p] = math.sqrt(e[p])
+
+
+@nb.njit(cache=True, nogil=True, parallel=True)
+def _quartiles(first, members, values, out):  # type: ignore[no-untyped-def]
+    for i in nb.prange(len(out)):
+        about = values[members[first[i] : first[i + 1]]]
+        about = about[np.isfinite(about)]
+        if len(about):
+            out[i] = np.partition(about, len(about) // 4)[len(about) // 4]

@@ -1,0 +1,359 @@
+"""A subset in vectors of LANES pixels of one row: where they lie, what they hold, and the normal matrix of it.
+
+The vectors are ordered by strips LANES columns wide, so that within a strip the lanes keep their dx: powers of dy
+enter a sum once a vector, powers of dx once a strip. Which pixels of a vector belong to the subset are the bits of
+a number.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba as nb
+import numpy as np
+
+from ringdic.correlation.interpolation import FAST, between_pixels
+from ringdic.correlation.lanes import (
+    BITS,
+    LANES,
+    chosen,
+    load,
+    marked,
+    number,
+    pointer,
+    population,
+    put,
+    ramp,
+    select,
+    store,
+    total,
+)
+from ringdic.correlation.spline import PAD
+
+REF, GX, GY = range(3)  # rows of a packed subset
+MOMENTS = 72  # rows of scratch that ``moments`` needs
+_F, _U = np.float32, np.uint64
+_L = np.uint64(LANES)
+_PAD = PAD
+_OUT = PAD - 4  # px outside the image that a vector and its taps may begin
+
+
+@nb.njit(cache=True)
+def template(radius, circle):  # type: ignore[no-untyped-def]
+    """The uncut subset of n vectors in s strips.
+
+    Returns corner (2, n) int64, dx and dy of lane 0; bits (n,) BITS; strips (s + 1,), the first vector of each
+    and n.
+    """
+    half = np.empty(2 * radius + 1, np.int64)
+    for row in range(2 * radius + 1):
+        half[row] = int(math.sqrt(radius * radius - (row - radius) ** 2)) if circle else radius
+    count = (2 * radius + LANES) // LANES
+    best, shift = 2**62, 0
+    for slack in range(count * LANES - 2 * radius):  # the strips reach over the subset; where they begin is free
+        vectors = 0
+        for s in range(count):
+            left = s * LANES - radius - slack
+            vectors += np.sum((half >= left) & (-half < left + LANES))
+        if vectors < best:
+            best, shift = vectors, slack
+    corner, bits = np.empty((2, best), np.int64), np.zeros(best, BITS)
+    strips = np.zeros(count + 1, np.int64)
+    n = 0
+    for s in range(count):
+        left = s * LANES - radius - shift
+        for row in range(2 * radius + 1):
+            if half[row] >= left and -half[row] < left + LANES:
+                corner[0, n], corner[1, n] = left, row - radius
+                for lane in range(LANES):
+                    bits[n] |= BITS((abs(left + lane) <= half[row]) << lane)
+                n += 1
+        strips[s + 1] = n
+    return corner, bits, strips
+
+
+@nb.njit(fastmath=FAST, nogil=True, cache=True)
+def pack(  # type: ignore[no-untyped-def]
+    image, gx, gy, coef, stride, mask, shape, x, y, radius, quintic, corner, uncut, px, bits
+):  # fmt: skip
+    """A subset between the pixels, or at the border of the crop: what ``moments`` finds by itself elsewhere.
+
+    Fills px (3, LANES n) with f about a level and its gradient of the subset about (x, y), bits (n,) with what the
+    mask leaves of it. The subset is measured from (x, y); at a fractional centre f and its gradient are interpolated.
+    image, gx, gy, mask : flat (h w,); coef : flat, its rows ``stride`` apart.
+    """
+    height, width = shape
+    jx, iy = math.floor(x), math.floor(y)
+    between = not (x == jx and y == iy)
+    near_x, near_y = math.floor(x + 0.5) - jx, math.floor(y + 0.5) - iy  # the pixel whose mask counts
+    inside = well_inside(shape, x, y, radius)
+    level = level_at(image, shape, x, y)
+    source, region, c = pointer(image), pointer(mask), pointer(coef)
+    f, fx, fy = pointer(px[REF]), pointer(px[GX]), pointer(px[GY])
+    tx, ty = px.dtype.type(x - jx), px.dtype.type(y - iy)
+    for v in range(_U(corner.shape[1])):
+        j, i, at, kept = jx + corner[0, v], iy + corner[1, v], v * _L, uncut[v]
+        if inside:
+            kept &= marked(region, _U((i + near_y) * width + j + near_x))
+        else:
+            for lane in range(LANES):
+                k = j + lane
+                here = i >= 0 and i < height - between and k >= 0 and k < width - between
+                row, column = min(max(i, 0), height - 1), min(max(k, 0), width - 1)
+                here = here and mask[min(row + near_y, height - 1) * width + min(column + near_x, width - 1)] > 0
+                kept &= BITS(0xFFFF ^ ((not here) << lane))
+                put(f, at + _U(lane), number(source, _U(row * width + column)))
+                put(fx, at + _U(lane), gx[row * width + column])
+                put(fy, at + _U(lane), gy[row * width + column])
+        bits[v], w = kept, chosen(kept)
+        if between:
+            i, j = min(max(i, -_OUT), height), min(max(j, -_OUT), width)
+            first = _U((i + _PAD) * np.int64(stride) + j + _PAD)
+            here_f, here_x, here_y = between_pixels(c, first, stride, tx, ty, quintic)
+        else:
+            here_f, here_x, here_y = load(f, at), load(fx, at), load(fy, at)
+        store(f, at, select(w, here_f - level, _F(0)))
+        store(fx, at, select(w, here_x, _F(0)))
+        store(fy, at, select(w, here_y, _F(0)))
+
+
+@nb.njit(fastmath=FAST, nogil=True, cache=True)
+def take(image, gx, gy, mask, at_centre, offset, level, uncut, px, bits):  # type: ignore[no-untyped-def]
+    """Fills px (3, LANES n) and bits (n,) of a subset on the pixels as ``moments`` does on the way."""
+    source, slope_x, slope_y, region = pointer(image), pointer(gx), pointer(gy), pointer(mask)
+    f, fx, fy = pointer(px[REF]), pointer(px[GX]), pointer(px[GY])
+    for v in range(_U(uncut.shape[0])):
+        at, begin = v * _L, _U(at_centre + offset[v])
+        kept = uncut[v] & marked(region, begin)
+        bits[v], w = kept, chosen(kept)
+        store(f, at, select(w, load(source, begin) - level, _F(0)))
+        store(fx, at, select(w, load(slope_x, begin), _F(0)))
+        store(fy, at, select(w, load(slope_y, begin), _F(0)))
+
+
+@nb.njit(forceinline=True)
+def well_inside(shape, x, y, radius):  # type: ignore[no-untyped-def]
+    """Whether all vectors of the subset lie inside the crop (h, w), a row of pixels beyond them included."""
+    jx, iy, reach = math.floor(x), math.floor(y), radius + LANES
+    return jx >= reach and jx + reach < shape[1] and iy >= radius and iy + radius < shape[0] - 1
+
+
+@nb.njit(forceinline=True)
+def level_at(image, shape, x, y):  # type: ignore[no-untyped-def]
+    """The grey level that f is taken about: that of the pixel at the centre, or the nearest one."""
+    row, column = min(max(math.floor(y), 0), shape[0] - 1), min(max(math.floor(x), 0), shape[1] - 1)
+    return image[row * shape[1] + column]
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def add(at, row, value):  # type: ignore[no-untyped-def]
+    """Lanes added to a row of scratch."""
+    store(at, _U(row) * _L, load(at, _U(row) * _L) + value)
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _by_power(at, row, x, q0, q1):  # type: ignore[no-untyped-def]
+    """Lanes of q, q dx and q dy of a strip added to three rows of scratch. q_k : Σ q dy^k."""
+    add(at, row, q0)
+    add(at, row + 1, q0 * x)
+    add(at, row + 2, q1)
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _by_second_power(at, row, x, q0, q1, q2):  # type: ignore[no-untyped-def]
+    """The same for xx xy yy."""
+    add(at, row, q0 * (x * x))
+    add(at, row + 1, q1 * x)
+    add(at, row + 2, q2)
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _by_high_power(at, row, x, q0, q1, q2, q3, q4):  # type: ignore[no-untyped-def]
+    """The same for i + k = 3 and 4: xxx xxy xyy yyy xxxx xxxy xxyy xyyy yyyy."""
+    xx = x * x
+    x0, x1, x2 = q0 * xx, q1 * xx, q2 * xx
+    add(at, row, x0 * x)
+    add(at, row + 1, x1)
+    add(at, row + 2, q2 * x)
+    add(at, row + 3, q3)
+    add(at, row + 4, x0 * xx)
+    add(at, row + 5, x1 * x)
+    add(at, row + 6, x2)
+    add(at, row + 7, q3 * x)
+    add(at, row + 8, q4)
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _first_and_second(last, s0, s1, s2):  # type: ignore[no-untyped-def]
+    """Σ q dy and Σ q dy² from running sums s1 of s0 and s2 of s1, of rows up to ``last`` - 1: adding costs less."""
+    e1 = s0 * last
+    return e1 - s1, (e1 - s1 - s1) * last + (s2 + s2 - s1)
+
+
+@nb.njit(forceinline=True, fastmath=FAST)
+def _third_and_fourth(last, s0, s1, s2, s3, s4):  # type: ignore[no-untyped-def]
+    """Σ q dy³ and Σ q dy⁴ likewise. With m = last - dy the running sums are those of q times m (m+1) … / k!."""
+    m2 = s2 + s2 - s1
+    m3 = _F(6) * (s3 - s2) + s1
+    m4 = _F(24) * s4 - _F(36) * s3 + _F(14) * s2 - s1
+    square = last * last
+    e3 = last * (square * s0 - _F(3) * last * s1 + _F(3) * m2) - m3
+    e4 = square * (square * s0 - _F(4) * last * s1 + _F(6) * m2) - _F(4) * last * m3 + m4
+    return e3, e4
+
+
+def _make_moments(second: bool, direct: bool) -> Any:
+    """The sums over a subset of one order, from the images or from px as ``pack`` left it."""
+
+    @nb.njit(fastmath=FAST, nogil=True)
+    def sums(  # type: ignore[no-untyped-def]
+        image, gx, gy, mask, at_centre, offset, level, uncut, px, bits, corner, strips, scratch, out
+    ):  # fmt: skip
+        source, slope_x, slope_y, region = pointer(image), pointer(gx), pointer(gy), pointer(mask)
+        ref, ref_x, ref_y, at_sum = pointer(px[REF]), pointer(px[GX]), pointer(px[GY]), pointer(scratch)
+        scratch[:] = 0.0
+        pixels = 0
+        for s in range(strips.shape[0] - 1):
+            zero = ramp(ref) * _F(0)
+            sf = sff = a0 = a1 = a2 = b0 = b1 = b2 = c0 = c1 = c2 = zero
+            d0 = d1 = d2 = e0 = e1 = e2 = g0 = g1 = g2 = h0 = h1 = h2 = zero
+            for v in range(_U(strips[s]), _U(strips[s + 1])):
+                at, y = v * _L, corner[1, v]
+                if direct:
+                    begin = _U(at_centre + offset[v])
+                    kept = uncut[v] & marked(region, begin)
+                    bits[v], w = kept, chosen(kept)
+                    f, fx = select(w, load(source, begin) - level, _F(0)), select(w, load(slope_x, begin), _F(0))
+                    fy = select(w, load(slope_y, begin), _F(0))
+                    store(ref, at, f)
+                    store(ref_x, at, fx)
+                    store(ref_y, at, fy)
+                else:
+                    f, fx, fy, kept = load(ref, at), load(ref_x, at), load(ref_y, at), bits[v]
+                pixels += population(kept)
+                sf += f
+                sff += f * f
+                kx, ky = f * fx, f * fy
+                d0 += fx
+                e0 += fy
+                g0 += kx
+                h0 += ky
+                d1 += fx * y
+                e1 += fy * y
+                g1 += kx * y
+                h1 += ky * y
+                if second:
+                    yy = y * y
+                    d2 += fx * yy
+                    e2 += fy * yy
+                    g2 += kx * yy
+                    h2 += ky * yy
+                else:
+                    a0 += fx * fx
+                    b0 += fx * fy
+                    c0 += fy * fy
+                    a1 += a0
+                    b1 += b0
+                    c1 += c0
+                    a2 += a1
+                    b2 += b1
+                    c2 += c1
+            x, last = ramp(ref) + corner[0, strips[s]], corner[1, strips[s + 1] - 1] + _F(1)
+            add(at_sum, 69, sf)
+            add(at_sum, 70, sff)
+            _by_power(at_sum, 18, x, d0, d1)
+            _by_power(at_sum, 24, x, e0, e1)
+            _by_power(at_sum, 30, x, g0, g1)
+            _by_power(at_sum, 36, x, h0, h1)
+            if second:
+                _by_second_power(at_sum, 21, x, d0, d1, d2)
+                _by_second_power(at_sum, 27, x, e0, e1, e2)
+                _by_second_power(at_sum, 33, x, g0, g1, g2)
+                _by_second_power(at_sum, 39, x, h0, h1, h2)
+                a3 = a4 = b3 = b4 = c3 = c4 = zero
+                for v in range(_U(strips[s]), _U(strips[s + 1])):
+                    fx, fy = load(ref_x, v * _L), load(ref_y, v * _L)
+                    a0 += fx * fx
+                    b0 += fx * fy
+                    c0 += fy * fy
+                    a1 += a0
+                    b1 += b0
+                    c1 += c0
+                    a2 += a1
+                    b2 += b1
+                    c2 += c1
+                    a3 += a2
+                    b3 += b2
+                    c3 += c2
+                    a4 += a3
+                    b4 += b3
+                    c4 += c3
+                a3, a4 = _third_and_fourth(last, a0, a1, a2, a3, a4)
+                b3, b4 = _third_and_fourth(last, b0, b1, b2, b3, b4)
+                c3, c4 = _third_and_fourth(last, c0, c1, c2, c3, c4)
+            a1, a2 = _first_and_second(last, a0, a1, a2)
+            b1, b2 = _first_and_second(last, b0, b1, b2)
+            c1, c2 = _first_and_second(last, c0, c1, c2)
+            _by_power(at_sum, 0, x, a0, a1)
+            _by_power(at_sum, 6, x, b0, b1)
+            _by_power(at_sum, 12, x, c0, c1)
+            _by_second_power(at_sum, 3, x, a0, a1, a2)
+            _by_second_power(at_sum, 9, x, b0, b1, b2)
+            _by_second_power(at_sum, 15, x, c0, c1, c2)
+            if second:
+                _by_high_power(at_sum, 42, x, a0, a1, a2, a3, a4)
+                _by_high_power(at_sum, 51, x, b0, b1, b2, b3, b4)
+                _by_high_power(at_sum, 60, x, c0, c1, c2, c3, c4)
+        for row in range(7):
+            for k in range(6 if row < 3 or second else 3):
+                out[row, k] = total(load(at_sum, _U(6 * row + k) * _L))
+        if second:
+            for row in range(3):
+                for k in range(9):
+                    out[row, 6 + k] = total(load(at_sum, _U(42 + 9 * row + k) * _L))
+        return total(load(at_sum, _U(69) * _L)), total(load(at_sum, _U(70) * _L)), pixels
+
+    return sums
+
+
+_first, _second = _make_moments(False, True), _make_moments(True, True)
+_packed_first, _packed_second = _make_moments(False, False), _make_moments(True, False)
+
+
+@nb.njit(nogil=True, cache=True)
+def moments(direct, second, *given):  # type: ignore[no-untyped-def]
+    """Σ q dx^i dy^k of the subset, in the order 1 x y xx xy yy (xxx xxy xyy yyy xxxx xxxy xxyy xyyy yyyy).
+
+    direct : px (3, LANES n) and bits (n,) are filled on the way, from the flat image, gx, gy and mask: LANES pixels
+    from at_centre + offset[v] on, f about ``level``, of them ``uncut`` those of the mask; else they are as ``pack``
+    left them. corner : (2, n) as floats; scratch : (MOMENTS, LANES); out : (7, 15), rows q = gx², gx gy, gy², gx, gy,
+    f gx, f gy. Returns Σ f, Σ f² and the number of pixels.
+    """
+    if direct:
+        if second:
+            return _second(*given)
+        return _first(*given)
+    if second:
+        return _packed_second(*given)
+    return _packed_first(*given)
+
+
+# φ = 1 dx dy dx²/2 dxdy dy²/2: exponents of dx and dy, and factor.
+_EX, _EY = np.array([0, 1, 0, 2, 1, 0]), np.array([0, 0, 1, 0, 1, 2])
+_FACTOR = np.array([1.0, 1.0, 1.0, 0.5, 1.0, 0.5])
+
+
+@nb.njit(nogil=True, cache=True)
+def normal_matrix(sums, mean, terms, H, sum_J, sum_fJ):  # type: ignore[no-untyped-def]
+    """H = Σ JᵀJ (2 terms, 2 terms), ΣJ and Σ (f − mean) J from the moments; J = (∂f/∂x φ, ∂f/∂y φ)."""
+    for a in range(terms):
+        for b in range(a + 1):
+            i, k = _EX[a] + _EX[b], _EY[a] + _EY[b]
+            at, factor = (i + k) * (i + k + 1) // 2 + k, _FACTOR[a] * _FACTOR[b]
+            H[a, b] = factor * sums[0, at]
+            H[terms + a, b] = H[terms + b, a] = factor * sums[1, at]
+            H[terms + a, terms + b] = factor * sums[2, at]
+        sum_J[a], sum_J[terms + a] = _FACTOR[a] * sums[3, a], _FACTOR[a] * sums[4, a]
+        sum_fJ[a] = _FACTOR[a] * sums[5, a] - mean * sum_J[a]
+        sum_fJ[terms + a] = _FACTOR[a] * sums[6, a] - mean * sum_J[terms + a]

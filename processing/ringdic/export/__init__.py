@@ -1,0 +1,101 @@
+"""Results in the forms that other programs read.
+
+=======  ===========================================  ==================================================
+format   what is written                              for
+=======  ===========================================  ==================================================
+npz      one file, arrays of all steps                Python
+mat      one file: DIC3DPPresults as MultiDIC makes   MATLAB, Octave
+         it, and the arrays of the npz, from 1
+vtkhdf   one file, all steps and fields               ParaView
+vtp      a folder, one file a step and series.pvd     ParaView and other VTK readers
+csv      a folder, points and faces of each step      spreadsheets, R
+ply      a folder, one surface a step, with fields    MeshLab, CloudCompare
+         and colours
+glb      a folder, one coloured surface a step        viewers, Blender (metres, y upwards)
+=======  ===========================================  ==================================================
+
+Lengths are mm in the target's frame except in glb, whose standard is metres. All of them are made of the stored
+positions, so a step may be compared with the one before it, moved back, or given strains over another window than the
+run's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from ringdic.errors import InputError
+from ringdic.export.arrays import export_npz
+from ringdic.export.matlab import export_mat
+from ringdic.export.surfaces import DEFAULT_COLOUR, export_glb, export_ply
+from ringdic.export.tables import export_csv
+from ringdic.export.vtk import export_vtkhdf, export_vtp
+from ringdic.results.evaluation import Evaluated, Evaluation, evaluated
+from ringdic.session.folder import newest_results
+
+_WRITERS: dict[str, Callable[[Evaluated, Path], None]] = {
+    "npz": export_npz,
+    "vtkhdf": export_vtkhdf,
+    "vtp": export_vtp,
+    "mat": export_mat,
+    "csv": export_csv,
+    "ply": export_ply,
+    "glb": export_glb,
+}
+_FOLDERS = ("vtp", "csv", "ply", "glb")
+_COLOURED: dict[str, Callable[[Evaluated, Path, str], None]] = {"ply": export_ply, "glb": export_glb}
+FORMATS = tuple(_WRITERS)
+
+__all__ = ["FORMATS", "Evaluation", "export"]
+
+
+def export(
+    session_path: Path,
+    format: str,
+    out: Path | None = None,
+    evaluation: Evaluation = Evaluation(),  # noqa: B008 - frozen
+    colour: str | None = None,
+    run: int | None = None,
+) -> Path:
+    """Write the results of a session in another form; the file or folder written. ``run`` : the newest unless given.
+
+    ``out`` : where to; without it, beside the results. Formats of one file a step write a folder. ``evaluation`` : how
+    fields are made of positions. ``colour`` : the field that ply and glb are coloured by, displacement unless given.
+    Raises InputError : unknown format or field, no results, or no folder to write into.
+    """
+    if format not in _WRITERS:
+        raise InputError(f"no export format '{format}'; there are {', '.join(FORMATS)}")
+    if colour is not None and format not in _COLOURED:
+        raise InputError(f"format '{format}' has no colours; {' and '.join(_COLOURED)} have")
+    results_path = newest_results(Path(session_path), run)
+    if out is None:
+        out = results_path.with_name(format if format in _FOLDERS else f"results.{format}")
+    out = Path(out)
+    _check_place(out, format)
+    seen = evaluated(results_path, evaluation)
+    if format in _COLOURED:
+        seen.field(colour or DEFAULT_COLOUR)
+    if format in _FOLDERS:
+        out.mkdir(exist_ok=True)
+        if format in _COLOURED:
+            _COLOURED[format](seen, out, colour or DEFAULT_COLOUR)
+        else:
+            _WRITERS[format](seen, out)
+        return out
+    partial = out.with_name(f".{out.name}.partial")  # a reader never sees half a file
+    try:
+        _WRITERS[format](seen, partial)
+        partial.replace(out)
+    finally:
+        partial.unlink(missing_ok=True)
+    return out
+
+
+def _check_place(out: Path, format: str) -> None:
+    if not out.parent.is_dir():
+        raise InputError(f"{out.parent}: no such folder to export into")
+    if format in _FOLDERS:
+        if out.exists() and not out.is_dir():
+            raise InputError(f"{out}: is a file; format '{format}' writes a folder with one file a step")
+    elif out.is_dir():
+        raise InputError(f"{out}: is a folder; format '{format}' writes one file")

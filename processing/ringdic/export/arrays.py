@@ -1,0 +1,57 @@
+"""All steps as arrays for Python: NumPy's npz."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ringdic.results.evaluation import Evaluated
+
+_SCALARS = ("lambda1", "lambda2", "J")
+
+
+def export_npz(seen: Evaluated, out: Path) -> None:
+    """Write ``vertices_ref`` (N, 3), ``vertices`` (F, N, 3), ``faces`` (M, 3), ``lambda1``, ``lambda2``, ``J`` (F, M),
+    ``E`` (F, M, 3, 3), ``correlation`` (F, N), ``sigma_xyz`` (F, N, 3) and ``pair`` (M,).
+
+    ``sigma_xyz`` is the standard deviation of a position over repeated noise of the images. What the calibration adds,
+    common to all points and steps, stands apart: ``sigma_calibration`` (F, N, 3), where it is known.
+
+    mm, world frame; step 0 is the reference, with identity deformation; NaN where not measured. With a strain window,
+    the four of deformation also as ``window_…``.
+    """  # fmt: skip
+    with Path(out).open("wb") as file:  # given a name, savez would append a suffix to it
+        np.savez(file, **arrays(seen))
+
+
+def arrays(seen: Evaluated) -> dict[str, Any]:
+    """The arrays of the npz, in full precision."""
+    results = seen.results
+    F, M = len(results.steps), len(results.faces)
+    prefixes = ("", "window_") if seen.window is not None else ("",)
+    found: dict[str, Any] = {prefix + name: np.empty((F, M)) for prefix in prefixes for name in _SCALARS}
+    found |= {f"{prefix}E": np.empty((F, M, 3, 3)) for prefix in prefixes}
+    for step in range(F):
+        fields = seen.step(step)
+        for prefix in prefixes:
+            for name in _SCALARS:
+                found[prefix + name][step] = fields.face[prefix + name]
+            found[f"{prefix}E"][step] = square(fields.face[f"{prefix}E_tensor"])
+    by_cameras = {} if results.sigma_calibration is None else {"sigma_calibration": results.sigma_calibration}
+    return {
+        "vertices_ref": results.vertices_ref,
+        "vertices": np.stack([seen.positions(step) for step in range(F)]),
+        "faces": results.faces,
+        **found,
+        "correlation": results.correlation,
+        "sigma_xyz": results.sigma_xyz,
+        **by_cameras,
+        "pair": results.pair,
+    }
+
+
+def square(six: np.ndarray) -> np.ndarray:
+    """Symmetric tensors (..., 3, 3) of their components (..., 6), xx yy zz xy yz xz."""
+    return six[..., [[0, 3, 5], [3, 1, 4], [5, 4, 2]]]

@@ -1,0 +1,170 @@
+"""All steps for MATLAB and Octave, with the field names of MultiDIC (Solav et al. 2018)."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.io import savemat
+
+from ringdic.errors import InputError
+from ringdic.export.arrays import arrays
+from ringdic.results.evaluation import Evaluated
+from ringdic.strain.deformation import Deformation
+from ringdic.strain.rigid_motion import RigidMotion
+from ringdic.strain.window import StrainWindow
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+_LARGEST = 2**31 - 2**20  # bytes of one variable of a level 5 file
+
+
+def export_mat(seen: Evaluated, out: Path) -> None:
+    """Write a level 5 MAT file, indices from 1.
+
+    ``DIC3DPPresults`` : the structure that MultiDIC's post-processing makes and its plots read: Points3D, Faces, Disp,
+    RBM, Deform and their like as cells with one entry a step, the same with ``_ARBM`` after the rigid motion has been
+    taken out, and Deform_window over the strain window if there is one; deformation in single precision. Beside it the
+    arrays of the npz: ``faces`` and ``pair`` count from 1 (0: a face joins two pairs); ``steps`` and ``settings`` are
+    text.
+
+    Raises InputError where a level 5 file cannot hold it.
+    """
+    results = seen.results
+    values = arrays(seen)
+    values["faces"] = np.asarray(results.faces, dtype=float) + 1
+    values["pair"] = np.asarray(results.pair, dtype=float) + 1
+    values["steps"] = np.array(results.steps, dtype=object)
+    values["settings"] = results.settings
+    values["DIC3DPPresults"] = post_processing(seen)
+    with Path(out).open("wb") as file:
+        savemat(file, values, do_compression=True, oned_as="column")
+
+
+def post_processing(seen: Evaluated) -> dict[str, Any]:
+    """The structure DIC3DPPresults. Cells are object arrays (1, F)."""
+    results = seen.results
+    F = len(results.steps)
+    structure = _surface(seen)
+    bytes_each = F * len(results.faces) * 4 * _floats_a_face()
+    if bytes_each > _LARGEST:
+        raise InputError(
+            f"{F} steps of {len(results.faces):,} triangles are more than a MAT file of level 5 can hold; "
+            "export npz or vtkhdf"
+        )
+    wanted: list[tuple[str, bool, StrainWindow | None]] = [("Deform", False, None)]
+    if seen.window is not None:
+        wanted.append(("Deform_window", False, seen.window))
+    wanted.append(("Deform_ARBM", True, None))
+    room = _LARGEST // bytes_each
+    for name, removed, window in wanted[:room]:
+        structure[name] = _deform(seen, removed, window)
+    for name, _, _ in wanted[room:]:
+        log.warning("%s is left out: with it, the file would be larger than MATLAB's level 5 allows", name)
+    return structure
+
+
+def _surface(seen: Evaluated) -> dict[str, Any]:
+    """Points, triangles, displacements and rigid motions."""
+    results, F = seen.results, len(seen.steps)
+    faces = results.faces
+    motions = [_motion(seen, step) for step in range(F)]
+    points = [seen.positions(step) for step in range(F)]
+    back = [motion.apply(xyz) for motion, xyz in zip(motions, points, strict=True)]
+    moved = [xyz - _before(seen, step) for step, xyz in enumerate(points)]
+    without = [xyz - _before(seen, step) for step, xyz in enumerate(back)]
+    ids = {camera.id: index for index, camera in enumerate(results.cameras, start=1)}
+    return {
+        "Points3D": _cells(points),
+        "Points3D_ARBM": _cells(back),
+        "Faces": faces.astype(float) + 1,
+        "corrComb": _cells([column(results.correlation[step]) for step in range(F)]),
+        "FaceCorrComb": _cells([column(results.correlation[step][faces].max(axis=1)) for step in range(F)]),
+        "FacePairInds": column(results.pair.astype(float) + 1),
+        "PointPairInds": column(results.vertex_pair.astype(float) + 1),
+        "pairIndices": np.array([[_camera_number(name, ids) for name in pair] for pair in results.pairs], dtype=float),
+        "Disp": {
+            "DispVec": _cells(moved),
+            "DispMgn": _cells([column(np.linalg.norm(u, axis=1)) for u in moved]),
+            "DispVec_ARBM": _cells(without),
+            "DispMgn_ARBM": _cells([column(np.linalg.norm(u, axis=1)) for u in without]),
+        },
+        "FaceCentroids": _cells([xyz[faces].mean(axis=1) for xyz in points]),
+        "FaceCentroids_ARBM": _cells([xyz[faces].mean(axis=1) for xyz in back]),
+        "FaceIsoInd": _cells([column(seen.step(step).face["isotropy"]) for step in range(F)]),
+        "RBM": {
+            "RotMat": _cells([motion.R for motion in motions]),
+            "TransVec": _cells([motion.t for motion in motions]),
+        },
+    }
+
+
+def _deform(seen: Evaluated, rigid_motion_removed: bool, window: StrainWindow | None) -> dict[str, Any]:
+    how = seen.evaluation
+    removed = rigid_motion_removed or how.rigid_motion_removed
+    steps = [_named(seen.results.deformation(step, removed, how.previous, window)) for step in range(len(seen.steps))]
+    return {name: _cells([step[name] for step in steps]) for name in steps[0]}
+
+
+def _named(found: Deformation) -> dict[str, NDArray[np.float32]]:
+    """The fields of one step under MultiDIC's names: tensors (3, 3, M), vectors (M, 3), scalars (M, 1)."""
+    C = np.einsum("mki,mkj->mij", found.F, found.F)
+    tensors = {"Fmat": found.F, "Cmat": C, "Emat": found.E, "emat": found.e}
+    vectors = {
+        "d3": found.normal_current,
+        "Epc1vec": found.direction1_reference, "Epc2vec": found.direction2_reference,
+        "Epc1vecCur": found.direction1_current, "Epc2vecCur": found.direction2_current,
+        "epc1vec": found.direction1_current, "epc2vec": found.direction2_current,
+    }  # fmt: skip
+    scalars = {
+        "Lamda1": found.lambda1, "Lamda2": found.lambda2, "J": found.J, "Emgn": found.E_magnitude,
+        "emgn": found.e_magnitude, "Epc1": found.E1, "Epc2": found.E2, "epc1": found.e1, "epc2": found.e2,
+        "EShearMax": found.E_shear, "eShearMax": found.e_shear, "Eeq": found.E_equivalent, "eeq": found.e_equivalent,
+        "Area": np.where(np.isfinite(found.J), found.area, np.nan),
+    }  # fmt: skip
+    named = {
+        **{name: np.moveaxis(values, 0, -1) for name, values in tensors.items()},
+        **vectors,
+        **{name: column(values) for name, values in scalars.items()},
+    }
+    return {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in named.items()}
+
+
+def _floats_a_face() -> int:
+    one = np.ones((1, 3, 3))
+    found = dict.fromkeys(Deformation.__dataclass_fields__, one[:, 0, 0])
+    found |= {name: one[:, 0] for name in found if name.startswith("direction")}
+    found |= dict.fromkeys(("F", "E", "directors_reference", "directors_current"), one)
+    return sum(values.size for values in _named(Deformation(**found)).values())
+
+
+def _before(seen: Evaluated, step: int) -> Array:
+    return seen.results.before(step, seen.evaluation.previous)
+
+
+def _motion(seen: Evaluated, step: int) -> RigidMotion:
+    """The motion that takes the exported positions back; none is left where it has been removed already."""
+    if seen.evaluation.rigid_motion_removed:
+        return RigidMotion(np.eye(3), np.zeros(3))
+    return seen.results.motion(step, seen.evaluation.previous)
+
+
+def _camera_number(name: str, order: dict[str, int]) -> int:
+    """MultiDIC's cameras have numbers for names; a camera with another name takes its place in the ring."""
+    return int(name) if name.isascii() and name.isdigit() else order.get(name, 0)
+
+
+def column(values: Array) -> Array:
+    """Scalars as MATLAB has them, (n, 1)."""
+    return np.asarray(values, dtype=float).reshape(-1, 1)
+
+
+def _cells(entries: list[Any]) -> NDArray[np.object_]:
+    cells = np.empty((1, len(entries)), dtype=object)
+    for index, entry in enumerate(entries):
+        cells[0, index] = entry
+    return cells

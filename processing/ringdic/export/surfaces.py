@@ -1,0 +1,77 @@
+"""Every step as a surface: PLY with fields and colours, GLB with colours. Triangles that lost a corner are left out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from ringdic.results.colours import colours
+from ringdic.results.evaluation import Evaluated
+from ringdic.results.fields import Field, StepFields
+
+Array = NDArray[np.float64]
+
+_GLTF_FROM_WORLD = 1e-3 * np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+DEFAULT_COLOUR = "displacement"
+
+
+def export_ply(seen: Evaluated, out: Path, colour: str = DEFAULT_COLOUR) -> None:
+    """Write ``STEP.ply`` (binary, mm) for every step: every field as a property of its vertices or faces, and colours
+    of one of them, one scale for all steps."""
+    paint = _Paint(seen, colour)
+    for step, name in enumerate(seen.steps):
+        fields = seen.step(step)
+        mesh, kept, whole = seen.measured(step)
+        solid = _solid(mesh.vertices, mesh.faces, paint.vertices(fields)[kept])
+        for entry in seen.fields:
+            values = fields.scalar(entry).astype(np.float32)
+            if entry.location == "point":
+                solid.vertex_attributes[entry.name] = values[kept]
+            else:
+                solid.face_attributes[entry.name] = values[whole]
+        solid.export(out / f"{name}.ply", file_type="ply")
+
+
+def export_glb(seen: Evaluated, out: Path, colour: str = DEFAULT_COLOUR) -> None:
+    """Write ``STEP.glb`` for every step, coloured by a field, one scale for all steps.
+
+    glTF's conventions: metres, y upwards (the target's z).
+    """
+    paint = _Paint(seen, colour)
+    for step, name in enumerate(seen.steps):
+        mesh, kept, _ = seen.measured(step)
+        solid = _solid(mesh.vertices @ _GLTF_FROM_WORLD.T, mesh.faces, paint.vertices(seen.step(step))[kept])
+        solid.export(out / f"{name}.glb", file_type="glb")
+
+
+def _solid(vertices: Array, faces: NDArray[np.int64], rgba: NDArray[np.uint8]) -> trimesh.Trimesh:
+    """A surface with colours; one without points has none."""
+    return trimesh.Trimesh(vertices, faces, vertex_colors=rgba if len(rgba) else None, process=False)
+
+
+class _Paint:
+    """Colours of the vertices by one field; a field of faces is averaged at each vertex over its triangles."""
+
+    def __init__(self, seen: Evaluated, name: str) -> None:
+        self._entry: Field = seen.field(name)
+        self._limits = seen.limits(name)
+        self._faces = seen.results.faces
+        self._count = len(seen.results.vertices_ref)
+
+    def vertices(self, fields: StepFields) -> NDArray[np.uint8]:
+        """RGBA (N, 4)."""
+        values = fields.scalar(self._entry)
+        if self._entry.location == "face":
+            values = self._at_vertices(values)
+        rgb = colours(values, *self._limits, diverging=self._entry.centre is not None)
+        return np.column_stack([np.rint(255 * rgb), np.full(len(rgb), 255.0)]).astype(np.uint8)
+
+    def _at_vertices(self, values: Array) -> Array:
+        known = np.isfinite(values)
+        corners = self._faces[known].ravel()
+        total = np.bincount(corners, np.repeat(values[known], 3), self._count)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(total / np.bincount(corners, minlength=self._count))

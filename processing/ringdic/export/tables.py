@@ -1,0 +1,46 @@
+"""Points and faces of every step as tables of comma-separated values."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.results.evaluation import Evaluated
+
+
+def export_csv(seen: Evaluated, out: Path) -> None:
+    """Write ``STEP-points.csv`` and ``STEP-faces.csv`` for every step into the folder ``out``.
+
+    The first line names the columns with their units; vertices count from 0; what was not measured is empty. The
+    columns ``…_reference`` hold what the step is compared with.
+    """
+    for step, name in enumerate(seen.steps):
+        columns: dict[str, list[tuple[str, NDArray[np.generic]]]] = {"point": [], "face": []}
+        positions = seen.positions(step)
+        before = seen.results.before(step, seen.evaluation.previous)
+        for i, axis in enumerate("xyz"):
+            columns["point"].append((f"{axis}_reference [mm]", before[:, i]))
+            columns["point"].append((f"{axis} [mm]", positions[:, i]))
+        for i in range(3):
+            columns["face"].append((f"vertex{i + 1}", seen.results.faces[:, i]))
+        fields = seen.step(step)
+        for entry in seen.fields:
+            unit = f" [{entry.unit}]" if entry.unit else ""
+            columns[entry.location].append((entry.name + unit, fields.scalar(entry).astype(np.float32)))
+        _write(out / f"{name}-points.csv", columns["point"])
+        _write(out / f"{name}-faces.csv", columns["face"])
+
+
+def _write(path: Path, columns: list[tuple[str, NDArray[np.generic]]]) -> None:
+    texts = []
+    for _, values in columns:
+        if np.issubdtype(values.dtype, np.integer):
+            texts.append([str(value) for value in values])
+        else:
+            digits = ".6f" if values.dtype == np.float64 else ".9g"
+            texts.append(["" if np.isnan(value) else format(value, digits) for value in values.tolist()])
+    with path.open("w", encoding="utf-8", newline="") as file:
+        file.write(",".join(header for header, _ in columns) + "\n")
+        file.writelines(",".join(row) + "\n" for row in zip(*texts, strict=True))

@@ -1,0 +1,1 @@
+"""Cameras and points in space: projection, lens distortion, triangulation, outliers."""

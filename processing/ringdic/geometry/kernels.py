@@ -1,0 +1,215 @@
+"""The loops over points, compiled: triangulation, how points move with their pixels, and neighbours on a grid.
+
+:mod:`ringdic.geometry.triangulation`, :mod:`ringdic.uncertainty.position` and :mod:`ringdic.geometry.outliers` say
+what is computed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+
+# A positive semi-definite N with det N above this share of (tr N)³ has no eigenvalue below that share of the largest.
+_SURE = 1e-9
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _inverse(N, out):  # type: ignore[no-untyped-def]
+    """Inverse of a symmetric N (3, 3) by its cofactors; its determinant."""
+    out[0, 0] = N[1, 1] * N[2, 2] - N[1, 2] * N[1, 2]
+    out[0, 1] = N[0, 2] * N[1, 2] - N[0, 1] * N[2, 2]
+    out[0, 2] = N[0, 1] * N[1, 2] - N[0, 2] * N[1, 1]
+    out[1, 1] = N[0, 0] * N[2, 2] - N[0, 2] * N[0, 2]
+    out[1, 2] = N[0, 1] * N[0, 2] - N[0, 0] * N[1, 2]
+    out[2, 2] = N[0, 0] * N[1, 1] - N[0, 1] * N[0, 1]
+    determinant = N[0, 0] * out[0, 0] + N[0, 1] * out[0, 1] + N[0, 2] * out[0, 2]
+    for i in range(3):
+        for j in range(i, 3):
+            out[i, j] /= determinant
+            out[j, i] = out[i, j]
+    return determinant
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def normal_equations(P, px, normal, right, seen):  # type: ignore[no-untyped-def]
+    """Eq. 7-9 of points: ``AᵀA`` (n, 3, 3), ``Aᵀb`` (n, 3) and the number of cameras (n,) are filled.
+
+    P (C, 3, 4), px (C, n, 2) undistorted, not finite where a camera takes no part. Returns (n,) bool, whether each is
+    well conditioned for sure.
+    """
+    sure = np.zeros(px.shape[1], np.bool_)
+    row = np.empty(4)
+    for n in range(px.shape[1]):
+        N, b = normal[n], right[n]
+        N[:], b[:], seen[n] = 0.0, 0.0, 0
+        for c in range(len(P)):
+            if not (math.isfinite(px[c, n, 0]) and math.isfinite(px[c, n, 1])):
+                continue
+            seen[n] += 1
+            for k in range(2):
+                for i in range(4):
+                    row[i] = P[c, k, i] - px[c, n, k] * P[c, 2, i]
+                for i in range(3):
+                    b[i] -= row[i] * row[3]
+                    for j in range(i, 3):
+                        N[i, j] += row[i] * row[j]
+        for i in range(3):
+            for j in range(i):
+                N[i, j] = N[j, i]
+        determinant = (
+            N[0, 0] * (N[1, 1] * N[2, 2] - N[1, 2] * N[1, 2])
+            - N[0, 1] * (N[0, 1] * N[2, 2] - N[0, 2] * N[1, 2])
+            + N[0, 2] * (N[0, 1] * N[1, 2] - N[0, 2] * N[1, 1])
+        )
+        sure[n] = determinant > _SURE * (N[0, 0] + N[1, 1] + N[2, 2]) ** 3
+    return sure
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def solve(normal, right, which, xyz):  # type: ignore[no-untyped-def]
+    """xyz (n, 3) with ``normal xyz = right`` by the factors L D Lᵀ of (n, 3, 3); NaN but for ``which`` (n,)."""
+    for n in range(len(normal)):
+        if not which[n]:
+            xyz[n] = np.nan
+            continue
+        N, b = normal[n], right[n]
+        l10, l20 = N[1, 0] / N[0, 0], N[2, 0] / N[0, 0]
+        d1 = N[1, 1] - l10 * N[1, 0]
+        l21 = (N[2, 1] - l20 * N[1, 0]) / d1
+        d2 = N[2, 2] - l20 * N[2, 0] - l21 * l21 * d1
+        y1 = b[1] - l10 * b[0]
+        y2 = b[2] - l20 * b[0] - l21 * y1
+        z = y2 / d2
+        y = y1 / d1 - l21 * z
+        xyz[n, 0], xyz[n, 1], xyz[n, 2] = b[0] / N[0, 0] - l10 * y - l20 * z, y, z
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def linear_variance(P, px, slopes, normal, which, xyz, sigma):  # type: ignore[no-untyped-def]
+    """Variances (n, 3) mm² of linearly triangulated points; NaN but for ``which`` (n,).
+
+    P (C, 3, 4). px (C, n, 2) undistorted. slopes (C, n, 2, 2): image pixel by undistorted pixel, NaN for the identity.
+    normal (n, 3, 3), xyz (n, 3): of the solution. sigma (C, n, 2) px, NaN for none.
+    """
+    out = np.zeros((len(xyz), 3))
+    inverse, A, moved = np.empty((3, 3)), np.empty((2, 3)), np.empty((3, 2))
+    for n in range(len(xyz)):
+        if not which[n]:
+            out[n] = np.nan
+            continue
+        _inverse(normal[n], inverse)
+        for c in range(len(P)):
+            u, v = px[c, n, 0], px[c, n, 1]
+            if not (math.isfinite(u) and math.isfinite(v)):
+                continue
+            depth = P[c, 2, 3]
+            for i in range(3):
+                depth += xyz[n, i] * P[c, 2, i]
+                A[0, i], A[1, i] = P[c, 0, i] - u * P[c, 2, i], P[c, 1, i] - v * P[c, 2, i]
+            for i in range(3):
+                for k in range(2):
+                    moved[i, k] = depth * (inverse[i, 0] * A[k, 0] + inverse[i, 1] * A[k, 1] + inverse[i, 2] * A[k, 2])
+            J = slopes[c, n]
+            xx, xy, yx, yy = J[0, 0], J[0, 1], J[1, 0], J[1, 1]
+            if not math.isfinite(xx + xy + yx + yy):
+                xx, xy, yx, yy = 1.0, 0.0, 0.0, 1.0
+            det = xx * yy - xy * yx
+            first = 0.0 if math.isnan(sigma[c, n, 0]) else sigma[c, n, 0]
+            second = 0.0 if math.isnan(sigma[c, n, 1]) else sigma[c, n, 1]
+            for i in range(3):
+                by_u = (moved[i, 0] * yy - moved[i, 1] * yx) / det * first
+                by_v = (moved[i, 1] * xx - moved[i, 0] * xy) / det * second
+                out[n, i] += by_u * by_u + by_v * by_v
+    return out
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def gain(slopes, sigma, out):  # type: ignore[no-untyped-def]
+    """``(Σ Jᵀ W J)⁻¹ J_cᵀ W_c`` of each camera and point fills out (C, n, 3, 2); zero where a camera takes no part.
+
+    slopes (C, n, 2, 3) px a mm. sigma (C, n, 2) px; a camera where either is not finite takes no part.
+    """
+    normal, inverse, weighted = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 2))
+    for n in range(slopes.shape[1]):
+        normal[:] = 0.0
+        for c in range(len(slopes)):
+            J, s = slopes[c, n], sigma[c, n]
+            if not math.isfinite(s[0] + s[1] + J[0, 0]):
+                continue
+            for k in range(2):
+                for i in range(3):
+                    for j in range(i, 3):
+                        normal[i, j] += J[k, i] / (s[k] * s[k]) * J[k, j]
+        determinant = _inverse(normal, inverse)
+        if not determinant > 0:
+            inverse[:] = np.nan
+        for c in range(len(slopes)):
+            J, s = slopes[c, n], sigma[c, n]
+            if not math.isfinite(s[0] + s[1] + J[0, 0]):
+                out[c, n] = 0.0
+                continue
+            for k in range(2):
+                for i in range(3):
+                    weighted[i, k] = J[k, i] / (s[k] * s[k])
+            for i in range(3):
+                for k in range(2):
+                    out[c, n, i, k] = (
+                        inverse[i, 0] * weighted[0, k] + inverse[i, 1] * weighted[1, k] + inverse[i, 2] * weighted[2, k]
+                    )
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def covariance(gain, sigma):  # type: ignore[no-untyped-def]
+    """``Σ A_c diag(σ_c²) A_cᵀ`` (n, 3, 3) of gains (C, n, 3, 2), errors (C, n, 2); NaN for fewer than two cameras."""
+    total = np.zeros((gain.shape[1], 3, 3))
+    for n in range(gain.shape[1]):
+        count = 0
+        for c in range(len(gain)):
+            A, s = gain[c, n], sigma[c, n]
+            takes_part = False
+            for i in range(3):
+                takes_part |= A[i, 0] != 0 or A[i, 1] != 0
+            if not takes_part:
+                continue
+            count += 1
+            for i in range(3):
+                for j in range(3):
+                    total[n, i, j] += A[i, 0] * s[0] * (A[j, 0] * s[0]) + A[i, 1] * s[1] * (A[j, 1] * s[1])
+        if count < 2:
+            total[n] = np.nan
+    return total
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def midpoint_residuals(pairs, values, doubt, rows):  # type: ignore[no-untyped-def]
+    """How far values (n, k) of some rows (r,) lie from the median of the middles of their pairs of neighbours, (r,).
+
+    pairs (n, 4, 2): rows of opposite neighbours, -1 where there is none. doubt (n,): nobody is judged by a more
+    doubtful one. NaN where no pair is complete.
+    """
+    out = np.empty(len(rows))
+    middle = np.empty(4)
+    for r in range(len(rows)):
+        n = rows[r]
+        square = 0.0
+        for k in range(values.shape[1]):
+            count = 0
+            for p in range(4):
+                a, b = pairs[n, p, 0], pairs[n, p, 1]
+                if a < 0 or b < 0 or not max(doubt[a], doubt[b]) <= doubt[n]:
+                    continue
+                value = 0.5 * (values[a, k] + values[b, k])
+                if math.isnan(value):
+                    continue
+                at = count
+                while at > 0 and middle[at - 1] > value:
+                    middle[at] = middle[at - 1]
+                    at -= 1
+                middle[at] = value
+                count += 1
+            median = 0.5 * (middle[(count - 1) // 2] + middle[count // 2]) if count else np.nan
+            square += (values[n, k] - median) ** 2
+        out[r] = math.sqrt(square)
+    return out

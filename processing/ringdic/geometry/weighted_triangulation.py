@@ -1,0 +1,164 @@
+"""From matched pixels and their uncertainty to points in space, with covariance: every camera by its weight.
+
+A point minimises ``χ² = Σ ((u_c - û_c(X))/σ_c)²`` over the cameras that see it, ``û_c`` its true projection through the
+lens. The start is the weighted linear solution (eq. 7-9 of Solav et al. 2018), the rest is Gauss-Newton. With m cameras
+χ² has 2 m - 3 degrees of freedom, and the covariance of the point is ``(Σ Jᵀ W J)⁻¹``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.geometry.camera import Camera
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+_STEPS = 8  # Gauss-Newton; two or three are enough unless a match is wrong
+_SETTLED = 1e-7  # mm
+_CROSSING = 1e-10  # least 27 det N / (tr N)³ of a normal matrix N; 1 where all directions are known equally well
+
+
+@dataclass(frozen=True)
+class WeightedPoints:
+    """Points triangulated from all their views; NaN where fewer than two cameras saw one or their rays are parallel.
+
+    xyz : (n, 3) mm, world frame. covariance : (n, 3, 3) mm², of independent pixel errors with the standard deviations
+    that were given. chi2 : (n,) weighted squared residuals. degrees : (n,) their degrees of freedom, 2 m - 3 for m
+    views, 0 where lost.
+    """
+
+    xyz: Array
+    covariance: Array
+    chi2: Array
+    degrees: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        n = len(self.xyz)
+        if self.xyz.shape != (n, 3) or self.covariance.shape != (n, 3, 3) or self.chi2.shape != (n,):
+            raise ValueError("weighted points need a place, a covariance and a chi-square each")
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations of x, y and z. (n, 3) mm."""
+        return np.sqrt(np.einsum("nii->ni", self.covariance))
+
+
+@dataclass(frozen=True)
+class _View:
+    """What one camera saw: which points (k,), their pixels (k, 2) and one over their standard deviations (k, 2)."""
+
+    camera: Camera
+    index: Index
+    px: Array
+    weight: Array
+
+
+def triangulate_weighted(cameras: Sequence[Camera], px: Array, sigma: Array) -> WeightedPoints:
+    """Points in space from their pixels in two or more images, each by its weight.
+
+    Parameters
+    ----------
+    cameras : the C cameras, C ≥ 2.
+    px, sigma : (C, n, 2) image pixels as they are in the images (distorted) and their standard deviations, px. A
+        camera in which either is not finite takes no part in the point.
+
+    Raises ValueError for arrays of other shapes and for a standard deviation that is not positive.
+    """
+    px, sigma = np.asarray(px, dtype=float), np.asarray(sigma, dtype=float)
+    if len(cameras) < 2 or px.shape[:1] != (len(cameras),) or px.ndim != 3 or px.shape[2] != 2:
+        raise ValueError(f"{len(cameras)} cameras do not go with pixels of shape {px.shape}; wanted (C, n, 2), C >= 2")
+    if sigma.shape != px.shape:
+        raise ValueError(f"standard deviations of shape {sigma.shape} do not go with pixels of shape {px.shape}")
+    if (sigma <= 0).any():
+        raise ValueError("a pixel with a standard deviation of zero or less has no weight; give it a positive one")
+    n = px.shape[1]
+    views = [_view(camera, image, scatter) for camera, image, scatter in zip(cameras, px, sigma, strict=True)]
+    count = np.zeros(n, dtype=np.int64)
+    for view in views:
+        count[view.index] += 1
+    xyz, normal = _linear(views, n)
+    xyz[(count < 2) | ~_determined(normal)] = np.nan
+    xyz, normal, chi2 = _gauss_newton(views, xyz)
+    lost = ~(np.isfinite(xyz).all(axis=1) & np.isfinite(chi2) & _determined(normal))
+    covariance = _inverse(normal)
+    xyz[lost], covariance[lost], chi2[lost] = np.nan, np.nan, np.nan
+    return WeightedPoints(xyz, covariance, chi2, np.where(lost, 0, 2 * count - 3))
+
+
+def _view(camera: Camera, px: Array, sigma: Array) -> _View:
+    undistorted = np.isfinite(px).all(axis=1) & np.isfinite(sigma).all(axis=1)
+    index = np.flatnonzero(undistorted)
+    return _View(camera, index, px[index], 1.0 / sigma[index])
+
+
+def _linear(views: list[_View], n: int) -> tuple[Array, Array]:
+    """Solutions of the weighted equations of eq. 7-9 (n, 3) and their normal matrices (n, 3, 3)."""
+    normal, right = np.zeros((n, 3, 3)), np.zeros((n, 3))
+    for view in views:
+        P = view.camera.P
+        px = view.camera.undistort(view.px)
+        known = np.isfinite(px).all(axis=1)
+        # A row's residual is the pixel's times its depth, which is 1 at the world's origin and near it all over a rig.
+        rows = (P[:2] - px[known][..., None] * P[2]) * view.weight[known][..., None]
+        A, b = rows[..., :3], -rows[..., 3]
+        normal[view.index[known]] += A.transpose(0, 2, 1) @ A
+        right[view.index[known]] += (A.transpose(0, 2, 1) @ b[..., None])[..., 0]
+    return (_inverse(normal) @ right[..., None])[..., 0], normal
+
+
+def _gauss_newton(views: list[_View], xyz: Array) -> tuple[Array, Array, Array]:
+    """Points (n, 3) moved to the least χ²; then their normal matrices (n, 3, 3) and χ² (n,)."""
+    for _ in range(_STEPS):
+        normal, right, chi2 = _normal_equations(views, xyz)
+        step = (_inverse(normal) @ right[..., None])[..., 0]
+        xyz = xyz + step
+        # χ² at the minimum of its quadratic; exact where the step was small.
+        chi2 = chi2 - np.einsum("ni,ni->n", step, right)
+        if not (np.abs(step) > _SETTLED).any():
+            break
+    else:
+        xyz[np.abs(step).max(axis=1) > 1e3 * _SETTLED] = np.nan
+    return xyz, normal, np.maximum(chi2, 0.0)
+
+
+def _normal_equations(views: list[_View], xyz: Array) -> tuple[Array, Array, Array]:
+    """JᵀWJ (n, 3, 3), JᵀW times the residuals (n, 3) and χ² (n,)."""
+    n = len(xyz)
+    normal, right, chi2 = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n)
+    for view in views:
+        projected, slope = view.camera.project_with_slope(xyz[view.index])
+        residual = (view.px - projected) * view.weight
+        J = slope * view.weight[..., None]
+        normal[view.index] += J.transpose(0, 2, 1) @ J
+        right[view.index] += (J.transpose(0, 2, 1) @ residual[..., None])[..., 0]
+        chi2[view.index] += (residual**2).sum(axis=1)
+    return normal, right, chi2
+
+
+def _determined(normal: Array) -> NDArray[np.bool_]:
+    """Which points (n,) have lines of sight that cross."""
+    trace = np.einsum("nii->n", normal)
+    return np.asarray(27.0 * _determinant(normal) > _CROSSING * trace**3)
+
+
+def _determinant(N: Array) -> Array:
+    """Of symmetric matrices (n, 3, 3)."""
+    a, b, c, d, e, f = (N[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
+    return np.asarray(a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d))
+
+
+def _inverse(N: Array) -> Array:
+    """Inverses of positive definite matrices (n, 3, 3) by their adjugates; NaN where singular."""
+    a, b, c, d, e, f = (N[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
+    out = np.empty_like(N)
+    out[:, 0, 0], out[:, 1, 1], out[:, 2, 2] = d * f - e * e, a * f - c * c, a * d - b * b
+    out[:, 0, 1] = out[:, 1, 0] = c * e - b * f
+    out[:, 0, 2] = out[:, 2, 0] = b * e - c * d
+    out[:, 1, 2] = out[:, 2, 1] = b * c - a * e
+    determinant = a * out[:, 0, 0] + b * out[:, 0, 1] + c * out[:, 0, 2]
+    return out / np.where(determinant > 0, determinant, np.nan)[:, None, None]

@@ -1,0 +1,69 @@
+"""``python -m ringdic.jobs SESSION``: process a session and tell about it in lines of JSON on standard output.
+
+This is what the controller runs as a child process. Every line is one object: ``{"stage", "done", "rate",
+"left_s", "message"}`` while at work, at last ``{"state": "done", "run", "summary"}`` or
+``{"state": "failed", "error"}``. Exit codes: 0 done, 2 bad input, 3 could not be computed, 1 a bug.
+
+``python -m ringdic.jobs --serve`` stays warm and takes its orders from standard input; see `ringdic.jobs.serving`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from ringdic.errors import RingdicError
+from ringdic.jobs.allocation import keep_freed_memory
+from ringdic.jobs.serving import carry_out, compile_kernels, serve, told
+
+
+def main() -> int:
+    """Parse the command line, process, report; the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m ringdic.jobs", description="Process a session folder.")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("session", type=Path, nargs="?")
+    what.add_argument("--serve", action="store_true", help="take orders from standard input")
+    what.add_argument("--compile", action="store_true", help="compile the kernels at low priority, and end")
+    parser.add_argument("--settings", type=Path)
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="NAME=VALUE")
+    arguments = parser.parse_args()
+    keep_freed_memory()
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
+    if arguments.compile:
+        compile_kernels(_line)
+        return 0
+    if arguments.serve:
+        return _serve_to_the_end()
+    try:
+        _line(carry_out(arguments.session, arguments.settings, arguments.overrides, lambda at: _line(told(at))))
+    except RingdicError as error:
+        _line({"state": "failed", "error": str(error)})
+        return error.exit_code
+    return 0
+
+
+def _serve_to_the_end() -> int:
+    try:
+        serve(sys.stdin, _line)
+    except Exception:
+        logging.exception("the processing failed through a fault of its own")
+        return 1
+    return 0
+
+
+def _line(value: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(value) + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    code = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # At once: all is written, taking arrays and kernels down takes half a second, and who reads the orders never ends.
+    os._exit(code)

@@ -1,0 +1,228 @@
+"""The figures of a run that an operator reads first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.calibration.drift import drift_sentences
+from ringdic.calibration.quality import ReconstructionError
+from ringdic.calibration.rig import Ring
+from ringdic.measure.window_study import gauge
+from ringdic.results.fields import available
+from ringdic.results.results import Results
+from ringdic.strain.deformation import Deformation
+from ringdic.strain.rigid_motion import RigidMotion
+
+Array = NDArray[np.float64]
+
+#: Why nothing is stated of what the calibration adds.
+ALONE = (
+    "each camera was calibrated alone, which states no covariance: what the calibration adds to the uncertainty is not "
+    "known; with calibration.method=bundle it is"
+)
+
+
+@dataclass(frozen=True)
+class StepFigures:
+    """What the summary tells of one step: its row, and the medians of its standard deviations, by cause."""
+
+    row: dict[str, Any]
+    uncertainty: dict[str, Any]
+
+
+def summarise(
+    reference: Results,
+    steps: Sequence[StepFigures],
+    ring: Ring,
+    errors: dict[tuple[str, str], ReconstructionError],
+    drift: Mapping[str, Array],
+    agreement: Mapping[str, Any],
+    warnings: tuple[str, ...],
+) -> dict[str, Any]:
+    """Counts, calibration quality and one row of figures a step, as JSON values; ``table`` is for the terminal.
+
+    reference : the results of the reference alone. steps : all, the reference first.
+    drift : (F,) px by pair or camera, the mean vertical residual of each step: cameras that moved between frames.
+    agreement : of the surfaces of camera pairs, or of the cameras about the points that all measured together.
+    """
+    control = {
+        "mean_mm": _mean([error.mean for error in errors.values()]),
+        "rms_mm": _mean([error.rms for error in errors.values()]),
+    }
+    names = tuple(step.row["step"] for step in steps)
+    last = [step for step in steps if step.row["measured"]][-1]
+    figures = {
+        "points": len(reference.vertices_ref),
+        "faces": len(reference.faces),
+        "pairs": len(reference.pairs),
+        "area_mm2": round(float(reference.mesh.areas.sum()), 1),
+        "control_points": control,
+        "cameras": [asdict(row) for row in ring.quality],
+        "calibration": _calibration(ring),
+        "drift_px": {who: _finite(values) for who, values in drift.items()},
+        "agreement": dict(agreement),
+        "strain": _strain(reference),
+        "uncertainty": {**last.uncertainty, "why": None if ring.bundle is not None else ALONE},
+        "steps": [step.row for step in steps],
+        "warnings": [*warnings, *drift_sentences(drift, names)],
+    }
+    return {**figures, "table": _table(figures)}
+
+
+def step_figures(results: Results, motion: RigidMotion, found: Deformation) -> StepFigures:
+    """The figures of the last step of some results, by its rigid motion back onto the reference and its deformation."""
+    last = len(results.steps) - 1
+    return StepFigures(_row(results, last, motion, found), _uncertainty(results, last))
+
+
+def _calibration(ring: Ring) -> dict[str, Any]:
+    """How the cameras were found and how well: the pairs, the target as adjusted, and what could be done better."""
+    return {
+        "method": "dlt" if ring.bundle is None else "bundle",
+        "pairs": [asdict(row) for row in ring.pairs],
+        "bundle": None if ring.bundle is None else ring.bundle.figures(ring.target),
+        "advice": list(ring.advice),
+    }
+
+
+def _strain(results: Results) -> dict[str, float | None]:
+    """What a strain averages over, mm: each triangle alone, and the window if the run has one."""
+    alone = gauge(results, 0.0)
+    over = replace(alone, width=results.window_mm)
+    return {
+        "step_mm": _number(alone.step),
+        "subset_mm": _number(alone.subset),
+        "gauge_mm": _number(alone.length),
+        "window_mm": results.window_mm,
+        "window_gauge_mm": _number(over.length) if results.window_mm > 0 else None,
+    }
+
+
+def _uncertainty(results: Results, step: int) -> dict[str, Any]:
+    """Medians of the standard deviations at a step, by noise and by the calibration; None for what is not known."""
+    arrays = results.certainty(step).fields()
+    known = {entry.name: entry for entry in available(arrays.names)}
+
+    def row(names: Mapping[str, str]) -> dict[str, float | None]:
+        return {what: _median(arrays.scalar(known[n])) if n in known else None for what, n in names.items()}
+
+    return {
+        "step": results.steps[step],
+        "noise": row({"position_mm": "sigma", "displacement_mm": "sigma_displacement", "stretch": "sigma_lambda2"}),
+        "calibration": row(
+            {
+                "position_mm": "sigma_calibration",
+                "displacement_mm": "sigma_displacement_calibration",
+                "stretch": "sigma_lambda_calibration2",
+            }
+        ),
+    }
+
+
+def _row(results: Results, step: int, motion: RigidMotion, found: Deformation) -> dict[str, Any]:
+    current = results.vertices[step]
+    measured = np.isfinite(current).all(axis=1)
+    residual = np.linalg.norm(motion.apply(current) - results.vertices_ref, axis=1)
+    return {
+        "step": results.steps[step],
+        "measured": int(measured.sum()),
+        "lost": int((~measured).sum()),
+        "c_ls_median": _median(results.correlation[step]),
+        "displacement_mm": _median(np.linalg.norm(current - results.vertices_ref, axis=1)),
+        "rigid_translation_mm": float(np.linalg.norm(np.nanmean(results.vertices_ref - current, axis=0)))
+        if measured.any()
+        else None,
+        "rigid_rotation_deg": float(np.degrees(motion.angle)),
+        "rigid_residual_rms_mm": _rms(residual),
+        "E_magnitude_median": _median(found.E_magnitude),
+        "lambda1_median": _median(found.lambda1),
+        "lambda2_median": _median(found.lambda2),
+    }
+
+
+def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
+    control = figures["control_points"]
+    rows = [
+        {
+            "figure": "camera pairs, points, triangles",
+            "value": f"{figures['pairs']}, {figures['points']:,}, {figures['faces']:,}",
+        },
+        {"figure": "measured area", "value": f"{figures['area_mm2'] / 100:,.1f} cm²"},
+        {
+            "figure": "control points: mean vector, RMS",
+            "value": f"{control['mean_mm']:.4f}, {control['rms_mm']:.4f} mm",
+        },
+    ]
+    bundle = figures["calibration"]["bundle"]
+    if bundle is not None:
+        rows.append(
+            {
+                "figure": "bundle: centroids, print errors, radius",
+                "value": f"{bundle['centroid_sigma_px']:.4f} px, {bundle['print_errors_rms_mm']:.3f} mm, "
+                f"{bundle['radius_mm']:.3f} mm",
+            }
+        )
+    agreement = figures["agreement"]
+    if agreement.get("mismatch_mm") is not None:
+        rows.append(
+            {
+                "figure": "distance between the surfaces of neighbouring pairs",
+                "value": f"{agreement['mismatch_mm']:.4f} ± {agreement['mismatch_std_mm']:.4f} mm",
+            }
+        )
+    if agreement.get("residual_px") is not None:
+        rows.append(
+            {
+                "figure": "cameras a point, how far they miss it",
+                "value": f"{agreement['views']:.1f}, {agreement['residual_px']:.4f} px",
+            }
+        )
+    strain = figures["strain"]
+    if strain["gauge_mm"] is not None:
+        value = f"{strain['gauge_mm']:.1f} mm"
+        if strain["window_gauge_mm"] is not None:
+            value += f", over the window of {strain['window_mm']:g} mm {strain['window_gauge_mm']:.1f} mm"
+        rows.append({"figure": "a strain averages over (virtual strain gauge)", "value": value})
+    for part, figures_of in (("noise", "image noise"), ("calibration", "calibration")):
+        known = figures["uncertainty"][part]
+        if None not in known.values():
+            value = f"{known['position_mm']:.4f} mm, {known['displacement_mm']:.5f} mm, {known['stretch']:.1e}"
+            rows.append({"figure": f"standard deviations by the {figures_of}: place, displacement, λ2", "value": value})
+    for step in figures["steps"][1:]:
+        if step["measured"]:
+            rows.append(
+                {
+                    "figure": f"{step['step']}: displacement, λ1, λ2 (medians), lost",
+                    "value": f"{step['displacement_mm']:.3f} mm, {step['lambda1_median']:.4f}, "
+                    f"{step['lambda2_median']:.4f}, {step['lost']:,}",
+                }
+            )
+    rows += [{"figure": "warning", "value": sentence} for sentence in figures["warnings"]]
+    return rows
+
+
+def _median(values: Array) -> float | None:
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else None
+
+
+def _rms(values: Array) -> float | None:
+    finite = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(finite**2))) if len(finite) else None
+
+
+def _mean(values: list[float]) -> float:
+    return float(np.mean(values))
+
+
+def _number(value: float) -> float | None:
+    return round(value, 4) if np.isfinite(value) else None
+
+
+def _finite(values: Array) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in values]

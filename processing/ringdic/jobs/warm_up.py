@@ -1,0 +1,71 @@
+"""What follows the matching, gone through once on a small made-up plate, so that its kernels are compiled or loaded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.geometry.camera import Camera, Intrinsics
+from ringdic.pairs.matching import StepMatches
+from ringdic.pairs.reconstruction import pair_shape
+from ringdic.pairs.surfaces import FollowedPair, follow, pairs_surface
+from ringdic.results.series import Shelf
+from ringdic.results.uncertainty import Stated
+from ringdic.results.writer import write_series
+from ringdic.settings import Settings
+
+Array = NDArray[np.float64]
+
+_SIDE = 16  # points along an edge of what a pair sees
+_PITCH = 10.0  # mm, and px
+_AWAY = 1000.0  # mm, from the cameras to the plate
+_FOCAL = 1000.0  # px
+_SIZE = (800, 800)
+_STEPS = 2
+
+
+def rehearse() -> None:
+    """Two pairs of three cameras in a row see a plate, with an overlap, at the reference and a little stretched."""
+    cameras = [_camera(str(k), x) for k, x in enumerate((-80.0, 0.0, 80.0))]
+    settings = Settings()
+    with TemporaryDirectory() as folder:
+        shelf = Shelf(Path(folder))
+        pairs = [_followed((cameras[k], cameras[k + 1]), 80.0 * k - 120.0, shelf) for k in range(2)]
+        series, _ = pairs_surface("rehearsal", cameras, pairs, [str(k) for k in range(_STEPS)], settings)
+        Stated(series.reference, None, series.noise).of(series.at(1), 1)
+        write_series(Path(folder) / "results.h5", series, lambda _: None, {}, {})
+        shelf.close()
+
+
+def _camera(name: str, x: float) -> Camera:
+    """A camera at (x, 0, -1 m) mm that looks along z."""
+    lens = Intrinsics(
+        np.array([[_FOCAL, 0.0, 400.0], [0.0, _FOCAL, 400.0], [0.0, 0.0, 1.0]]),
+        np.array([1e-3, 0.0, 0.0, 0.0, 0.0]),
+        _SIZE,
+    )
+    P = lens.K_undistorted @ np.column_stack([np.eye(3), [-x, 0.0, _AWAY]])
+    return Camera(name, P / P[2, 3], _SIZE, lens)
+
+
+def _followed(cameras: tuple[Camera, Camera], left: float, shelf: Shelf) -> FollowedPair:
+    """A pair's part of the plate, from ``left`` mm on along x."""
+    column, row = (axis.ravel() for axis in np.meshgrid(np.arange(_SIDE), np.arange(_SIDE), indexing="ij"))
+    places = np.column_stack([left + _PITCH * column, _PITCH * row - 80.0, np.zeros(len(row))])
+    first = np.flatnonzero((column < _SIDE - 1) & (row < _SIDE - 1))
+    quad = np.stack([first, first + _SIDE, first + _SIDE + 1, first + 1], axis=1)
+    faces = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]]).astype(np.int32)
+    steps = [_matches(cameras, places * [1.0 + 1e-3 * k, 1.0, 1.0]) for k in range(_STEPS)]
+    grid = _PITCH * np.column_stack([column, row]).astype(np.float64)
+    shape = pair_shape(cameras, grid, faces, steps[0], int(_PITCH), 1.0)
+    return follow(shape, steps.__getitem__, _STEPS, shelf)
+
+
+def _matches(cameras: tuple[Camera, Camera], xyz: Array) -> StepMatches:
+    """What the cameras see of points (n, 3) mm."""
+    n = len(xyz)
+    px = np.stack([camera.project(xyz) for camera in cameras])
+    return StepMatches(px, np.full((2, n, 2), 0.01, np.float32), np.full(n, 0.01, np.float32), np.zeros(n, np.int8))

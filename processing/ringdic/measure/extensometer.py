@@ -1,0 +1,45 @@
+"""A virtual extensometer: the length between two material places, along the surface and straight."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ringdic.measure.path import shortest_path
+from ringdic.measure.place import Place
+from ringdic.measure.table import Table
+from ringdic.results.evaluation import Evaluated
+
+_UNITS = dict.fromkeys(("along_surface", "straight"), "mm")
+
+
+def extensometer(seen: Evaluated, start: Place, end: Place) -> Table:
+    """One row a step: lengths in mm and engineering strains ``L / L0 - 1``.
+
+    ``along_surface`` follows the material that was the shortest way in the reference; ``straight`` is the chord. L0 is
+    the length at the step that each is compared with. Raises ComputationError if no way along the surface joins the
+    places.
+    """
+    results = seen.results
+    mesh = results.mesh
+    path = shortest_path(mesh, start, end)
+    rows: list[dict[str, Any]] = []
+    for step, name in enumerate(seen.steps):
+        now, before = results.vertices[step], results.before(step, seen.evaluation.previous)
+        row: dict[str, Any] = {"step": step, "capture": name}
+        lengths = {
+            "along_surface": [path.length(vertices, mesh.faces) for vertices in (now, before)],
+            "straight": [
+                float(np.linalg.norm(end.at(vertices, mesh.faces) - start.at(vertices, mesh.faces)))
+                for vertices in (now, before)
+            ],
+        }
+        row |= {kind: length for kind, (length, _) in lengths.items()}
+        row |= {f"strain_{kind}": length / known - 1.0 for kind, (length, known) in lengths.items()}
+        rows.append(row)
+    note = (
+        f"from {start.label} to {end.label}; the way along the surface crosses {len(path.edges)} edges; "
+        "strain is the change of length over the length before"
+    )
+    return Table.of_rows(rows, _UNITS, [note])

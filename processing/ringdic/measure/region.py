@@ -1,0 +1,151 @@
+"""Statistics of fields over a part of the reference surface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.errors import InputError
+from ringdic.measure.table import Table
+from ringdic.mesh.mesh import Mesh
+from ringdic.results.evaluation import Evaluated
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class Region(Protocol):
+    """A part of space, or of a surface."""
+
+    def faces(self, mesh: Mesh) -> Mask:
+        """Which triangles (M,) of the reference surface belong to it, by their centroids."""
+        ...
+
+
+@dataclass(frozen=True)
+class Everything:
+    """The whole surface."""
+
+    def faces(self, mesh: Mesh) -> Mask:
+        """All triangles, (M,)."""
+        return np.ones(len(mesh.faces), dtype=bool)
+
+
+@dataclass(frozen=True)
+class Box:
+    """What lies between two corners, mm."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
+            raise InputError(f"the first corner of a box is the lower one in x, y and z, not {self.low} to {self.high}")
+
+    def faces(self, mesh: Mesh) -> Mask:
+        """Triangles inside, (M,)."""
+        centroids = mesh.centroids
+        return np.asarray(((centroids >= self.low) & (centroids <= self.high)).all(axis=1))
+
+
+@dataclass(frozen=True)
+class Ball:
+    """What lies within ``radius`` mm of a centre."""
+
+    centre: tuple[float, float, float]
+    radius: float
+
+    def __post_init__(self) -> None:
+        if not self.radius > 0:
+            raise InputError(f"the radius of a sphere is above 0 mm, not {self.radius:g}")
+
+    def faces(self, mesh: Mesh) -> Mask:
+        """Triangles inside, (M,)."""
+        return np.asarray(np.linalg.norm(mesh.centroids - self.centre, axis=1) <= self.radius)
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A window in azimuth, rad, counter-clockwise from the first to the second, and in height z, mm."""
+
+    azimuth: tuple[float, float]
+    height: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        if not self.height[0] < self.height[1]:
+            raise InputError(f"the first height of a patch is the lower one, not {self.height[0]:g}")
+
+    def faces(self, mesh: Mesh) -> Mask:
+        """Triangles inside, (M,)."""
+        x, y, z = mesh.centroids.T
+        begin, end = self.azimuth
+        span = 2 * np.pi if end - begin >= 2 * np.pi else np.mod(end - begin, 2 * np.pi)
+        turned = np.mod(np.arctan2(y, x) - begin, 2 * np.pi) <= span
+        return np.asarray(turned & (z >= self.height[0]) & (z <= self.height[1]))
+
+
+@dataclass(frozen=True)
+class Listed:
+    """Triangles by their indices from 0."""
+
+    indices: tuple[int, ...]
+
+    def faces(self, mesh: Mesh) -> Mask:
+        """Those triangles, (M,). Raises InputError for one that there is not."""
+        chosen = np.zeros(len(mesh.faces), dtype=bool)
+        for index in self.indices:
+            if not 0 <= index < len(mesh.faces):
+                raise InputError(f"no face {index}; there are {len(mesh.faces)}, from 0")
+            chosen[index] = True
+        return chosen
+
+
+def region_statistics(seen: Evaluated, region: Region, fields: Sequence[str] = ()) -> Table:
+    """One row a field and step over the triangles of a region, or over the points that are their corners.
+
+    ``mean``, ``std`` and ``rms`` are weighted by the area in the reference (a point has a third of its triangles in the
+    region); ``min``, ``p5``, ``median``, ``p95``, ``max`` count triangles or points alike; ``measured`` and ``lost``
+    are numbers of them. Raises InputError for a region without triangles or a field there is not.
+    """
+    entries = [seen.field(name) for name in fields] if fields else list(seen.fields)
+    mesh = seen.results.mesh
+    inside = region.faces(mesh)
+    if not inside.any():
+        raise InputError("the region holds no triangle of the surface")
+    areas = np.where(inside, mesh.areas, 0.0)
+    weights = {"face": areas, "point": _shares(mesh, areas)}
+    rows: list[dict[str, Any]] = []
+    for entry in entries:
+        for step, name in enumerate(seen.steps):
+            weight = weights[entry.location]
+            held = weight > 0
+            found = statistics(seen.step(step).scalar(entry)[held], weight[held])
+            rows.append({"field": entry.name, "unit": entry.unit, "step": step, "capture": name, **found})
+    note = f"{int(inside.sum())} triangles, {areas.sum():.2f} mm² in the reference"
+    return Table.of_rows(rows, {}, [note])
+
+
+def statistics(values: Array, weights: Array) -> dict[str, float | int]:
+    """Weighted mean, standard deviation and RMS, plain percentiles, and how many are measured and lost."""
+    known = np.isfinite(values)
+    lost = int((~known).sum())
+    names = ("mean", "std", "rms", "min", "p5", "median", "p95", "max")
+    if not known.any():
+        return {**dict.fromkeys(names, float("nan")), "measured": 0, "lost": lost}
+    v, w = values[known], weights[known] / weights[known].sum()
+    mean = float(w @ v)
+    found = (
+        mean,
+        float(np.sqrt(w @ (v - mean) ** 2)),
+        float(np.sqrt(w @ v**2)),
+        *np.percentile(v, [0, 5, 50, 95, 100]),
+    )
+    return {**dict(zip(names, map(float, found), strict=True)), "measured": len(v), "lost": lost}
+
+
+def _shares(mesh: Mesh, areas: Array) -> Array:
+    return np.asarray(np.bincount(mesh.faces.ravel(), np.repeat(areas / 3.0, 3), len(mesh.vertices)), dtype=float)

@@ -1,0 +1,162 @@
+"""Fields along a cut of the reference surface, of the same material at every step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.errors import InputError
+from ringdic.measure.table import Table
+from ringdic.mesh.mesh import Mesh
+from ringdic.results.evaluation import Evaluated
+from ringdic.results.fields import Field
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A plane through ``origin`` mm with ``normal`` of any length.
+
+    towards : if given, only the side of the plane where ``(x - origin) · towards > 0``.
+    """
+
+    origin: tuple[float, float, float]
+    normal: tuple[float, float, float]
+    towards: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.normal).all() or np.linalg.norm(self.normal) == 0:
+            raise InputError(f"a plane needs a normal with a direction, not {self.normal}")
+
+    @classmethod
+    def at_height(cls, z: float) -> Cut:
+        """The plane of constant z, mm."""
+        return cls((0.0, 0.0, z), (0.0, 0.0, 1.0))
+
+    @classmethod
+    def at_azimuth(cls, theta: float) -> Cut:
+        """The half-plane from the axis at an azimuth about +z from +x, rad."""
+        c, s = float(np.cos(theta)), float(np.sin(theta))
+        return cls((0.0, 0.0, 0.0), (-s, c, 0.0), (c, s, 0.0))
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """The triangles that a cut crosses, in order along its lines. K triangles.
+
+    faces : (K,). edges : (K, 2, 2) the two edges crossed, shares : (K, 2) where. line : (K,) number of the line.
+    along : (K,) mm, arc length from the line's begin to the middle of the crossing, in the reference.
+    """
+
+    faces: Ints
+    edges: Ints
+    shares: Array
+    line: Ints
+    along: Array
+
+    def at(self, values: Array) -> Array:
+        """Values of points (N, ...) at the middle of each crossing, (K, ...)."""
+        shares = self.shares.reshape(*self.shares.shape, *[1] * (values.ndim - 1))
+        first, second = values[self.edges[..., 0]], values[self.edges[..., 1]]
+        return np.asarray((first + shares * (second - first)).mean(axis=1))
+
+
+def section(seen: Evaluated, cut: Cut, fields: Sequence[str] = ()) -> Table:
+    """One row a crossed triangle and step: line, arc length in the reference, position and fields.
+
+    fields : names; every field there is unless given. Raises InputError for a field there is not, or a cut that misses
+    the surface.
+    """
+    entries: list[Field] = [seen.field(name) for name in fields] if fields else list(seen.fields)
+    found = crossings(seen.results.mesh, cut)
+    reference = found.at(seen.results.vertices_ref)
+    rows: list[dict[str, Any]] = []
+    for step, name in enumerate(seen.steps):
+        arrays, now = seen.step(step), found.at(seen.positions(step))
+        columns = {
+            entry.name: found.at(values) if entry.location == "point" else values[found.faces]
+            for entry in entries
+            for values in [arrays.scalar(entry)]
+        }
+        for k in range(len(found.faces)):
+            row: dict[str, Any] = {"line": int(found.line[k]), "step": step, "capture": name, "s": found.along[k]}
+            row |= {f"{axis}_reference": reference[k, i] for i, axis in enumerate("xyz")}
+            row |= {axis: now[k, i] for i, axis in enumerate("xyz")}
+            rows.append(row | {entry: values[k] for entry, values in columns.items()})
+    lengths = ("s", "x", "y", "z", "x_reference", "y_reference", "z_reference")
+    units = {**dict.fromkeys(lengths, "mm"), **{entry.name: entry.unit for entry in entries}}
+    lines = int(found.line.max()) + 1
+    return Table.of_rows(rows, units, [f"{len(found.faces)} triangles crossed on {lines} line{'s' * (lines > 1)}"])
+
+
+def crossings(mesh: Mesh, cut: Cut) -> Crossings:
+    """Where a cut crosses the triangles of a surface. Raises InputError if it does not."""
+    normal = np.array(cut.normal) / np.linalg.norm(cut.normal)
+    height = (mesh.vertices - np.array(cut.origin)) @ normal
+    above = height >= 0  # a vertex on the plane counts as above: every triangle is crossed twice or not at all
+    sides = mesh.faces[:, [[0, 1], [1, 2], [2, 0]]]
+    crossed = above[sides[..., 0]] != above[sides[..., 1]]
+    which = np.flatnonzero(crossed.any(axis=1) & mesh.whole_faces())
+    edges = np.sort(sides[which][crossed[which]].reshape(-1, 2, 2), axis=-1)
+    h = height[edges]
+    shares = h[..., 0] / (h[..., 0] - h[..., 1])
+    if cut.towards is not None:
+        middle = _points(mesh, edges, shares).mean(axis=1)
+        side = (middle - np.array(cut.origin)) @ np.array(cut.towards) > 0
+        which, edges, shares = which[side], edges[side], shares[side]
+    if not len(which):
+        low, high = np.nanmin(mesh.vertices, axis=0), np.nanmax(mesh.vertices, axis=0)
+        spans = ", ".join(f"{a} {low[i]:.1f} … {high[i]:.1f}" for i, a in enumerate("xyz"))
+        raise InputError(f"the section misses the surface, which spans {spans} mm")
+    order, flipped, line = _chained(edges, len(mesh.vertices))
+    edges, shares = edges[order], shares[order]
+    edges[flipped], shares[flipped] = edges[flipped][:, ::-1], shares[flipped][:, ::-1]
+    steps = np.linalg.norm(np.diff(_points(mesh, edges, shares), axis=1)[:, 0], axis=1)
+    total = np.cumsum(steps)
+    begin = np.concatenate([[0.0], total[:-1]])[np.searchsorted(line, line)]
+    return Crossings(which[order], edges, shares, line, total - 0.5 * steps - begin)
+
+
+def _points(mesh: Mesh, edges: Ints, shares: Array) -> Array:
+    """Where edges (K, 2, 2) are crossed: (K, 2, 3) mm."""
+    a, b = mesh.vertices[edges[..., 0]], mesh.vertices[edges[..., 1]]
+    return np.asarray(a + shares[..., None] * (b - a))
+
+
+def _chained(edges: Ints, vertices: int) -> tuple[Ints, NDArray[np.bool_], Ints]:
+    """Segments between edges (K, 2, 2) in order along their lines.
+
+    Returns the order (K,), which of the ordered segments run backwards (K,), and the number of the line of each (K,),
+    rising. Open lines begin at an end; closed ones at the segment that comes first.
+    """
+    nodes = edges[..., 0] * vertices + edges[..., 1]  # (K, 2)
+    _, index = np.unique(nodes, return_inverse=True)
+    index = index.reshape(-1, 2)
+    at: list[list[int]] = [[] for _ in range(int(index.max()) + 1)]
+    for segment, ends in enumerate(index.tolist()):
+        for node in ends:
+            at[node].append(segment)
+    left = [True] * len(index)
+    order: list[int] = []
+    flipped: list[bool] = []
+    line: list[int] = []
+    open_ends = [node for node, segments in enumerate(at) if len(segments) == 1]
+    number = 0
+    for node in [*open_ends, *index[:, 0].tolist()]:
+        began = len(order)
+        while following := [segment for segment in at[node] if left[segment]]:
+            segment = following[0]
+            left[segment] = False
+            backwards = int(index[segment, 0]) != node
+            order.append(segment)
+            flipped.append(backwards)
+            line.append(number)
+            node = int(index[segment, 0 if backwards else 1])
+        number += len(order) > began
+    return np.array(order), np.array(flipped), np.array(line)

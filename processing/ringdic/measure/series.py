@@ -1,0 +1,44 @@
+"""Fields of places through time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ringdic.measure.place import Place
+from ringdic.measure.table import Table
+from ringdic.results.evaluation import Evaluated
+
+
+def time_series(seen: Evaluated, places: Sequence[Place], fields: Sequence[str] = ()) -> Table:
+    """One row a place and step: position and fields, those of points interpolated, those of faces of its triangle.
+
+    fields : names; every field there is unless given. Raises InputError for a field there is not.
+    """
+    entries = [seen.field(name) for name in fields] if fields else list(seen.fields)
+    faces = seen.results.faces
+    rows: list[dict[str, Any]] = []
+    for step, name in enumerate(seen.steps):
+        arrays = seen.step(step)
+        values = {entry.name: arrays.scalar(entry) for entry in entries}
+        positions = seen.positions(step)
+        for number, place in enumerate(places):
+            x, y, z = place.at(positions, faces)
+            row: dict[str, Any] = {"place": place.label, "step": step, "capture": name, "x": x, "y": y, "z": z}
+            for entry in entries:
+                here = values[entry.name]
+                row[entry.name] = float(place.at(here, faces) if entry.location == "point" else here[place.face])
+            rows.insert((number + 1) * (step + 1) - 1, row)  # the steps of a place follow one another
+    units = {"x": "mm", "y": "mm", "z": "mm", **{entry.name: entry.unit for entry in entries}}
+    return Table.of_rows(rows, units, _notes(seen, places))
+
+
+def _notes(seen: Evaluated, places: Sequence[Place]) -> list[str]:
+    reference = seen.results.vertices_ref
+    return [
+        f"{place.label} is in triangle {place.face}, in the reference at "
+        f"({', '.join(f'{c:.3f}' for c in np.asarray(place.at(reference, seen.results.faces)))}) mm"
+        for place in places
+    ]

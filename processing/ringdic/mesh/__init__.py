@@ -1,0 +1,1 @@
+"""Triangle meshes: neighbours, topology, distances along the surface, projection onto it."""

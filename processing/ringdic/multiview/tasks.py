@@ -1,0 +1,164 @@
+"""The surface that all cameras measure together as tasks: its reference shape, then each camera's points in time.
+
+A camera follows its points through blocks of steps; a block sets out from what the one before left, so the blocks of
+a camera come one after the other, and the cameras side by side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.correlation import CorrelationSettings
+from ringdic.geometry.camera import Camera
+from ringdic.multiview.shape import ReferenceShape, ShapeSettings, reference_shape
+from ringdic.multiview.surface import numbers_of, reference_places, shape_settings, tracking_of
+from ringdic.multiview.tracking import Track, Tracking, TrackState, at_reference, track_block
+from ringdic.session.folder import Capture, Session
+from ringdic.session.images import read_mask
+from ringdic.settings import Settings
+from ringdic.sweep.sweep import Search
+from ringdic.tasks import Arrays, Task, code_stamp, digest, read_output, work_folder
+from ringdic.tasks.step_images import Digests, Image, step_image
+
+T = TypeVar("T")
+
+_BLOCK = 4  # steps of a task: what is started anew for each, and what is lost with one, both stay small
+_SHAPE_COST = 8.0  # of a camera, in those of a camera's step
+_STATE, _TRACK = "state_", "track_"
+
+
+@dataclass(frozen=True)
+class RingJob:
+    """The tasks of the whole ring: the shape, and of every camera the blocks of steps in order."""
+
+    cameras: tuple[Camera, ...]
+    shape: Task
+    blocks: tuple[tuple[Task, ...], ...]
+
+    @property
+    def tasks(self) -> list[Task]:
+        """All tasks, block by block."""
+        return [self.shape, *(task for turn in zip(*self.blocks, strict=True) for task in turn)]
+
+    def found(self) -> tuple[ReferenceShape, dict[int, Track]]:
+        """The shape, and the tracks through all steps of the cameras that see some of it, by index.
+
+        Raises the ComputationError that the shape ended with.
+        """
+        shape = ReferenceShape.from_arrays(read_output(self.shape.output))
+        tracks = {}
+        for k, (camera, blocks) in enumerate(zip(self.cameras, self.blocks, strict=True)):
+            vertex, x0 = reference_places(camera, shape, k)
+            if len(vertex):
+                later = [_part(Track, read_output(task.output), _TRACK) for task in blocks]
+                tracks[k] = Track.joined([at_reference(x0, camera.size[::-1]), *later])
+        return shape, tracks
+
+
+def ring_job(
+    session: Session,
+    cameras: Sequence[Camera],
+    pairs: Sequence[tuple[str, str]],
+    steps: Sequence[Capture],
+    search: Search,
+    settings: Settings,
+) -> RingJob:
+    """The tasks over these steps, the reference first, of cameras that all have a reference image."""
+    digests, folder = Digests(session), work_folder(session.path)
+    correlation = CorrelationSettings(**settings.correlation.keywords)
+    numbers, how = numbers_of(cameras, pairs), shape_settings(settings)
+    masks = {camera.id: mask for camera in cameras if (mask := session.mask(camera.id)) is not None}
+    seen = [[digests.image(steps[0], camera.id), digests.mask(camera.id)] for camera in cameras]
+    shape = Task(
+        digest(code_stamp(), "shape", list(cameras), numbers, search, correlation, how, seen),
+        "shape of the reference",
+        shape_task,
+        (tuple(cameras), tuple(numbers), search, correlation, how, dict(steps[0].images), masks),
+        folder,
+        cost=_SHAPE_COST * len(cameras),
+    )
+    options = tracking_of(settings)
+    blocks = []
+    for k, camera in enumerate(cameras):
+        images = [step.images.get(camera.id) for step in steps]
+        row: list[Task] = []
+        for first in range(1, len(steps), _BLOCK):
+            part = range(first, min(first + _BLOCK, len(steps)))
+            needs = (shape.key, *([row[-1].key] if row else []))
+            new = [digests.image(steps[step], camera.id) for step in part]
+            row.append(
+                Task(
+                    digest("track", needs, k, correlation, options, new),
+                    f"camera {camera.id}, {steps[part[0]].id} to {steps[part[-1]].id}",
+                    track_task,
+                    (camera, k, correlation, options, tuple(images[: part[-1] + 1]), part, masks.get(camera.id)),
+                    folder,
+                    needs,
+                    cost=float(len(part)),
+                )
+            )
+        blocks.append(tuple(row))
+    return RingJob(tuple(cameras), shape, tuple(blocks))
+
+
+def shape_task(
+    cameras: tuple[Camera, ...],
+    pairs: tuple[tuple[int, int], ...],
+    search: Search,
+    correlation: CorrelationSettings,
+    how: ShapeSettings,
+    images: Mapping[str, Path],
+    masks: Mapping[str, Path],
+    *,
+    inputs: tuple[Path, ...],
+) -> Arrays:
+    """The reference shape from the cameras' reference images."""
+    del inputs
+    by_id = {camera.id: camera for camera in cameras}
+    drawn = {id_: read_mask(path, by_id[id_].size[::-1]) for id_, path in masks.items()}
+
+    def image(id_: str) -> Image | None:
+        return step_image(images[id_], by_id[id_]) if id_ in images else None
+
+    shape = reference_shape(cameras, image, drawn, pairs, search, correlation, how)
+    return {**shape.arrays(), "points": np.array(shape.made)}
+
+
+def track_task(
+    camera: Camera,
+    k: int,
+    correlation: CorrelationSettings,
+    options: Tracking,
+    images: tuple[Path | None, ...],
+    steps: range,
+    mask: Path | None,
+    *,
+    inputs: tuple[Path, ...],
+) -> Arrays:
+    """The points of camera number k through a block of steps. images : of all steps so far, the reference first."""
+    shape_file, *before = inputs
+    _, x0 = reference_places(camera, ReferenceShape.from_arrays(read_output(shape_file)), k)
+    state = _part(TrackState, read_output(before[0]), _STATE) if before else None
+
+    def image(step: int) -> Image | None:
+        path = images[step]
+        return None if path is None else step_image(path, camera)
+
+    reference = image(0)
+    assert reference is not None  # only such cameras take part
+    drawn = None if mask is None else read_mask(mask, camera.size[::-1])
+    found, state = track_block(reference, image, steps, x0, drawn, correlation, options, state)
+    named = {f"{_TRACK}{name}": values for name, values in found.arrays().items()}
+    named |= {f"{_STATE}{name}": np.asarray(values) for name, values in state.arrays().items()}
+    return {**named, "points": np.array(len(x0) * len(steps))}
+
+
+def _part(kind: type[T], arrays: Mapping[str, NDArray[Any]], prefix: str) -> T:
+    """The dataclass of arrays that lies under a prefix of their names."""
+    return kind(**{name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)})

@@ -1,0 +1,65 @@
+"""Which cameras see a node of the surface, and how steeply."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.geometry.camera import Camera
+from ringdic.multiview.lattice import TURN, Pieces
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_CLEARANCE = 0.7  # mm that a line of sight must keep above the surface it passes
+_LOOK_ALONG = np.array([2.0, 4.0, 6.0, 9.0, 13.0, 18.0, 25.0, 34.0, 46.0, 60.0])  # mm from the node
+
+
+def incidence(pieces: Pieces, cameras: Sequence[Camera]) -> Array:
+    """Cosine of the angle between normal and line of sight. (C, columns, rows), NaN where there is no surface."""
+    xyz, normals = pieces.xyz, pieces.normals
+    return np.stack([camera.incidence_cosine(xyz, normals) for camera in cameras])
+
+
+def seen(
+    pieces: Pieces, cameras: Sequence[Camera], masks: Mapping[str, Mask], incidence_deg: float, margin: float
+) -> tuple[Mask, Array]:
+    """Which cameras see which nodes, (C, columns, rows), and the cosine of incidence likewise.
+
+    A node is seen under less than ``incidence_deg``, ``margin`` px inside the image, inside the camera's mask where
+    one was drawn, and not behind another part of the surface.
+    """
+    cosine = incidence(pieces, cameras)
+    with np.errstate(invalid="ignore"):
+        sight = cosine > math.cos(math.radians(incidence_deg))
+    xyz = pieces.xyz
+    for k, camera in enumerate(cameras):
+        at = np.nonzero(sight[k])
+        if not len(at[0]):
+            continue
+        px = camera.project(xyz[at])
+        width, height = camera.size
+        fits = (px >= margin).all(axis=1) & (px[:, 0] < width - 1 - margin) & (px[:, 1] < height - 1 - margin)
+        mask = masks.get(camera.id)
+        if mask is not None:
+            column, row = np.rint(np.where(fits[:, None], px, 0)).astype(int).T
+            fits &= mask[row, column]
+        fits[fits] = ~_hidden(pieces, camera, xyz[at][fits])
+        sight[k][at] = fits
+    return sight, cosine
+
+
+def _hidden(pieces: Pieces, camera: Camera, xyz: Array) -> Mask:
+    """Points (n, 3) whose line of sight passes below the surface on its way to the camera. (n,)."""
+    towards = camera.centre - xyz
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    hidden = np.zeros(len(xyz), bool)
+    for distance in _LOOK_ALONG:
+        x, y, z = (xyz + distance * towards).T
+        column, row, inside = pieces.lattice.nearest(np.arctan2(y, x) % TURN, z)
+        with np.errstate(invalid="ignore"):
+            hidden |= inside & (np.hypot(x, y) < pieces.radius[column, row] - _CLEARANCE)
+    return hidden

@@ -1,0 +1,65 @@
+"""What a curved surface does to a subset between two cameras: the map of pixels to second order.
+
+A pixel of the reference camera is taken along its line of sight to the surface and from there into the other camera.
+The derivatives are central differences over a subset's reach: what a subset of that size feels.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.geometry.camera import Camera
+from ringdic.multiview.lattice import Lattice, evaluate
+
+Array = NDArray[np.float64]
+
+#: Positions of the differences: centre, ± x, ± y, and the four corners.
+_STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]], dtype=float)
+_NEWTON = 6
+
+
+def surface_stencil(
+    lattice: Lattice, coefficients: Array, theta: Array, z: Array, camera: Camera, px: Array, reach: float
+) -> Array:
+    """Where pixels about px (n, 2) of a camera meet the pieces of the surface. (n, 9, 3) mm.
+
+    coefficients : (n, 10), pieces about the places theta, z (n,). reach : px from the centre to its neighbours.
+    NaN where a line of sight misses the piece.
+    """
+    d = camera.ray(px[:, None, :] + reach * _STENCIL)
+    origin = camera.centre
+    radius = coefficients[:, 0]
+    node = np.stack([radius * np.cos(theta), radius * np.sin(theta), z], axis=-1)
+    t = np.sum((node - origin)[:, None, :] * d, axis=-1)
+    for _ in range(_NEWTON):
+        p = origin + t[..., None] * d
+        rho = np.hypot(p[..., 0], p[..., 1])
+        turn = np.arctan2(p[..., 1], p[..., 0])
+        value, by_a, by_b = evaluate(coefficients[:, None], lattice.arc(turn, theta[:, None]), p[..., 2] - z[:, None])
+        outwards = (p[..., 0] * d[..., 0] + p[..., 1] * d[..., 1]) / rho
+        turning = (p[..., 0] * d[..., 1] - p[..., 1] * d[..., 0]) / rho**2
+        slope = outwards - by_a * lattice.radius * turning - by_b * d[..., 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = np.where(np.abs(slope) > 1e-3, (rho - value) / slope, np.nan)
+        t = t - np.clip(step, -20.0, 20.0)
+    return np.where(np.abs(step)[..., None] < 1e-6, origin + t[..., None] * d, np.nan)
+
+
+def warps_to(camera: Camera, px: Array, stencil: Array, reach: float) -> Array:
+    """Warps (n, 12) from px (n, 2) of the reference camera into another: u v ux uy vx vy uxx uxy uyy vxx vxy vyy.
+
+    stencil : (n, 9, 3) mm of :func:`surface_stencil`, with the same reach.
+    """
+    seen = camera.project(stencil) - (px[:, None, :] + reach * _STENCIL)
+    centre, right, left, below, above, br, bl, ar, al = np.moveaxis(seen, 1, 0)
+    first = np.stack([(right - left) / (2 * reach), (below - above) / (2 * reach)], axis=-1)  # (n, u v, x y)
+    second = np.stack(
+        [
+            (right - 2 * centre + left) / reach**2,
+            (br - bl - ar + al) / (4 * reach**2),
+            (below - 2 * centre + above) / reach**2,
+        ],
+        axis=-1,
+    )
+    return np.concatenate([centre, first.reshape(-1, 4), second.reshape(-1, 6)], axis=1)

@@ -1,0 +1,183 @@
+"""The loops of the overlap's removal that go from triangle to triangle, compiled."""
+
+from __future__ import annotations
+
+import heapq
+import math
+
+import numba as nb
+import numpy as np
+
+from ringdic.mesh.nearest import near
+
+
+@nb.njit(cache=True, nogil=True)
+def peel(start, rival, beside, living, bad):  # type: ignore[no-untyped-def]
+    """Take border triangles with living rivals away, the worst first, until none is left that a border reaches.
+
+    start (M + 1,), rival : the competitors of each triangle in one row. beside : (M, 3), -1 at a border.
+    living : (M,) bool, changed in place. bad : (M,).
+    """
+    left = np.zeros(len(living), np.int64)
+    queue = [(0.0, 0) for _ in range(0)]
+    worst = -1
+    for f in range(len(living)):
+        left[f] = start[f + 1] - start[f]
+        if left[f]:
+            if worst < 0 or bad[f] > bad[worst]:
+                worst = f
+            for g in beside[f]:
+                if g < 0 or not living[g]:
+                    queue.append((-bad[f], f))
+                    break
+    if not queue and worst >= 0:  # closed surfaces: somewhere the first has to go
+        queue.append((-bad[worst], worst))
+    heapq.heapify(queue)
+    while queue:
+        _, f = heapq.heappop(queue)
+        if not living[f] or not left[f]:
+            continue
+        living[f] = False
+        for at in range(start[f], start[f + 1]):
+            left[rival[at]] -= 1
+        for g in beside[f]:
+            if g >= 0 and living[g] and left[g]:
+                heapq.heappush(queue, (-bad[g], g))
+
+
+@nb.njit(cache=True, nogil=True)
+def regrow(start, rival, beside, living, wanted, bad):  # type: ignore[no-untyped-def]
+    """Put wanted triangles (M,) without living rivals back beside living ones; most neighbours first, then the best.
+
+    The other arguments are those of ``peel``.
+    """
+    queue = [(0, 0.0, 0) for _ in range(0)]
+    for f in range(len(living)):
+        count = _count(beside, living, f) if wanted[f] else 0
+        if count:
+            queue.append((-count, bad[f], f))
+    heapq.heapify(queue)
+    while queue:
+        _, _, f = heapq.heappop(queue)
+        free = not living[f]
+        for at in range(start[f], start[f + 1]):
+            if living[rival[at]]:
+                free = False
+                break
+        if not free:
+            continue
+        living[f] = True
+        for g in beside[f]:
+            if g >= 0 and wanted[g] and not living[g]:
+                heapq.heappush(queue, (-_count(beside, living, g), bad[g], g))
+
+
+@nb.njit(cache=True, nogil=True)
+def _count(beside, living, f):  # type: ignore[no-untyped-def]
+    """Living neighbours of a triangle."""
+    count = 0
+    for g in beside[f]:
+        if g >= 0 and living[g]:
+            count += 1
+    return count
+
+
+@nb.njit(cache=True, nogil=True)
+def closer(middles, inside, owner, normals, corners, radius, usual, gap, reach, same_side, first, last):  # type: ignore[no-untyped-def]
+    """Pairs (P, 2) of triangles of different surfaces that lie over one another or within ``gap`` mm beside.
+
+    middles : centroids (M, 3) in cubes. inside : (M,) triangles of usual size that have no other surface near. radius :
+    (M,) mm, from centroid to farthest corner; usual : mm, of most. first, last : of which triangles in the order of the
+    cubes pairs are sought.
+    """
+    M, widest = len(radius), radius.max()
+    found, apart = np.empty(M, np.int64), np.empty(M)
+    pairs, count = np.empty((last - first + 1, 2), np.int64), 0
+    common = math.hypot(2 * usual + gap, reach)
+    for k in range(first, last):
+        a, x = middles.order[k], middles.at[k]
+        large = radius[a] > usual
+        if inside[a] and not large:
+            continue
+        within = math.hypot(radius[a] + widest + gap, reach) if large else common
+        for m in range(near(middles, x[0], x[1], x[2], within, found, apart)):
+            b = middles.order[found[m]]
+            if owner[a] == owner[b]:
+                continue
+            if b < a if (radius[b] > usual) == large else not large:  # every pair once, from the larger triangle
+                continue
+            if not _close(a, b, middles.at[k], middles.at[found[m]], normals, corners, radius, gap, reach, same_side):
+                continue
+            if count == len(pairs):
+                pairs = np.concatenate((pairs, np.empty_like(pairs)))
+            pairs[count, 0], pairs[count, 1] = a, b
+            count += 1
+    return pairs[:count]
+
+
+@nb.njit(cache=True, nogil=True)
+def _close(a, b, at_a, at_b, normals, corners, radius, gap, reach, same_side):  # type: ignore[no-untyped-def]
+    """Whether two triangles lie over one another or within ``gap`` beside. at_a, at_b : (3,) mm, their middles."""
+    cosine = normals[a, 0] * normals[b, 0] + normals[a, 1] * normals[b, 1] + normals[a, 2] * normals[b, 2]
+    if not cosine > same_side:
+        return False
+    nx, ny, nz = normals[a, 0] + normals[b, 0], normals[a, 1] + normals[b, 1], normals[a, 2] + normals[b, 2]
+    length = max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-9)
+    nx, ny, nz = nx / length, ny / length, nz / length
+    dx, dy, dz = at_b[0] - at_a[0], at_b[1] - at_a[1], at_b[2] - at_a[2]
+    height = dx * nx + dy * ny + dz * nz
+    beside = math.sqrt(max(dx * dx + dy * dy + dz * dz - height * height, 0.0))
+    if not (abs(height) < reach and beside < radius[a] + radius[b] + gap):
+        return False
+    return max(_separation(corners[a], corners[b], nx, ny, nz), _separation(corners[b], corners[a], nx, ny, nz)) < gap
+
+
+@nb.njit(cache=True, nogil=True)
+def _separation(one, two, nx, ny, nz):  # type: ignore[no-untyped-def]
+    """Widest gap of triangle two (3, 3) beyond the edges of triangle one, seen along a normal."""
+    widest = -np.inf
+    for k in range(3):
+        m = (k + 1) % 3
+        ex, ey, ez = one[m, 0] - one[k, 0], one[m, 1] - one[k, 1], one[m, 2] - one[k, 2]
+        ax, ay, az = ey * nz - ez * ny, ez * nx - ex * nz, ex * ny - ey * nx  # outwards from the triangle
+        length = max(math.sqrt(ax * ax + ay * ay + az * az), 1e-12)
+        nearest = np.inf
+        for j in range(3):
+            away = (two[j, 0] - one[k, 0]) * ax + (two[j, 1] - one[k, 1]) * ay + (two[j, 2] - one[k, 2]) * az
+            nearest = min(nearest, away / length)
+        widest = max(widest, nearest)
+    return widest
+
+
+@nb.njit(cache=True, nogil=True)
+def rivals(M, competing):  # type: ignore[no-untyped-def]
+    """For each of M triangles, where its competitors begin (M + 1) in a row of all of them. competing : (P, 2)."""
+    start = np.zeros(M + 1, np.int64)
+    for first, second in competing:
+        start[first + 1] += 1
+        start[second + 1] += 1
+    for f in range(1, M + 1):
+        start[f] += start[f - 1]
+    free, row = start[:-1].copy(), np.empty(2 * len(competing), np.int64)
+    for first, second in competing:
+        row[free[first]], row[free[second]] = second, first
+        free[first] += 1
+        free[second] += 1
+    return start, row
+
+
+@nb.njit(cache=True, nogil=True)
+def smoothed(values, known, beside, rounds):  # type: ignore[no-untyped-def]
+    """Values (M,) averaged with those of the neighbours that are known, round by round; 0 where nothing is."""
+    total, weight = np.where(known, values, 0.0), known.astype(np.float64)
+    for _ in range(rounds):
+        old_total, old_weight = total.copy(), weight.copy()
+        for f in range(len(values)):
+            more, heavier = 0.0, 0.0
+            for g in beside[f]:
+                if g >= 0:
+                    more += old_total[g]
+                    heavier += old_weight[g]
+            total[f] += more
+            weight[f] += heavier
+    return np.where(weight > 0, total / np.maximum(weight, 1e-300), 0.0)

@@ -1,0 +1,99 @@
+"""A field's colours: limits, values to colours, and the bar that tells them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from ringdic.errors import InputError
+from ringdic.results.colours import colours
+from ringdic.results.evaluation import Evaluated
+from ringdic.results.fields import Field
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Colours of a field between two limits; diverging where the field has a middle."""
+
+    field: Field
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite([self.low, self.high]).all() and self.high > self.low):
+            raise InputError(
+                f"the limits of the colours are two numbers, the first one smaller, not {self.low:g} and {self.high:g}"
+            )
+
+    @property
+    def diverging(self) -> bool:
+        """Whether the colours have a middle."""
+        return self.field.centre is not None
+
+    @property
+    def title(self) -> str:
+        """The field's label with its unit."""
+        return f"{self.field.label}, {self.field.unit}" if self.field.unit else self.field.label
+
+    def colours(self, values: Array) -> Array:
+        """sRGB (..., 3) from 0 to 1."""
+        return colours(values, self.low, self.high, self.diverging)
+
+    def mappable(self) -> ScalarMappable:
+        """The same colours for a plot's colour bar."""
+        listed = ListedColormap(colours(np.linspace(0.0, 1.0, 256), 0.0, 1.0, self.diverging).tolist())
+        return ScalarMappable(Normalize(self.low, self.high), listed)
+
+    def bar(self, height: int) -> Picture:
+        """The colour bar with its title as a picture of its own, (height, ·, 3), black on white."""
+        dpi = max(70.0, height / 7.0)
+        picture = Figure(figsize=(1.15, height / dpi), dpi=dpi, layout="constrained")
+        axes = picture.subplots()
+        bar = picture.colorbar(self.mappable(), cax=axes)
+        bar.ax.tick_params(labelsize=8)
+        bar.set_label(self.title, fontsize=8)
+        canvas = FigureCanvasAgg(picture)
+        canvas.draw()
+        drawn = np.asarray(canvas.buffer_rgba())[..., :3]
+        whole = np.full((height, drawn.shape[1], 3), 255, dtype=np.uint8)
+        whole[: min(height, len(drawn))] = drawn[:height]
+        return whole
+
+
+def scale_of(seen: Evaluated, name: str, limits: tuple[float, float] | None = None) -> Scale:
+    """The scale of a field, by default between limits that serve all steps. InputError for a field there is not."""
+    low, high = seen.limits(name) if limits is None else limits
+    return Scale(seen.field(name), float(low), float(high))
+
+
+def on_faces(seen: Evaluated, entry: Field, values: Array, step: int) -> Array:
+    """Values of a field at a step on the triangles (M,): of points, the mean of the corners; NaN where not measured."""
+    faces = seen.results.faces
+    if entry.location == "point":
+        values = values[faces].mean(axis=1)
+    lost = ~np.isfinite(seen.results.vertices[step]).all(axis=1)
+    return np.asarray(np.where(lost[faces].any(axis=1), np.nan, values))
+
+
+def palette(scale: Scale) -> Picture:
+    """256 colours (256, 3) that a drawing in this scale is made of: the scale's own and greys for lines and letters."""
+    steps = scale.colours(np.linspace(scale.low, scale.high, 224))
+    greys = np.repeat(np.linspace(0.0, 1.0, 32)[:, None], 3, axis=1)
+    return np.rint(255.0 * np.concatenate([steps, greys])).astype(np.uint8)
+
+
+def looked_up(faces: NDArray[np.int32], values: Array, scale: Scale) -> Array:
+    """The picture (h, w, 4) RGBA from 0 to 1 of an image of face numbers; clear where nothing was measured."""
+    of_face = np.zeros((len(values) + 1, 4))
+    of_face[:-1, :3] = scale.colours(values)
+    of_face[:-1, 3] = np.isfinite(values)
+    return np.asarray(of_face[faces])

@@ -1,0 +1,70 @@
+"""What a report needs of the fields, gathered in one pass: a step is costly to evaluate and is evaluated once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.measure.region import statistics
+from ringdic.pictures.scale import Scale, on_faces
+from ringdic.results.evaluation import Evaluated
+from ringdic.results.fields import Field
+from ringdic.results.ranges import Ranges, even_limits
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """Fields of a run over its steps.
+
+    scales : by name, with limits that serve all steps. faces : by name and step, the values on the triangles (M,), of
+    the steps that get maps. values : by name and step, where the field lies. statistics : by name and step.
+    """
+
+    steps: tuple[str, ...]
+    shown: tuple[int, ...]
+    scales: dict[str, Scale]
+    faces: dict[tuple[str, int], NDArray[np.float32]]
+    values: dict[tuple[str, int], NDArray[np.float32]]
+    statistics: dict[tuple[str, int], dict[str, Any]]
+
+
+def gather(
+    seen: Evaluated, names: Sequence[str], shown: Sequence[int], progress: Callable[[float], None] = lambda _: None
+) -> Gathered:
+    """Gather the fields of these names that the run has; keep the values of the steps shown."""
+    fields = [entry for name in names for entry in seen.fields if entry.name == name]
+    ranges = Ranges(fields)
+    weights = _weights(seen)
+    faces: dict[tuple[str, int], NDArray[np.float32]] = {}
+    values: dict[tuple[str, int], NDArray[np.float32]] = {}
+    found: dict[tuple[str, int], dict[str, Any]] = {}
+    for step in range(len(seen.steps)):
+        arrays = seen.step(step)
+        ranges.add(arrays)
+        for entry in fields:
+            scalar = arrays.scalar(entry)
+            found[entry.name, step] = statistics(scalar, weights[entry.location])
+            if step in shown:
+                values[entry.name, step] = scalar[np.isfinite(scalar)].astype(np.float32)
+                faces[entry.name, step] = on_faces(seen, entry, scalar, step).astype(np.float32)
+        progress((step + 1) / len(seen.steps))
+    scales = {entry.name: _scale(entry, row) for entry, row in zip(fields, ranges.table(), strict=True)}
+    return Gathered(seen.steps, tuple(shown), scales, faces, values, found)
+
+
+def _scale(entry: Field, row: dict[str, Any]) -> Scale:
+    return Scale(entry, *even_limits(row["range"], entry.centre))
+
+
+def _weights(seen: Evaluated) -> dict[str, Array]:
+    """Area in the reference of each triangle, and of each point a third of its triangles'."""
+    mesh = seen.results.mesh
+    areas = mesh.areas
+    shares = np.bincount(mesh.faces.ravel(), np.repeat(areas / 3.0, 3), len(mesh.vertices))
+    return {"face": areas, "point": np.asarray(shares, dtype=float)}

@@ -1,0 +1,201 @@
+"""The report of a run, from its first line to its last."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from uuid import uuid4
+
+import numpy as np
+
+from ringdic.errors import InputError
+from ringdic.mesh.mesh import Mesh
+from ringdic.pictures.scale import Scale, palette
+from ringdic.pictures.views import View, from_side, mean_azimuth, unrolled
+from ringdic.report import plots, tables
+from ringdic.report.document import Document, figure
+from ringdic.report.gathered import Gathered, gather
+from ringdic.report.hardware import camera_facts
+from ringdic.report.noise import STATED, noise, noise_rows
+from ringdic.results.evaluation import Evaluated, evaluated
+from ringdic.results.results import Results
+from ringdic.session.folder import Session, newest_results, read_session
+
+#: Fields that get maps, where the run has them.
+_MAPS = (
+    "displacement", "displacement_x", "displacement_y", "displacement_z", "lambda1", "lambda2", "J", "E1", "E2",
+    "E_equivalent", "window_lambda1", "window_lambda2",
+)  # fmt: skip
+_CERTAINTY = (
+    "sigma", "sigma_displacement", "sigma_lambda1", "sigma_lambda2", "sigma_calibration", "chi2", "correlation",
+)  # fmt: skip
+_COURSES = ("displacement", "J", "lambda1", "lambda2", "E_equivalent", "correlation")
+_STEPS_SHOWN = 4
+_WORTHWHILE = 0.2  # share of a view that must show the surface's outer side
+
+
+def write_report(
+    session_path: Path,
+    out: Path | None = None,
+    run: int | None = None,
+    progress: Callable[[float], None] = lambda _: None,
+) -> Path:
+    """Write the report of a run and return where it lies.
+
+    session_path : the session's folder. out : the HTML file, by default ``report.html`` beside the results. run : its
+    number, the newest unless given. progress : is told the share done.
+    Raises InputError where there is no run, or nothing can be written to ``out``.
+    """
+    results_path = newest_results(session_path, run)
+    out = results_path.parent / "report.html" if out is None else Path(out)
+    if out.is_dir() or not out.parent.is_dir():
+        raise InputError(f"{out}: not a file in a folder that is there; give the name of an HTML file")
+    session, seen = read_session(session_path), evaluated(results_path)
+    results = seen.results
+    document = Document(
+        f"{session.name}: report of run {results_path.parent.name}",
+        f"Rig {results.rig}, {len(results.cameras)} cameras, {len(results.steps) - 1} steps after the reference; "
+        f"measured by RingDIC {_version()}",
+    )
+    _summary(document, results)
+    gathered = gather(
+        seen,
+        list(dict.fromkeys((*_MAPS, *_CERTAINTY, *STATED))),
+        shown_steps(len(seen.steps)),
+        lambda s: progress(0.3 * s),
+    )
+    _describe(document, session, results, gathered)
+    progress(0.5)
+    _pictures(document, seen, gathered, lambda share: progress(0.5 + 0.45 * share))
+    document.section("settings", "Settings of the run")
+    document.verbatim("settings-toml", results.settings)
+    aside = out.with_name(f".{out.name}.{uuid4().hex}.partial")
+    try:
+        aside.write_text(document.to_html(), encoding="utf-8")
+        aside.replace(out)
+    finally:
+        aside.unlink(missing_ok=True)
+    progress(1.0)
+    return out
+
+
+def _summary(document: Document, results: Results) -> None:
+    document.section("summary", "At a glance")
+    rows = [list(row.values()) for row in results.summary.get("table", []) if row.get("figure") != "warning"]
+    document.facts("figures", {str(row[0]): row[1] for row in rows if len(row) > 1})
+    warnings = results.summary.get("warnings", [])
+    document.heading("Warnings")
+    if warnings:
+        document.sentences(warnings, warnings=True)
+    else:
+        document.text("None.")
+
+
+def _describe(document: Document, session: Session, results: Results, gathered: Gathered) -> None:
+    document.section("hardware", "Hardware")
+    tables.hardware(document, session, results, camera_facts(session, results))
+    document.section("analysis", "Analysis")
+    tables.analysis(document, results, _version(), noise_rows(results, gathered))
+    document.section("calibration", "Calibration")
+    tables.calibration(document, session, results)
+    document.section("noise", "Noise and uncertainty")
+    noise(document, results, gathered)
+    document.section("measured", "Steps")
+    tables.steps(document, session, results)
+
+
+def _pictures(document: Document, seen: Evaluated, gathered: Gathered, progress: Callable[[float], None]) -> None:
+    document.section("courses", "Courses and statistics")
+    document.picture(
+        "courses-plot",
+        plots.courses(gathered, [name for name in _COURSES if name in gathered.scales]),
+        "Medians over the surface, and the band from the 5th to the 95th percentile.",
+    )
+    _statistics(document, gathered)
+    document.picture(
+        "histograms-plot",
+        plots.histograms(gathered, [name for name in (*_MAPS, *_CERTAINTY) if name in gathered.scales]),
+        "Shares of points or triangles; what lies beyond a scale's limits is counted at its ends.",
+    )
+    views = _views(seen, gathered.shown)
+    progress(0.2)
+    done = 0
+    for key, title, chosen in (("maps", "Maps", _MAPS), ("certainty", "Maps of uncertainty and quality", _CERTAINTY)):
+        document.section(key, title)
+        if key == "maps":
+            document.text(_how_to_read(seen, gathered.shown))
+        for name in chosen:
+            if name in gathered.scales:
+                scale = gathered.scales[name]
+                document.picture(
+                    f"map-{name}", plots.maps(gathered, scale, views), _caption(scale), palette(scale), dpi=100
+                )
+                done += 1
+                progress(0.2 + 0.8 * done / len(gathered.scales))
+
+
+def _statistics(document: Document, gathered: Gathered) -> None:
+    names = ("mean", "std", "median", "p5", "p95", "min", "max")
+
+    def digits(field: str) -> int:
+        return 6 if gathered.scales[field].field.centre == 1.0 else 4  # stretches differ in the last ones
+
+    document.heading("Statistics over the whole surface")
+    document.table(
+        "statistics",
+        ("field", "step", "mean", "STD", "median", "5 %", "95 %", "least", "greatest"),
+        (
+            (gathered.scales[field].title, gathered.steps[step], *(figure(row[name], digits(field)) for name in names))
+            for (field, step), row in sorted(
+                gathered.statistics.items(), key=lambda item: (list(gathered.scales).index(item[0][0]), item[0][1])
+            )
+            if step > 0 or len(gathered.steps) == 1
+        ),
+        "Mean and standard deviation are weighted by the area in the reference.",
+    )
+
+
+def shown_steps(count: int) -> list[int]:
+    """Steps that get maps: all after the reference if they are few, else some spread evenly, the last among them."""
+    if count == 1:
+        return [0]
+    return sorted({int(k) for k in np.rint(np.linspace(1, count - 1, min(_STEPS_SHOWN, count - 1)))})
+
+
+def _views(seen: Evaluated, steps: Sequence[int]) -> list[plots.StepViews]:
+    """The views of the steps shown; the map lies over the reference, so that a place stays where it is."""
+    reference = unrolled(seen.results.mesh)
+    front = mean_azimuth(seen.results.mesh)
+    made = []
+    for step in steps:
+        mesh = Mesh(seen.positions(step), seen.results.faces)
+        sides: list[tuple[str, View]] = []
+        for azimuth in (front, front + np.pi) if mesh.whole_faces().any() else ():
+            view = from_side(mesh, azimuth)
+            if not sides or view.outside_share > _WORTHWHILE:
+                sides.append((f"from {np.degrees(azimuth) % 360:.0f}°", view))
+        made.append(plots.StepViews(step, seen.steps[step], reference, sides))
+    fewest = min(len(step.sides) for step in made)
+    return [plots.StepViews(each.step, each.name, each.unrolled, each.sides[:fewest]) for each in made]
+
+
+def _how_to_read(seen: Evaluated, steps: Sequence[int]) -> str:
+    which = "all steps" if len(steps) >= len(seen.steps) - 1 else f"{len(steps)} of the {len(seen.steps) - 1} steps"
+    return (
+        f"Shown are {which}: left the surface unrolled over azimuth and height of the reference, so that a place of "
+        "the material stays where it is; right the body as it stood, from 15° above. Blank: not measured. Light grey: "
+        "the inner side. One scale serves all steps of a field; it spans the 2nd to the 98th percentile."
+    )
+
+
+def _caption(scale: Scale) -> str:
+    about = f", about {scale.field.centre:g}" if scale.field.centre is not None else ""
+    return f"{scale.title}. Colours from {figure(scale.low)} to {figure(scale.high)}{about}."
+
+
+def _version() -> str:
+    try:
+        return version("ringdic")
+    except PackageNotFoundError:
+        return "(not installed)"

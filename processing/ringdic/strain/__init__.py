@@ -1,0 +1,1 @@
+"""From positions of a mesh to deformation: stretches, strains, and the rigid part of a motion."""

@@ -1,0 +1,156 @@
+"""The region of interest of a camera pair, found from the images.
+
+A coarse lattice of positions in the reference image is matched into the second camera by a sweep of proxies. Where
+the match is convincing, alone of its kind and at a depth like its neighbours', the specimen is there and textured.
+What neither camera can see well, by the angle between surface and line of sight, is left out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.geometry.camera import Camera
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Positions on a regular lattice over an image. ``xy`` (rows, columns, 2) px, ``spacing`` px."""
+
+    xy: Array
+    spacing: int
+
+
+def lattice(size: tuple[int, int], spacing: int, margin: int) -> Lattice:
+    """All multiples of ``spacing`` that keep ``margin`` px from the image's edge; size is (width, height)."""
+    first = -(-margin // spacing) * spacing
+    x = np.arange(first, size[0] - margin, spacing, dtype=float)
+    y = np.arange(first, size[1] - margin, spacing, dtype=float)
+    return Lattice(np.stack(np.meshgrid(x, y), axis=-1), spacing)
+
+
+def coherent(radius: Array, convincing: Mask, tolerance: float, least: int = 0) -> Mask:
+    """Lattice positions whose radius (rows, columns) mm agrees with the convincing ones around it.
+
+    At least three of the 8 neighbours must be convincing, and the radius must lie within ``tolerance`` mm of their
+    median; then the largest connected piece is kept, or, where ``least`` is given, every piece of so many positions.
+    """
+    padded = np.pad(np.where(convincing, radius, np.nan), 1, constant_values=np.nan)
+    rows, columns = radius.shape
+    around = np.stack(
+        [
+            padded[1 + j : 1 + j + rows, 1 + i : 1 + i + columns]
+            for j in (-1, 0, 1)
+            for i in (-1, 0, 1)
+            if (i, j) != (0, 0)
+        ]
+    )
+    count = np.isfinite(around).sum(axis=0)
+    ordered = np.sort(around, axis=0)  # NaN last
+    middle = np.take_along_axis(ordered, (np.maximum(count, 1)[None] - 1) // 2, axis=0)[0]
+    good = convincing & (count >= 3) & (np.abs(radius - middle) < tolerance)
+    labels_count, labels, stats, _ = cv2.connectedComponentsWithStats(good.astype(np.uint8), connectivity=8)
+    if labels_count < 2:
+        return np.zeros_like(good)
+    area = stats[1:, cv2.CC_STAT_AREA]
+    kept = area >= least if least else np.arange(len(area)) == np.argmax(area)
+    return np.asarray(np.append(False, kept)[labels])
+
+
+def contrast(image: NDArray[np.generic], xy: Array, half_width: int) -> Array:
+    """Root mean square of the grey level's gradient in a square about each position (..., 2) of an image. (...).
+
+    By Sobel's differences, of what of the square lies inside the image.
+    """
+    at = np.ascontiguousarray(xy.reshape(-1, 2), dtype=np.float64)
+    out = np.empty(len(at))
+    _contrast(np.ascontiguousarray(image), at, half_width, out)
+    return out.reshape(xy.shape[:-1])
+
+
+@nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+def _contrast(image, xy, half_width, out):  # type: ignore[no-untyped-def]
+    """Fills out (n,) with the contrast about positions xy (n, 2)."""
+    (height, width), one = image.shape, np.uint64(1)
+    kind: Any = np.float32
+    for k in range(len(xy)):
+        column, row = int(xy[k, 0]), int(xy[k, 1])
+        left, right = max(column - half_width, 1), min(column + half_width + 1, width - 1)
+        total, count = 0.0, 0
+        for i in range(max(row - half_width, 1), min(row + half_width + 1, height - 1)):
+            of_row = kind(0.0)
+            for j in range(np.uint64(left), np.uint64(right)):
+                before, after = j - one, j + one
+                a, b, c = kind(image[i - 1, before]), kind(image[i - 1, j]), kind(image[i - 1, after])
+                d, e = kind(image[i, before]), kind(image[i, after])
+                f, g, h = kind(image[i + 1, before]), kind(image[i + 1, j]), kind(image[i + 1, after])
+                along_x, along_y = c - a + e - d + e - d + h - f, f - a + g - b + g - b + h - c
+                of_row += along_x * along_x + along_y * along_y
+            total += of_row
+            count += max(right - left, 0)
+        out[k] = math.sqrt(total / count) / 8.0 if count else 0.0
+
+
+def lattice_normals(xyz: Array) -> Array:
+    """Outward unit normals (rows, columns, 3) of a lattice of points (rows, columns, 3), NaN where unknown.
+
+    Differences reach over two neighbours where they exist; outward is away from the z axis.
+    """
+    along_x = _difference(xyz, axis=1)
+    along_y = _difference(xyz, axis=0)
+    normals = np.cross(along_x, along_y)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        inwards = normals[..., 0] * xyz[..., 0] + normals[..., 1] * xyz[..., 1] < 0
+    normals[inwards] *= -1
+    return normals
+
+
+def well_seen(xyz: Array, cameras: tuple[Camera, Camera], limit_deg: float) -> Mask:
+    """Lattice positions that both cameras see under less than ``limit_deg``. (rows, columns)."""
+    normals = lattice_normals(xyz)
+    limit = np.cos(np.radians(limit_deg))
+    with np.errstate(invalid="ignore"):
+        return np.logical_and.reduce([camera.incidence_cosine(xyz, normals) > limit for camera in cameras])
+
+
+def paint(points: Lattice, good: Mask, size: tuple[int, int]) -> Mask:
+    """The lattice's good positions as a filled region of the image. (height, width)."""
+    width, height = size
+    region = np.zeros((height, width), bool)
+    at = points.xy[good].astype(int)
+    if not len(at):
+        return region
+    half, reach = points.spacing // 2 + 1, 2 * points.spacing
+    left, top = np.maximum(at.min(axis=0) - half - reach - 1, 0)
+    box = region[top : at[:, 1].max() + half + reach + 2, left : at[:, 0].max() + half + reach + 2]
+    mask = np.zeros(box.shape, np.uint8)
+    for x, y in at - (left, top):
+        mask[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1] = 1
+    closing = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * reach + 1, 2 * reach + 1))
+    box[:] = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, closing)
+    return region
+
+
+def _difference(xyz: Array, axis: int) -> Array:
+    """Central difference along a lattice axis, one-sided where a neighbour is missing."""
+    forward = np.full_like(xyz, np.nan)
+    backward = np.full_like(xyz, np.nan)
+    lower = [slice(None)] * 3
+    upper = [slice(None)] * 3
+    lower[axis], upper[axis] = slice(None, -1), slice(1, None)
+    step = xyz[tuple(upper)] - xyz[tuple(lower)]
+    forward[tuple(lower)] = step
+    backward[tuple(upper)] = step
+    both = (forward + backward) / 2
+    one = np.where(np.isfinite(forward), forward, backward)
+    return np.where(np.isfinite(both), both, one)

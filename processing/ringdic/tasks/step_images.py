@@ -1,0 +1,54 @@
+"""The images of a session's steps as the tasks read them, kept in memory between tasks, and what tells them apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.errors import InputError
+from ringdic.geometry.camera import Camera
+from ringdic.session.folder import Capture, Session
+from ringdic.tasks import file_digest, kept
+
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+def step_image(path: Path, camera: Camera) -> Image:
+    """The grey image of a file. InputError where it has not the size that the camera was calibrated at."""
+    grey: Image = kept.image(path)
+    width, height = camera.size
+    if grey.shape != (height, width):
+        raise InputError(
+            f"{path}: {grey.shape[1]} x {grey.shape[0]} px, but camera {camera.id} was calibrated at "
+            f"{width} x {height} px; capture board, target and specimen at one size"
+        )
+    return grey
+
+
+@dataclass(frozen=True)
+class Digests:
+    """Digests of a session's images and masks, each taken once."""
+
+    session: Session
+    known: dict[Path, str] = field(default_factory=dict)
+
+    def image(self, capture: Capture, id_: str) -> str | None:
+        """Of a camera's image in a capture; None where it has none."""
+        path = capture.images.get(id_)
+        if path is None:
+            return None
+        if path not in self.known:
+            self.known[path] = file_digest(path, capture.record.get("cameras", {}).get(id_))
+        return self.known[path]
+
+    def mask(self, id_: str) -> str | None:
+        """Of the region drawn for a camera; None where there is none."""
+        path = self.session.mask(id_)
+        if path is None:
+            return None
+        if path not in self.known:
+            self.known[path] = file_digest(path)
+        return self.known[path]

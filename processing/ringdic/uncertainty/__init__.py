@@ -1,0 +1,5 @@
+"""How sure the numbers are: from the noise of the images to matches, points, displacements and strains."""
+
+from ringdic.uncertainty.position import position_sigma
+
+__all__ = ["position_sigma"]

@@ -1,5 +1,0 @@
-"""How sure the numbers are: from the noise of the images to matches, points, displacements and strains."""
-
-from processing.uncertainty.position import position_sigma
-
-__all__ = ["position_sigma"]

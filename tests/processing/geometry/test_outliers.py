@@ -1,0 +1,49 @@
+"""Wrong points are found among noisy good ones; good ones stay."""
+
+import numpy as np
+from ringdic.geometry.outliers import crossing_outliers, midpoint_residuals, neighbours, surface_outliers
+
+STEP = 10
+
+
+def cylinder_grid() -> tuple[np.ndarray, np.ndarray]:
+    x, y = np.meshgrid(np.arange(100, 500, STEP), np.arange(100, 800, STEP), indexing="ij")
+    xy = np.stack([x.ravel(), y.ravel()], axis=1).astype(float)
+    theta = (xy[:, 0] - 300) / 570
+    return xy, np.stack([57 * np.cos(theta), 57 * np.sin(theta), xy[:, 1] / 10], axis=1)
+
+
+def test_midpoints_are_exact_for_a_linear_field() -> None:
+    xy, _ = cylinder_grid()
+    values = xy @ np.array([[0.1, 0.2, -0.3], [0.02, 0.5, 1.0]]) + 7
+    residual = midpoint_residuals(xy, values, STEP)
+    np.testing.assert_allclose(residual[np.isfinite(residual)], 0, atol=1e-10)
+    assert np.isnan(residual).sum() == 4  # the corners of the grid have no opposite neighbours
+
+
+def test_planted_outliers_are_found_and_no_good_point_is_lost() -> None:
+    rng = np.random.default_rng(3)
+    xy, xyz = cylinder_grid()
+    xyz += rng.normal(0, 0.005, xyz.shape)
+    apart = np.flatnonzero((xy % (4 * STEP) == 20).all(axis=1))
+    planted = rng.choice(apart, 20, replace=False)
+    xyz[planted] += rng.choice([-1.0, 1.0], (20, 3)) * rng.uniform(0.5, 2.0, (20, 3))
+    found = np.flatnonzero(surface_outliers(neighbours(xy, STEP), xyz))
+    np.testing.assert_array_equal(found, np.sort(planted))
+
+
+def test_a_jump_of_one_camera_as_a_whole_is_no_outlier() -> None:
+    rng = np.random.default_rng(4)
+    residuals = rng.normal(0, 0.01, (2, 500, 2))
+    residuals[0] += [0.0, 0.35]
+    residuals[1] -= [0.0, 0.35]
+    residuals[:, 17] += [[0, 2.0], [0, -2.0]]
+    found = crossing_outliers(residuals)
+    assert found[17]
+    assert found.sum() == 1
+
+
+def test_lost_points_are_no_outliers() -> None:
+    xy, xyz = cylinder_grid()
+    xyz[50] = np.nan
+    assert not surface_outliers(neighbours(xy, STEP), xyz)[50]

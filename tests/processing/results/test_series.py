@@ -1,0 +1,122 @@
+"""Steps taken out of results and put together again, and values laid aside."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Thread
+
+import numpy as np
+import pytest
+from ringdic.pairs.reconstruction import PairShape, PairStep
+from ringdic.pairs.surfaces import follow
+from ringdic.results.results import WHERE_KNOWN, Matches, Results
+from ringdic.results.series import InMemory, Shelf, joined, part
+from ringdic.results.uncertainty import Stated, with_uncertainty
+
+F, N = 4, 6
+
+
+def some_results() -> Results:
+    """A strip of triangles whose every number tells its place, and a step in which a point is lost."""
+    rng = np.random.default_rng(3)
+    reference = np.column_stack([np.arange(N) // 2, np.arange(N) % 2, np.zeros(N)]).astype(float)
+    vertices = reference + rng.normal(0.0, 0.01, (F, N, 3)) * np.arange(F)[:, None, None]
+    vertices[2, 3] = np.nan
+    faces = np.array([[0, 2, 1], [2, 3, 1], [2, 4, 3], [4, 5, 3]])
+    matches = Matches(("1",), rng.uniform(size=(N, 2)), rng.uniform(size=(F, 1, N, 2)), rng.uniform(size=(F, N)),
+                      rng.uniform(size=(F, 1, N, 2)), np.zeros((F, N), np.int8), np.arange(N))  # fmt: skip
+    ends = {"point": (N,), "vector": (N, 3), "face": (len(faces), 2)}
+    known = {name: rng.uniform(size=(F, *ends[kind])) for name, kind in WHERE_KNOWN.items() if name != "chi2"}
+    return Results(
+        rig="strip", steps=tuple("abcd"), cameras=(), pairs=(), vertices_ref=reference, vertices=vertices, faces=faces,
+        pair=np.zeros(len(faces), np.int64), vertex_pair=np.zeros(N, np.int64), correlation=rng.uniform(size=(F, N)),
+        sigma_xyz=rng.uniform(size=(F, N, 3)), status=rng.integers(0, 9, (F, N)).astype(np.int8), matches=(matches,),
+        **known,
+    )  # fmt: skip
+
+
+def same(first: Results, second: Results) -> None:
+    assert first.steps == second.steps
+    for name in ("vertices", "correlation", "sigma_xyz", "status", *WHERE_KNOWN):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
+    for name in ("xy", "px", "c_ls", "sigma", "status", "vertex"):
+        np.testing.assert_array_equal(getattr(first.matches[0], name), getattr(second.matches[0], name), err_msg=name)
+
+
+def test_a_part_of_the_steps_keeps_everything_that_belongs_to_them() -> None:
+    whole = some_results()
+    kept = part(whole, [0, 2])
+    assert kept.steps == ("a", "c")
+    for name in ("vertices", "correlation", "sigma_xyz", "status", "sigma_displacement", "sigma_lambda"):
+        np.testing.assert_array_equal(getattr(kept, name), getattr(whole, name)[[0, 2]])
+    np.testing.assert_array_equal(kept.matches[0].px, whole.matches[0].px[[0, 2]])
+    assert kept.chi2 is None
+    with pytest.raises(ValueError, match="step 0"):
+        part(whole, [1, 2])
+
+
+def test_the_steps_of_results_one_by_one_are_the_results() -> None:
+    whole = some_results()
+    series = InMemory(whole)
+    same(joined([series.at(k) for k in range(F)]), whole)
+    same(part(joined([series.at(0), series.at(3)]), [0, 1]), part(whole, [0, 3]))
+    assert series.without_matches().at(1).matches == ()
+
+
+def test_what_is_known_of_the_uncertainty_is_left_as_it_is() -> None:
+    whole = some_results()
+    same(with_uncertainty(whole, None), whole)
+    stated = Stated(InMemory(whole).reference, None, InMemory(whole).noise)
+    same(stated.of(InMemory(whole).at(2), 2), part(whole, [0, 2]))
+
+
+def test_values_laid_aside_come_back_whichever_thread_asks(tmp_path: Path) -> None:
+    shelf, back = Shelf(tmp_path / "new"), {}
+
+    def use(key: int) -> None:
+        for step in range(20):
+            shelf.put((key, step), np.full(5000, 100 * key + step))
+        for step in reversed(range(20)):
+            back[key, step] = shelf.get((key, step))
+
+    threads = [Thread(target=use, args=(key,)) for key in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for (key, step), values in back.items():
+        np.testing.assert_array_equal(values, np.full(5000, 100 * key + step))
+    with pytest.raises(KeyError):
+        shelf.get("nothing")
+
+
+@dataclass(frozen=True)
+class Step(PairStep):
+    """A step that is its own matches."""
+
+    px: np.ndarray = field(default_factory=lambda: np.zeros((2, 4, 2)))
+
+
+class FixedShape(PairShape):
+    """A pair that is matched where it is."""
+
+    @property
+    def ids(self) -> tuple[str, str]:
+        return "1", "2"
+
+    def step(self, found: Step) -> Step:
+        return found
+
+
+def test_a_point_is_as_good_as_its_worst_step_and_a_step_that_failed_says_nothing(tmp_path: Path) -> None:
+    c_ls = np.array([[0.1, 0.2, 0.3, 0.4], [0.3, 0.1, np.nan, 0.1], [np.nan, np.nan, 0.9, np.nan]], np.float32)
+    lost = np.where(np.isnan(c_ls), 5, 0).astype(np.int8)
+    sigma = np.full((2, 4, 2), 0.01, np.float32)
+    steps = [Step(np.zeros((4, 3)), own, sigma, status, 0.5) for own, status in zip(c_ls, lost, strict=True)]
+    shape = FixedShape(
+        (None, None), np.zeros((4, 2)), np.arange(4), np.zeros((0, 3), int), steps[0], None, None, None, 1.0
+    )
+    pair = follow(shape, steps.__getitem__, 3, Shelf(tmp_path))
+    np.testing.assert_array_equal(pair.correlation, np.float32([0.3, 0.2, np.nan, 0.4]))
+    np.testing.assert_array_equal(pair.at(1)[0].correlation, c_ls[1])
+    np.testing.assert_allclose(pair.noise, 0.01, rtol=1e-6)
+    np.testing.assert_array_equal(pair.drift, 0.5)
