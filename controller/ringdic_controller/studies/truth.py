@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from ringdic.arrays import Floats, Mask
 from ringdic.results.results import Results
 from ringdic_node.virtual_rig.lens import VirtualCamera
 from ringdic_node.virtual_rig.scenes import Cylinder, Limb, Specimen
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Surface = Cylinder | Limb
 
 TURN = 2 * np.pi
@@ -30,11 +29,11 @@ class Errors:
     stretches : (F, M, 2) of λ1, λ2, NaN where lost.
     """
 
-    theta: Array
-    z: Array
-    distance: Array
-    displacement: Array
-    stretches: Array
+    theta: Floats
+    z: Floats
+    distance: Floats
+    displacement: Floats
+    stretches: Floats
 
 
 def errors(results: Results, surface: Surface, steps: Sequence[int] | None = None) -> Errors:
@@ -56,7 +55,7 @@ def errors(results: Results, surface: Surface, steps: Sequence[int] | None = Non
     return Errors(theta, z, distance, displacement, stretches)
 
 
-def face_middles(theta: Array, z: Array, faces: NDArray[np.integer]) -> tuple[Array, Array]:
+def face_middles(theta: Floats, z: Floats, faces: NDArray[np.integer]) -> tuple[Floats, Floats]:
     """Material coordinates of the middles of triangles (M, 3), (M,) rad and (M,) mm; a triangle may span the seam."""
     corners = theta[faces]
     corners = corners[:, :1] + np.mod(corners - corners[:, :1] + np.pi, TURN) - np.pi
@@ -71,9 +70,9 @@ class SurfaceGrid:
     """
 
     specimen: Specimen
-    theta: Array
-    z: Array
-    area: Array
+    theta: Floats
+    z: Floats
+    area: Floats
 
     @classmethod
     def of(cls, specimen: Specimen) -> SurfaceGrid:
@@ -111,7 +110,7 @@ class SurfaceGrid:
         clean &= ~damage.worn(self.theta, self.z).ravel()
         return seen.reshape(-1, *self.theta.shape), clean.reshape(-1, *self.theta.shape)
 
-    def covered(self, theta: Array, z: Array, faces: NDArray[np.integer]) -> Mask:
+    def covered(self, theta: Floats, z: Floats, faces: NDArray[np.integer]) -> Mask:
         """Which cells lie under triangles (M, 3) between vertices at material coordinates (N,)."""
         picture = np.zeros(self.theta.shape, np.uint8)
         rows, columns = len(self.z), len(self.z[0])

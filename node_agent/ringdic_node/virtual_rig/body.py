@@ -9,10 +9,6 @@ from __future__ import annotations
 import math
 
 import numba as nb
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 CYLINDER, LIMB = 0.0, 1.0
 MIDDLE = 125.0  # mm, half the height of the body

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ringdic_node.virtual_rig.arrays import Floats
 
 
 @nb.njit(cache=True, nogil=True)
@@ -62,10 +61,10 @@ class VirtualCamera:
 
     id: str
     azimuth_deg: float
-    K: Array
-    distortion: Array
-    R: Array
-    t: Array
+    K: Floats
+    distortion: Floats
+    R: Floats
+    t: Floats
     width: int
     height: int
 
@@ -76,21 +75,21 @@ class VirtualCamera:
             raise ValueError(f"camera {self.id}: R is not a rotation")
 
     @property
-    def lens(self) -> Array:
+    def lens(self) -> Floats:
         """fx fy s cx cy k1 k2 p1 p2 k3, as the kernels take them."""
         K = self.K
         return np.array([K[0, 0], K[1, 1], K[0, 1], K[0, 2], K[1, 2], *self.distortion])
 
     @property
-    def centre(self) -> Array:
+    def centre(self) -> Floats:
         """Centre of projection in the world, (3,) mm."""
         return np.asarray(-self.R.T @ self.t)
 
-    def project(self, xyz: Array) -> Array:
+    def project(self, xyz: Floats) -> Floats:
         """World points (n, 3) mm to image pixels (n, 2), distortion included."""
         return self.project_local(np.asarray(xyz, dtype=float) @ self.R.T + self.t)
 
-    def project_local(self, xyz: Array) -> Array:
+    def project_local(self, xyz: Floats) -> Floats:
         """Points (n, 3) mm in the camera's own frame to image pixels (n, 2)."""
         xd, yd = distort(xyz[..., 0] / xyz[..., 2], xyz[..., 1] / xyz[..., 2], self.lens)
         fx, fy, s, cx, cy = self.lens[:5]

@@ -15,6 +15,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic_node.virtual_rig.arrays import Radiance
 from ringdic_node.virtual_rig.body import CYLINDER, approach, point
 from ringdic_node.virtual_rig.lens import VirtualCamera, ideal
 from ringdic_node.virtual_rig.rig import paper_rig
@@ -24,9 +25,6 @@ from ringdic_node.virtual_rig.scenes.board import MARGIN, SQUARE, SQUARES
 from ringdic_node.virtual_rig.scenes.damage import BAR, GLARE_PEAK, GLARE_WIDTH, Damage
 from ringdic_node.virtual_rig.sensor import POINT_SPREAD, blurred, expose
 from ringdic_node.virtual_rig.texture import RADIUS, checker, covered, dots, speckle
-
-Array = NDArray[np.float64]
-Radiance = NDArray[np.float32]
 
 SAMPLES = 2
 # mm of the surface: with a footprint no larger one sample will do. Subsets of 41 px then lie off by less than 0.0001 px

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic_node.virtual_rig.arrays import Floats
 from ringdic_node.virtual_rig.lens import VirtualCamera
-
-Array = NDArray[np.float64]
 
 WIDTH, HEIGHT = 2464, 3280  # px, portrait
 RING_RADIUS = 350.0  # mm
@@ -113,7 +111,7 @@ def _camera(i: int, count: int, scale: float, rng: np.random.Generator) -> Virtu
     )
 
 
-def _looking_at(centre: Array, point: Array) -> Array:
+def _looking_at(centre: Floats, point: Floats) -> Floats:
     """World-to-camera rotation of an upright camera at ``centre`` that looks at ``point``."""
     forward = (point - centre) / np.linalg.norm(point - centre)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -121,7 +119,7 @@ def _looking_at(centre: Array, point: Array) -> Array:
     return np.stack([right, np.cross(forward, right), forward])
 
 
-def _turned(vector: Array) -> Array:
+def _turned(vector: Floats) -> Floats:
     """Rotation matrix of a rotation vector, rad (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     if angle == 0.0:

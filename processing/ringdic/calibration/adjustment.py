@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.calibration.parameters import PER_CAMERA
 from ringdic.calibration.patch import (
     Sheet,
@@ -29,10 +29,6 @@ from ringdic.calibration.patch import (
 from ringdic.errors import ComputationError
 from ringdic.session.rig import Target
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
-
 #: Residuals beyond this many σ count by their length, not by its square (Huber 1964).
 HUBER = 2.5
 #: The adjustment trusts no centroid and no print to better than this, px and mm.
@@ -43,13 +39,13 @@ _PX_FLOOR, _PRINT_FLOOR = 1e-5, 5e-4
 class State:
     """inner (C, 10), rotation (C, 3, 3), translation (C, 3), the sheet, print errors of the dots (m, 2) mm."""
 
-    inner: Array
-    rotation: Array
-    translation: Array
+    inner: Floats
+    rotation: Floats
+    translation: Floats
     sheet: Sheet
-    offsets: Array
+    offsets: Floats
 
-    def moved(self, step: Array, dots: Array) -> State:
+    def moved(self, step: Floats, dots: Floats) -> State:
         """The state after a step of cameras and sheet (16 C + 3,), and of the dots (m, 2) unless they are held."""
         cameras = step[:-3].reshape(-1, PER_CAMERA)
         radius, pitch, tilt = step[-3:]
@@ -75,14 +71,14 @@ class Problem:
     """
 
     target: Target
-    px: Array
-    camera: Index
-    dot: Index
-    rows: Index
-    columns: Index
-    lens: Array
-    lens_information: Array
-    sheet_sigma: Array
+    px: Floats
+    camera: Indices
+    dot: Indices
+    rows: Indices
+    columns: Indices
+    lens: Floats
+    lens_information: Floats
+    sheet_sigma: Floats
     free: Mask
 
     def views(self, state: State) -> Views:
@@ -91,15 +87,15 @@ class Problem:
         c = self.camera
         return Views(state.inner[c], state.rotation[c], state.translation[c], sz[self.dot], state.sheet.radius)
 
-    def project(self, state: State) -> Array:
+    def project(self, state: State) -> Floats:
         """Centroids expected. (n, 2) px."""
         return project_patches(self.views(state), self.target.dot_shape, self.target.dot_size_mm)
 
-    def project_centres(self, state: State) -> Array:
+    def project_centres(self, state: State) -> Floats:
         """Images of the dots' centres. (n, 2) px."""
         return project_centres(self.views(state))
 
-    def lens_gap(self, state: State) -> Array:
+    def lens_gap(self, state: State) -> Floats:
         """Squared distance of each lens from what is known of it, in units of its covariance. (C,)."""
         gap = state.inner - self.lens
         return np.einsum("ci,cij,cj->c", gap, self.lens_information, gap)
@@ -131,9 +127,9 @@ class Solution:
 
     state: State
     scales: Scales
-    covariance: Array
-    dots_covariance: Array
-    chi2: Array
+    covariance: Floats
+    dots_covariance: Floats
+    chi2: Floats
     iterations: int
 
 
@@ -185,16 +181,16 @@ class _Normal:
     """
 
     scales: Scales
-    A: Array
-    B: Array
-    D: Array
-    a: Array
-    d: Array
-    prior: Array
+    A: Floats
+    B: Floats
+    D: Floats
+    a: Floats
+    d: Floats
+    prior: Floats
     by_rest: scipy.sparse.csr_array
-    by_dot: Array
-    residuals: Array
-    weights: Array
+    by_dot: Floats
+    residuals: Floats
+    weights: Floats
 
 
 def _normal(problem: Problem, state: State, scales: Scales) -> _Normal:
@@ -223,7 +219,7 @@ def _reweighted(problem: Problem, state: State, normal: _Normal, scales: Scales)
 
 
 def _assembled(
-    problem: Problem, state: State, scales: Scales, by_rest: scipy.sparse.csr_array, by_dot: Array, residuals: Array
+    problem: Problem, state: State, scales: Scales, by_rest: scipy.sparse.csr_array, by_dot: Floats, residuals: Floats
 ) -> _Normal:
     m = len(problem.rows) if scales.print else 0
     w = np.minimum(1.0, HUBER * scales.px / np.maximum(np.abs(residuals), 1e-300)) / scales.px**2  # (n, 2)
@@ -243,7 +239,7 @@ def _assembled(
     return _Normal(scales, A, B, D, a, d, prior, by_rest, by_dot, residuals, w)
 
 
-def _beforehand(problem: Problem, state: State, scales: Scales) -> tuple[Array, Array]:
+def _beforehand(problem: Problem, state: State, scales: Scales) -> tuple[Floats, Floats]:
     """Information on the free parameters known beforehand (k, k), and its pull on the state (k,)."""
     C = len(state.inner)
     whole, pull = np.zeros((len(problem.free),) * 2), np.zeros(len(problem.free))
@@ -258,7 +254,7 @@ def _beforehand(problem: Problem, state: State, scales: Scales) -> tuple[Array, 
     return whole[np.ix_(problem.free, problem.free)], pull[problem.free]
 
 
-def _sheet_gap(problem: Problem, state: State) -> Array:
+def _sheet_gap(problem: Problem, state: State) -> Floats:
     nominal, sheet = Sheet.nominal(problem.target), state.sheet
     return np.array([sheet.radius - nominal.radius, sheet.pitch - nominal.pitch, sheet.tilt])
 
@@ -314,14 +310,14 @@ def _estimate(problem: Problem, state: State, normal: _Normal) -> Scales:
     return Scales(px, max(found, _PRINT_FLOOR), lens)
 
 
-def _chi2(problem: Problem, normal: _Normal, redundancy: Array) -> Array:
+def _chi2(problem: Problem, normal: _Normal, redundancy: Floats) -> Floats:
     count = len(problem.lens)
     squares = np.sum(normal.weights * normal.residuals**2, axis=1)
     degrees = np.bincount(problem.camera, weights=redundancy.sum(axis=1), minlength=count)
     return np.bincount(problem.camera, weights=squares, minlength=count) / np.maximum(degrees, 1.0)
 
 
-def _leverage(problem: Problem, normal: _Normal, covariance: Array, crossed: Array, dots: Array) -> Array:
+def _leverage(problem: Problem, normal: _Normal, covariance: Floats, crossed: Floats, dots: Floats) -> Floats:
     """Share of each residual (n, 2) that the parameters take up: diagonal of J N⁻¹ Jᵀ W."""
     J, by_dot = normal.by_rest, normal.by_dot
     taken = np.sum((J @ covariance) * J.toarray(), axis=1).reshape(-1, 2)
@@ -333,16 +329,16 @@ def _leverage(problem: Problem, normal: _Normal, covariance: Array, crossed: Arr
     return np.asarray(taken * normal.weights, dtype=np.float64)
 
 
-def _robust_sigma(residuals: Array) -> float:
+def _robust_sigma(residuals: Floats) -> float:
     """Standard deviation a component, from the median of its size."""
     return 1.4826 * float(np.median(np.abs(residuals)))
 
 
-def _reduced(normal: _Normal, damping: float) -> tuple[tuple[Array, bool], Array, Array, Array]:
+def _reduced(normal: _Normal, damping: float) -> tuple[tuple[Floats, bool], Floats, Floats, Floats]:
     """Factor and scale of the equations without the dots, D⁻¹ (m, 2, 2) and B D⁻¹ (k, m, 2)."""
     A = normal.A + damping * np.diag(np.diag(normal.A))
     inverse_D = np.asarray(np.linalg.inv(normal.D + damping * normal.D * np.eye(2)), dtype=np.float64)
-    BD: Array = np.einsum("kmi,mij->kmj", normal.B, inverse_D)
+    BD: Floats = np.einsum("kmi,mij->kmj", normal.B, inverse_D)
     S = A - BD.reshape(len(A), -1) @ normal.B.reshape(len(A), -1).T
     scale = 1 / np.sqrt(np.diag(A))
     try:
@@ -355,7 +351,7 @@ def _reduced(normal: _Normal, damping: float) -> tuple[tuple[Array, bool], Array
     return factor, scale, inverse_D, BD
 
 
-def _solve(normal: _Normal, damping: float) -> tuple[Array, Array]:
+def _solve(normal: _Normal, damping: float) -> tuple[Floats, Floats]:
     """One damped step: of the free parameters of cameras and sheet (k,) and of the dots (m, 2)."""
     factor, scale, inverse_D, BD = _reduced(normal, damping)
     right = normal.a - np.einsum("kmi,mi->k", BD, normal.d)
@@ -364,7 +360,7 @@ def _solve(normal: _Normal, damping: float) -> tuple[Array, Array]:
     return rest, dots
 
 
-def _inverse(normal: _Normal) -> tuple[Array, Array, Array]:
+def _inverse(normal: _Normal) -> tuple[Floats, Floats, Floats]:
     """Covariance of the free parameters of cameras and sheet (k, k), with the dots (k, m, 2), of each dot (m, 2, 2)."""
     factor, scale, inverse_D, BD = _reduced(normal, 0.0)
     covariance = scipy.linalg.cho_solve(factor, np.eye(len(scale))) * np.outer(scale, scale)

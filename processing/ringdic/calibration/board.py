@@ -6,22 +6,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.session.rig import Board
-
-Array = NDArray[np.float64]
 
 #: Long sides to which an image is brought to look for the board, px: smallest first, because it is fastest.
 _SEARCH_SIZES = (1000, 2000)
 
 
-def board_points(board: Board) -> Array:
+def board_points(board: Board) -> Floats:
     """Inner corners on the board, in the order of :func:`find_corners`. (n, 2) mm, (0, 0) at the first corner."""
     across, along = board.inner_corners
     y, x = np.mgrid[:along, :across]
     return np.column_stack([x.ravel(), y.ravel()]) * float(board.square_mm)
 
 
-def find_corners(image: NDArray[np.generic], inner_corners: tuple[int, int]) -> Array | None:
+def find_corners(image: NDArray[np.generic], inner_corners: tuple[int, int]) -> Floats | None:
     """Inner corners of the checkerboard, or None where the whole board is not found.
 
     image : (height, width) grey, uint8, uint16 or float in 0 … 255.
@@ -44,7 +43,7 @@ def find_corners(image: NDArray[np.generic], inner_corners: tuple[int, int]) -> 
     return fine if np.all(moved < 0.35 * spacing) else None
 
 
-def _search(grey: NDArray[np.uint8], inner_corners: tuple[int, int]) -> Array | None:
+def _search(grey: NDArray[np.uint8], inner_corners: tuple[int, int]) -> Floats | None:
     """Corners good to a pixel or so, from the smallest version of the image that shows the board."""
     height, width = grey.shape
     for size in _SEARCH_SIZES:
@@ -58,7 +57,7 @@ def _search(grey: NDArray[np.uint8], inner_corners: tuple[int, int]) -> Array | 
     return None
 
 
-def _spacing(corners: Array, inner_corners: tuple[int, int]) -> float:
+def _spacing(corners: Floats, inner_corners: tuple[int, int]) -> float:
     """Smallest distance of neighbouring corners, px."""
     grid = corners.reshape(inner_corners[1], inner_corners[0], 2)
     return float(

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.calibration.adjustment import Problem, Solution, State, adjust
 from ringdic.calibration.camera_calibration import CameraCalibration
 from ringdic.calibration.parameters import PER_CAMERA, Parameters
@@ -23,8 +23,6 @@ from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.session.rig import Target
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 log = logging.getLogger(__name__)
 
 #: Corners of a board are not trusted to better than this, px a component.
@@ -70,17 +68,17 @@ class BundleFit:
     """
 
     cameras: tuple[str, ...]
-    covariance: Array
+    covariance: Floats
     sheet: Sheet
     px_sigma: float
     print_sigma: float
-    rows: Index
-    columns: Index
-    offsets: Array
-    offsets_sigma: Array
-    lens_chi2: Array
+    rows: Indices
+    columns: Indices
+    offsets: Floats
+    offsets_sigma: Floats
+    lens_chi2: Floats
     lens_scale: float
-    chi2: Array
+    chi2: Floats
 
     def __post_init__(self) -> None:
         size = PER_CAMERA * len(self.cameras) + 3
@@ -88,12 +86,12 @@ class BundleFit:
             raise ValueError("the covariance of a bundle adjustment needs sixteen parameters a camera and three more")
 
     @property
-    def camera_sigma(self) -> Array:
+    def camera_sigma(self) -> Floats:
         """Standard errors of each camera's parameters. (C, 16)."""
         return np.sqrt(np.diag(self.covariance)[:-3]).reshape(-1, PER_CAMERA)
 
     @property
-    def sheet_sigma(self) -> Array:
+    def sheet_sigma(self) -> Floats:
         """Standard errors of radius, pitch (mm) and tilt (rad). (3,)."""
         return np.sqrt(np.diag(self.covariance)[-3:])
 
@@ -211,13 +209,13 @@ def adjust_ring(
 def centroid_shift(
     camera: Camera,
     target: Target,
-    rows: Index,
-    columns: Index,
+    rows: Indices,
+    columns: Indices,
     *,
     sheet: Sheet | None = None,
-    rotation: Array | None = None,
-    translation: Array | None = None,
-) -> Array:
+    rotation: Floats | None = None,
+    translation: Floats | None = None,
+) -> Floats:
     """Centroid of the image of each dot minus the image of its centre, for a target that was moved. (n, 2) px.
 
     Measured centroids less this are images of points, which lines of sight through them meet.
@@ -271,7 +269,7 @@ def _problem(given: list[CameraCalibration], target: Target, prior: TargetPrior)
     )
 
 
-def _lens(given: CameraCalibration) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _lens(given: CameraCalibration) -> tuple[Floats, Floats, Mask]:
     """Parameters of a lens (10,), what is known of them (10, 10), and which are free (10,)."""
     information, free = np.zeros((10, 10)), np.zeros(10, dtype=bool)
     if given.camera.intrinsics is None:
@@ -295,9 +293,7 @@ def _require_dots(ids: tuple[str, ...], part: Problem) -> None:
             )
 
 
-def _adjusted(
-    given: CameraCalibration, number: int, problem: Problem, kept: NDArray[np.bool_], state: State
-) -> CameraCalibration:
+def _adjusted(given: CameraCalibration, number: int, problem: Problem, kept: Mask, state: State) -> CameraCalibration:
     """One camera's calibration after the adjustment."""
     found = Parameters(state.inner[number], state.rotation[number], state.translation[number])
     camera = found.camera(given.camera)

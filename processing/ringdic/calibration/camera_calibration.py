@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.calibration import dlt
 from ringdic.calibration.board import board_points, find_corners
 from ringdic.calibration.dots import find_dots
@@ -24,7 +25,6 @@ from ringdic.errors import ComputationError, InputError
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.session.rig import Rig
 
-Array = NDArray[np.float64]
 Image = NDArray[np.generic]
 
 #: A focal length less certain than this part of itself is not one.
@@ -50,10 +50,10 @@ class CameraCalibration:
 
     camera: Camera
     dots: DotObservations
-    residuals: Array
+    residuals: Floats
     left_out: int
     fit: IntrinsicsFit | None
-    centroid_shift: Array
+    centroid_shift: Floats
     views: tuple[str, ...] = ()
     blank: tuple[str, ...] = ()
 
@@ -62,7 +62,7 @@ class CameraCalibration:
             raise ValueError("a calibration needs one residual and one shift of the centroid for each dot")
 
     @property
-    def dot_centres(self) -> Array:
+    def dot_centres(self) -> Floats:
         """Images of the dots' centres, measured. (n, 2) px."""
         return self.dots.px - self.centroid_shift
 
@@ -194,7 +194,7 @@ def calibrate_camera(
 
 def _find_views(
     rig: Rig, camera_id: str, images: Sequence[Image], progress: Callable[[int, int], None] | None
-) -> list[Array | None]:
+) -> list[Floats | None]:
     """Corners of the board in each image, None where it is not seen whole."""
     views = []
     for number, image in enumerate(images, start=1):

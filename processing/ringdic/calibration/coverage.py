@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ringdic.arrays import Floats
 
 #: Cells along the longer side of the image, for the area covered and for the residuals.
 _AREA_CELLS, _CELLS = 120, 10
@@ -14,7 +13,7 @@ _AREA_CELLS, _CELLS = 120, 10
 _FEWEST = 8
 
 
-def coverage(views: Array, size: tuple[int, int]) -> float:
+def coverage(views: Floats, size: tuple[int, int]) -> float:
     """Part of the image, 0 to 1, that lies inside the outline of at least one view.
 
     views : (v, n, 2) corners, px. size : (width, height), px.
@@ -27,7 +26,7 @@ def coverage(views: Array, size: tuple[int, int]) -> float:
     return float(seen.mean())
 
 
-def residual_distortion(px: Array, residuals: Array, size: tuple[int, int]) -> float:
+def residual_distortion(px: Floats, residuals: Floats, size: tuple[int, int]) -> float:
     """RMS over cells of the image of the mean residual in a cell, the share of random errors taken off. px.
 
     px, residuals : (..., 2). size : (width, height). NaN where no cell has corners enough.

@@ -7,14 +7,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Mask
 from ringdic.errors import ComputationError
 
-Array = NDArray[np.float64]
 
-
-def solve_dlt(xyz: Array, px: Array) -> Array:
+def solve_dlt(xyz: Floats, px: Floats) -> Floats:
     """The eleven parameters by plain linear least squares over all points.
 
     xyz : (n, 3) mm, not all in one plane, n ≥ 6.
@@ -39,20 +37,18 @@ def solve_dlt(xyz: Array, px: Array) -> Array:
     return L / scale
 
 
-def to_projection(L: Array) -> Array:
+def to_projection(L: Floats) -> Floats:
     """Projection matrix with ``P[2, 3] = 1``. (3, 4)."""
     return np.append(np.asarray(L, dtype=float), 1.0).reshape(3, 4)
 
 
-def residuals(L: Array, xyz: Array, px: Array) -> Array:
+def residuals(L: Floats, xyz: Floats, px: Floats) -> Floats:
     """Measured minus projected position. (n, 2) px."""
     h = np.asarray(xyz, dtype=float) @ to_projection(L)[:, :3].T + to_projection(L)[:, 3]
     return np.asarray(px, dtype=float) - h[:, :2] / h[:, 2:]
 
 
-def solve_dlt_robust(
-    xyz: Array, px: Array, *, sigmas: float = 5.0, floor: float = 0.5
-) -> tuple[Array, NDArray[np.bool_]]:
+def solve_dlt_robust(xyz: Floats, px: Floats, *, sigmas: float = 5.0, floor: float = 0.5) -> tuple[Floats, Mask]:
     """The DLT without gross errors: points off by more than ``sigmas`` robust standard deviations are left out.
 
     The scale is the median of the residuals' lengths (for a normal error 1.1774 σ a component), never taken

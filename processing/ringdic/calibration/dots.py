@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Mask
 from ringdic.session.rig import Target
 
-Array = NDArray[np.float64]
 Grey = NDArray[np.float32]
 
 #: Long side to which an image is reduced to look for dots, px.
@@ -37,10 +37,10 @@ class Dots:
     size : (width, height) of the image, px.
     """
 
-    px: Array
-    width: Array
-    height: Array
-    contrast: Array
+    px: Floats
+    width: Floats
+    height: Floats
+    contrast: Floats
     size: tuple[int, int]
 
     def __post_init__(self) -> None:
@@ -151,7 +151,7 @@ def _measure(light: Grey, box: NDArray[np.intp]) -> tuple[float, float, float, f
     )
 
 
-def _fit_plane(columns: NDArray[np.intp], rows: NDArray[np.intp], window: Array, chosen: NDArray[np.bool_]) -> Array:
+def _fit_plane(columns: NDArray[np.intp], rows: NDArray[np.intp], window: Floats, chosen: Mask) -> Floats:
     """Least-squares plane through the chosen pixels, over the whole window."""
     cx, cy = columns.mean(), rows.mean()
     A = np.column_stack([columns[chosen] - cx, rows[chosen] - cy, np.ones(int(chosen.sum()))])

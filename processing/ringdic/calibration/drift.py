@@ -9,15 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ringdic.arrays import Floats
 
 #: Mean vertical residual beyond which a camera has moved, px.
 LIMIT = 0.1
 
 
-def drift_sentences(drift: Mapping[str, Array], steps: Sequence[str], limit: float = LIMIT) -> tuple[str, ...]:
+def drift_sentences(drift: Mapping[str, Floats], steps: Sequence[str], limit: float = LIMIT) -> tuple[str, ...]:
     """One sentence for what moved since the calibration, and one for what moved between steps; none where all is still.
 
     drift : (F,) px by camera or pair; NaN where not measured. steps : F names. limit : px.

@@ -14,15 +14,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Mask
 from ringdic.calibration.coverage import coverage, residual_distortion
 from ringdic.calibration.lens_model import Choice, LensModel, choose, independent, possible
 from ringdic.calibration.parameters import lens_jacobians
 from ringdic.errors import ComputationError, InputError
 from ringdic.geometry.camera import Intrinsics
 
-Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 PARAMETERS = ("fx", "fy", "s", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -55,11 +54,11 @@ class IntrinsicsFit:
     """
 
     intrinsics: Intrinsics
-    sigma: Array
-    view_errors: Array
-    kept: NDArray[np.bool_]
+    sigma: Floats
+    view_errors: Floats
+    kept: Mask
     rms: float
-    covariance: Array
+    covariance: Floats
     model: str = ""
     reason: str = ""
     coverage: float = float("nan")
@@ -127,8 +126,8 @@ def read_intrinsics(path: Path) -> Intrinsics:
 
 
 def calibrate_intrinsics(
-    views: list[Array],
-    board_xy: Array,
+    views: list[Floats],
+    board_xy: Floats,
     size: tuple[int, int],
     *,
     radial: int | None = None,
@@ -162,7 +161,7 @@ def calibrate_intrinsics(
     kept = _views_to_keep(_view_errors(whole, px, board), drop_percentile)
     inner, rotations, translations = whole
     best = px[kept]
-    fits: dict[LensModel, tuple[State, Array]] = {}
+    fits: dict[LensModel, tuple[State, Floats]] = {}
 
     def fit(model: LensModel) -> tuple[float, float]:
         start = (np.where(model.free | _ALWAYS, inner, 0.0), rotations[kept], translations[kept])
@@ -199,15 +198,15 @@ def _words(choice: Choice) -> tuple[str, str]:
     return str(choice.model), choice.reason
 
 
-State = tuple[Array, Array, Array]  # inner (10,), rotations (views, 3, 3), translations (views, 3)
+State = tuple[Floats, Floats, Floats]  # inner (10,), rotations (views, 3, 3), translations (views, 3)
 
 
-def _intrinsics(inner: Array, size: tuple[int, int]) -> Intrinsics:
+def _intrinsics(inner: Floats, size: tuple[int, int]) -> Intrinsics:
     fx, fy, s, cx, cy, k1, k2, p1, p2, k3 = inner
     return Intrinsics(np.array([[fx, s, cx], [0, fy, cy], [0, 0, 1]]), np.array([k1, k2, p1, p2, k3]), size)
 
 
-def _start(px: Array, board: Array, size: tuple[int, int]) -> State:
+def _start(px: Floats, board: Floats, size: tuple[int, int]) -> State:
     """Focal length from the homographies with the centre in the middle, then the pose of each view."""
     points = [board.astype(np.float32)] * len(px)
     K = cv2.initCameraMatrix2D(points, [view.astype(np.float32) for view in px], size)
@@ -225,7 +224,7 @@ def _start(px: Array, board: Array, size: tuple[int, int]) -> State:
     return inner, np.array(rotations), np.array(translations)
 
 
-def _project(state: State, board: Array) -> tuple[Array, Array, Array, Array]:
+def _project(state: State, board: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Corners (views, n, 2) px, rotated board and points in the camera (views, n, 3), ideal normalised points."""
     inner, rotations, translations = state
     rotated = np.einsum("vij,nj->vni", rotations, board)
@@ -236,7 +235,7 @@ def _project(state: State, board: Array) -> tuple[Array, Array, Array, Array]:
     return distorted @ lens.K[:2, :2].T + lens.K[:2, 2], rotated, camera, xy
 
 
-def _cost(state: State, px: Array, board: Array) -> float:
+def _cost(state: State, px: Floats, board: Floats) -> float:
     """Sum of squared residuals; infinite where the state is not a camera."""
     if min(state[0][:2]) <= 0:
         return float("inf")
@@ -245,12 +244,12 @@ def _cost(state: State, px: Array, board: Array) -> float:
     return cost if np.isfinite(cost) else float("inf")
 
 
-def _view_errors(state: State, px: Array, board: Array) -> Array:
+def _view_errors(state: State, px: Floats, board: Floats) -> Floats:
     difference = px - _project(state, board)[0]
     return np.sqrt(np.mean(np.sum(difference**2, axis=-1), axis=-1))
 
 
-def _views_to_keep(errors: Array, drop_percentile: float) -> NDArray[np.bool_]:
+def _views_to_keep(errors: Floats, drop_percentile: float) -> Mask:
     """Views with a gross error never; above the percentile only where enough views are left."""
     keep = errors <= np.maximum(5.0 * np.median(errors), 1e-6)
     if len(errors) >= VIEWS_FOR_DROPPING:
@@ -258,7 +257,7 @@ def _views_to_keep(errors: Array, drop_percentile: float) -> NDArray[np.bool_]:
     return keep if keep.sum() >= VIEWS_NEEDED else np.ones(len(errors), dtype=bool)
 
 
-def _jacobians(state: State, board: Array) -> tuple[Array, Array, Array]:
+def _jacobians(state: State, board: Floats) -> tuple[Floats, Floats, Floats]:
     """Corners (v, n, 2) and their derivatives by the inner parameters (v, n, 2, 10) and the pose (v, n, 2, 6).
 
     The pose moves as ``R ← exp([ω]×) R``, ``t ← t + τ``, six parameters (ω, τ).
@@ -274,7 +273,7 @@ def _jacobians(state: State, board: Array) -> tuple[Array, Array, Array]:
     return px, inner, pose
 
 
-def _refine(state: State, px: Array, board: Array, free: NDArray[np.bool_]) -> tuple[State, Array]:
+def _refine(state: State, px: Floats, board: Floats, free: Mask) -> tuple[State, Floats]:
     """Levenberg-Marquardt to convergence; the state and the covariance of the inner parameters (10, 10)."""
     damping = 1e-3
     projected, by_inner, by_pose = _jacobians(state, board)
@@ -308,7 +307,7 @@ def _refine(state: State, px: Array, board: Array, free: NDArray[np.bool_]) -> t
     return state, covariance
 
 
-def _normal_equations(r: Array, by_inner: Array, by_pose: Array) -> tuple[Array, Array, Array, Array, Array]:
+def _normal_equations(r: Floats, by_inner: Floats, by_pose: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Blocks of JᵀJ and Jᵀr: inner (p, p), inner-pose (v, p, 6), pose (v, 6, 6), and right sides."""
     v, rows = len(r), r[0].size
     Ji, Jp, r = by_inner.reshape(v, rows, by_inner.shape[-1]), by_pose.reshape(v, rows, 6), r.reshape(v, rows)
@@ -316,7 +315,7 @@ def _normal_equations(r: Array, by_inner: Array, by_pose: Array) -> tuple[Array,
     return (JiT @ Ji).sum(0), JiT @ Jp, JpT @ Jp, (JiT @ r[..., None]).sum(0)[:, 0], (JpT @ r[..., None])[..., 0]
 
 
-def _solve(A: Array, B: Array, C: Array, a: Array, c: Array, damping: float) -> tuple[Array, Array]:
+def _solve(A: Floats, B: Floats, C: Floats, a: Floats, c: Floats, damping: float) -> tuple[Floats, Floats]:
     """One damped step: inner (p,) and poses (v, 6)."""
     A = A + damping * np.diag(np.diag(A))
     C = C + damping * C * np.eye(6)
@@ -331,7 +330,7 @@ def _solve(A: Array, B: Array, C: Array, a: Array, c: Array, damping: float) -> 
     return inner, pose
 
 
-def _moved(state: State, free: NDArray[np.bool_], step_inner: Array, step_pose: Array) -> State:
+def _moved(state: State, free: Mask, step_inner: Floats, step_pose: Floats) -> State:
     inner, rotations, translations = state
     inner = inner.copy()
     inner[free] += step_inner
@@ -339,7 +338,9 @@ def _moved(state: State, free: NDArray[np.bool_], step_inner: Array, step_pose: 
     return inner, turns @ rotations, translations + step_pose[:, 3:]
 
 
-def _poses_refined(inner: Array, rotations: Array, translations: Array, px: Array, board: Array) -> tuple[Array, Array]:
+def _poses_refined(
+    inner: Floats, rotations: Floats, translations: Floats, px: Floats, board: Floats
+) -> tuple[Floats, Floats]:
     """Poses of all views with the intrinsics held."""
     state = (inner, rotations, translations)
     state, _ = _refine(state, px, board, np.zeros(10, dtype=bool))

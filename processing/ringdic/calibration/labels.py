@@ -13,14 +13,14 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.calibration import dlt
 from ringdic.calibration.target import DotObservations
 from ringdic.geometry.camera import Camera
 from ringdic.session.rig import Target
 
-Array = NDArray[np.float64]
 #: What is printed above each column, by the column's number.
-Labels = dict[int, Array]
+Labels = dict[int, Floats]
 
 #: The strip above the middle of the top row, as parts of the distance of rows and of half the distance of columns.
 _LOW, _HIGH, _HALF_WIDTH = 0.25, 1.0, 0.8
@@ -76,12 +76,12 @@ def printed(labels: Labels) -> bool:
     return float(np.median((patches - patches.mean(axis=0)).std(axis=(1, 2)))) > _PRINT
 
 
-def common_part(all_labels: Iterable[Labels]) -> Array:
+def common_part(all_labels: Iterable[Labels]) -> Floats:
     """The mean over all columns of all cameras: shade and borders, which are no numbers."""
     return np.asarray(np.mean([patch for labels in all_labels for patch in labels.values()], axis=0))
 
 
-def same_numbers(first: Labels, second: Labels, common: Array, columns: int) -> int | None:
+def same_numbers(first: Labels, second: Labels, common: Floats, columns: int) -> int | None:
     """By how much the second camera's numbers of columns must be raised to agree with the first's, modulo columns.
 
     None where they have too little in common, or more than one answer is likely.
@@ -109,24 +109,24 @@ def _alike(whole: NDArray[np.float32], inner: NDArray[np.float32]) -> float:
 class _Bend:
     """A cubic surface through what the camera without a lens leaves over, in arc and height. px."""
 
-    def __init__(self, dots: DotObservations, target: Target, rest: Array) -> None:
+    def __init__(self, dots: DotObservations, target: Target, rest: Floats) -> None:
         self._spacing = target.column_spacing_mm
-        s: Array = np.asarray((dots.columns - 1) * self._spacing, dtype=np.float64)
-        z: Array = dots.xyz[:, 2]
+        s: Floats = np.asarray((dots.columns - 1) * self._spacing, dtype=np.float64)
+        z: Floats = dots.xyz[:, 2]
         # Columns beyond the seam continue on the other side.
         self._period = target.columns * self._spacing
         self._s0, self._z0 = self._middle(s), float(z.mean())
         self._coefficients = np.linalg.lstsq(self._terms(s, z), rest, rcond=None)[0]
 
-    def _middle(self, s: Array) -> float:
+    def _middle(self, s: Floats) -> float:
         angle = 2 * np.pi * s / self._period
         return float(np.arctan2(np.sin(angle).mean(), np.cos(angle).mean()) / (2 * np.pi) * self._period)
 
-    def _terms(self, s: Array, z: Array) -> Array:
+    def _terms(self, s: Floats, z: Floats) -> Floats:
         x = ((s - self._s0 + self._period / 2) % self._period - self._period / 2) / 50.0
         y = (z - self._z0) / 100.0
-        powers: Array = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=-1)
+        powers: Floats = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=-1)
         return powers
 
-    def __call__(self, s: Array, z: Array) -> Array:
+    def __call__(self, s: Floats, z: Floats) -> Floats:
         return np.asarray(self._terms(s, z) @ self._coefficients)

@@ -10,12 +10,10 @@ from collections import Counter, deque
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from ringdic.arrays import Indices
 from ringdic.calibration.dots import Dots
 from ringdic.session.rig import Target
-
-Index = NDArray[np.intp]
 
 #: Neighbours nearer or farther than these parts of the expected distance are not neighbours.
 _NEAREST, _FARTHEST = 0.55, 1.5
@@ -25,7 +23,7 @@ _VERTICAL_SLOPE, _HORIZONTAL_SLOPE = 0.35, 0.9
 _SHORTEST_COLUMN, _FEWEST_VOTES = 4, 3
 
 
-def walk(dots: Dots, target: Target) -> tuple[Index, Index, Index]:
+def walk(dots: Dots, target: Target) -> tuple[Indices, Indices, Indices]:
     """The largest lattice among spots of an upright image.
 
     Returns the indices of its spots, their rows counted upwards and their columns counted to the right, both from 0.
@@ -48,7 +46,7 @@ def walk(dots: Dots, target: Target) -> tuple[Index, Index, Index]:
     return frontal[spots], place[:, 0], place[:, 1]
 
 
-def _neighbours(dots: Dots, target: Target) -> tuple[Index, Index]:
+def _neighbours(dots: Dots, target: Target) -> tuple[Indices, Indices]:
     """For each spot the one above and the one to the right; −1 where there is none. Only mutual neighbours count."""
     tall = target.row_spacing_mm / target.dot_size_mm * dots.height
     wide = target.column_spacing_mm / target.dot_size_mm * dots.width
@@ -77,12 +75,12 @@ def _neighbours(dots: Dots, target: Target) -> tuple[Index, Index]:
     return _mutual(found["above"], found["below"]), _mutual(found["right"], found["left"])
 
 
-def _mutual(forth: Index, back: Index) -> Index:
+def _mutual(forth: Indices, back: Indices) -> Indices:
     i = np.arange(len(forth))
     return np.where((forth >= 0) & (back[forth] == i), forth, -1)
 
 
-def _columns(above: Index) -> list[list[int]]:
+def _columns(above: Indices) -> list[list[int]]:
     """Chains of spots from the bottom upwards."""
     has_below = set(above[above >= 0].tolist())
     chains = []
@@ -96,7 +94,7 @@ def _columns(above: Index) -> list[list[int]]:
     return chains
 
 
-def _label(columns: list[list[int]], right: Index) -> dict[int, tuple[int, int]]:
+def _label(columns: list[list[int]], right: Indices) -> dict[int, tuple[int, int]]:
     """(row, column) of each spot of the largest set of columns that hang together."""
     where = {spot: (c, r) for c, chain in enumerate(columns) for r, spot in enumerate(chain)}
     links: dict[int, list[tuple[int, int, int]]] = {c: [] for c in range(len(columns))}

@@ -16,9 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ringdic.arrays import Floats, Mask
 
 #: However alike neighbours are, a view is worth one corner and a half.
 _FEWEST_PER_VIEW = 3.0
@@ -37,7 +36,7 @@ class LensModel:
             raise ValueError(f"a lens has 2 or 3 radial terms, not {self.radial}")
 
     @property
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> Mask:
         """(10,) of fx fy s cx cy k1 k2 p1 p2 k3."""
         t = self.tangential
         return np.array([True, True, self.skew, True, True, True, True, t, t, self.radial == 3])
@@ -73,7 +72,7 @@ class Choice:
     reason: str
 
 
-def independent(residuals: Array, board_xy: Array) -> float:
+def independent(residuals: Floats, board_xy: Floats) -> float:
     """How many independent observations residuals are worth.
 
     residuals : (v, n, 2) of the corners at board_xy (n, 2) in v views.

@@ -2,6 +2,7 @@
 
 Only where three cameras and more see a point do lines of sight tell the motion of one from that of the surface: of two
 cameras, what moves a match along the epipolar line looks like depth. A motion of all cameras together cannot be told
+from ringdic.arrays import Floats
 from one of the body; the least motion that fits is taken.
 """
 
@@ -12,14 +13,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.calibration.refinement import Refinement, refine_poses
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.triangulation import reprojection_residuals, triangulate
-
-Array = NDArray[np.float64]
 
 #: Mean residual of a camera beyond which one has moved, px; of thousands of points it is known to a tenth of that.
 LIMIT = 0.03
@@ -35,7 +34,7 @@ class SteadiedCameras:
     cameras: Sequence[Camera]
     found: dict[int, Refinement] = field(default_factory=dict)
 
-    def __call__(self, step: int, px: Array, sigma: Array) -> Sequence[Camera]:
+    def __call__(self, step: int, px: Floats, sigma: Floats) -> Sequence[Camera]:
         """The cameras of a step, by the points that they saw: px, sigma (C, n, 2), NaN where a camera did not."""
         residuals = reprojection_residuals(self.cameras, triangulate(self.cameras, px), px)
         count = np.isfinite(residuals[..., 0]).sum(axis=1)

@@ -10,11 +10,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.geometry.camera import Camera, Intrinsics
-
-Array = NDArray[np.float64]
 
 #: Parameters of the lens, of the pose, and of a camera.
 LENS, POSE = 10, 6
@@ -29,9 +27,9 @@ class Parameters:
     to camera.
     """
 
-    inner: Array
-    rotation: Array
-    translation: Array
+    inner: Floats
+    rotation: Floats
+    translation: Floats
 
     @classmethod
     def of(cls, camera: Camera) -> Parameters:
@@ -42,7 +40,7 @@ class Parameters:
             np.array([K[0, 0], K[1, 1], K[0, 1], K[0, 2], K[1, 2], *distortion]), *pose(camera.P, camera.intrinsics)
         )
 
-    def moved(self, step: Array) -> Parameters:
+    def moved(self, step: Floats) -> Parameters:
         """After a step (16,) in the parameters."""
         turn = cv2.Rodrigues(np.asarray(step[LENS : LENS + 3], dtype=np.float64))[0]
         return Parameters(
@@ -58,7 +56,7 @@ class Parameters:
         return Camera(like.id, P / P[2, 3], like.size, lens)
 
 
-def split(P: Array) -> tuple[Array, Array]:
+def split(P: Floats) -> tuple[Floats, Floats]:
     """P = λ K [R | t], K upper triangular with K[2, 2] = 1: K (3, 3) and R (3, 3). The world lies before the camera."""
     M = P[:, :3] * np.sign(np.linalg.det(P[:, :3]))
     Q, U = np.linalg.qr(np.flipud(M).T)
@@ -68,7 +66,7 @@ def split(P: Array) -> tuple[Array, Array]:
     return K / K[2, 2], signs @ R
 
 
-def pose(P: Array, lens: Intrinsics | None) -> tuple[Array, Array]:
+def pose(P: Floats, lens: Intrinsics | None) -> tuple[Floats, Floats]:
     """Rotation and translation nearest to a projection, with the lens's own focal lengths."""
     centre = -np.linalg.solve(P[:, :3], P[:, 3])
     if lens is None:
@@ -80,7 +78,7 @@ def pose(P: Array, lens: Intrinsics | None) -> tuple[Array, Array]:
     return R, -R @ centre
 
 
-def projection_jacobians(parameters: Parameters, xyz: Array) -> tuple[Array, Array, Array]:
+def projection_jacobians(parameters: Parameters, xyz: Floats) -> tuple[Floats, Floats, Floats]:
     """Images of points and their derivatives.
 
     xyz : (n, 3) mm, world.
@@ -104,7 +102,7 @@ def projection_jacobians(parameters: Parameters, xyz: Array) -> tuple[Array, Arr
     return px, np.concatenate([by_inner, by_turn, by_point], axis=-1), by_point @ parameters.rotation
 
 
-def lens_jacobians(lens: Intrinsics, xy: Array) -> tuple[Array, Array, Array]:
+def lens_jacobians(lens: Intrinsics, xy: Floats) -> tuple[Floats, Floats, Floats]:
     """Image px (..., 2) of ideal normalised points (..., 2), their derivatives by the ten parameters of the lens
     (..., 2, 10) and by the ideal points (..., 2, 2).
     """

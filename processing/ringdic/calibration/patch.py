@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.session.rig import Target
 
-Array = NDArray[np.float64]
 Values = NDArray[Any]  # float64, or complex128 in a complex step
 
 _STEP = 1e-40
@@ -44,14 +44,14 @@ class Sheet:
         return 2 * np.pi * self.radius - (target.columns - 1) * self.pitch
 
 
-def sheet_points(target: Target, sheet: Sheet, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
+def sheet_points(target: Target, sheet: Sheet, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Floats:
     """Arc and height of dots' centres on the sheet, without print errors. rows, columns : (n,), from 1. (n, 2) mm."""
     arc, height = _nominal(target, rows, columns)
     s = arc * (sheet.pitch / target.column_spacing_mm) - sheet.tilt * (height - _middle(target)[1])
     return np.column_stack([s, height + sheet.tilt * (arc - _middle(target)[0])])
 
 
-def by_sheet(target: Target, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
+def by_sheet(target: Target, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Floats:
     """Derivatives of :func:`sheet_points` by pitch and tilt. (n, 2, 2), last axis the parameter."""
     arc, height = _nominal(target, rows, columns)
     D = np.zeros((len(arc), 2, 2))
@@ -61,7 +61,7 @@ def by_sheet(target: Target, rows: NDArray[np.intp], columns: NDArray[np.intp]) 
     return D
 
 
-def _nominal(target: Target, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> tuple[Array, Array]:
+def _nominal(target: Target, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> tuple[Floats, Floats]:
     arc = (np.asarray(columns, dtype=np.float64) - 1) * target.column_spacing_mm
     return arc, target.first_row_z_mm + (np.asarray(rows, dtype=np.float64) - 1) * target.row_spacing_mm
 
@@ -73,20 +73,20 @@ def _middle(target: Target) -> tuple[float, float]:
     )
 
 
-def wrapped(sz: Array, radius: float) -> Array:
+def wrapped(sz: Floats, radius: float) -> Floats:
     """Points of the sheet (..., 2) on the cylinder. (..., 3) mm."""
     angle = sz[..., 0] / radius
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), sz[..., 1]], axis=-1)
 
 
-def nodes(shape: str, size: float) -> tuple[Array, Array]:
+def nodes(shape: str, size: float) -> tuple[Floats, Floats]:
     """Points on a dot about its centre (16, 2), mm, and their weights (16,), sum 1.
 
     square : 4 × 4 Gauss-Legendre points of the edge ``size``. circle : of the diameter ``size``, two radii by Gauss's
     rule in r² and eight angles, exact to the seventh degree.
     """
-    x: Array
-    w: Array
+    x: Floats
+    w: Floats
     if shape == "square":
         x, w = (np.asarray(each, dtype=np.float64) for each in np.polynomial.legendre.leggauss(4))
         return 0.5 * size * np.column_stack([np.tile(x, 4), np.repeat(x, 4)]), np.outer(w, w).ravel() / 4
@@ -104,25 +104,25 @@ class Views:
     sz : (n, 2) arc and height of the dot's centre on the sheet, mm.
     """
 
-    inner: Array
-    rotation: Array
-    translation: Array
-    sz: Array
+    inner: Floats
+    rotation: Floats
+    translation: Floats
+    sz: Floats
     radius: float
 
 
-def project_patches(views: Views, shape: str, size: float) -> Array:
+def project_patches(views: Views, shape: str, size: float) -> Floats:
     """Centroids of the dots' images. (n, 2) px."""
     distorted = _centroids(views, nodes(shape, size))
     return _to_px(views.inner, distorted)
 
 
-def project_centres(views: Views) -> Array:
+def project_centres(views: Views) -> Floats:
     """Images of the dots' centres. (n, 2) px."""
     return _to_px(views.inner, _centroids(views, (np.zeros((1, 2)), np.ones(1))))
 
 
-def patch_jacobians(views: Views, shape: str, size: float) -> tuple[Array, Array, Array, Array, Array]:
+def patch_jacobians(views: Views, shape: str, size: float) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Centroids (n, 2) px and their derivatives.
 
     Returns px, by inner parameters (n, 2, 10), by pose (n, 2, 6), by sz (n, 2, 2), by the radius (n, 2, 1).
@@ -146,12 +146,12 @@ def patch_jacobians(views: Views, shape: str, size: float) -> tuple[Array, Array
     return _to_px(views.inner, distorted), inner, rest[:, :, 5:11], rest[:, :, 11:13], rest[:, :, 13:]
 
 
-def _to_px(inner: Array, distorted: Array) -> Array:
+def _to_px(inner: Floats, distorted: Floats) -> Floats:
     fx, fy, s, cx, cy = inner.T[:5]
     return np.column_stack([fx * distorted[:, 0] + s * distorted[:, 1] + cx, fy * distorted[:, 1] + cy])
 
 
-def _centroids(views: Views, rule: tuple[Array, Array], step: Values | None = None) -> Values:
+def _centroids(views: Views, rule: tuple[Floats, Floats], step: Values | None = None) -> Values:
     """Centroids in distorted normalised coordinates (n, 2).
 
     step : (14,) added to k1 k2 p1 p2 k3, ω (3), τ (3), s, z, radius.

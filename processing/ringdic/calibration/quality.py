@@ -6,14 +6,12 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.calibration.camera_calibration import CameraCalibration
 from ringdic.calibration.parameters import lens_jacobians
 from ringdic.errors import ComputationError
 from ringdic.geometry.triangulation import reprojection_residuals, triangulate
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -25,13 +23,13 @@ class ReconstructionError:
     points : number of points that were reconstructed.
     """
 
-    mean_vector: Array
+    mean_vector: Floats
     mean: float
     rms: float
     points: int
 
 
-def reconstruction_error(xyz_true: Array, xyz_reconstructed: Array) -> ReconstructionError:
+def reconstruction_error(xyz_true: Floats, xyz_reconstructed: Floats) -> ReconstructionError:
     """Mean error vector and RMS error of control points (n, 3) mm; points that are NaN are left out."""
     error = np.asarray(xyz_reconstructed, dtype=float) - np.asarray(xyz_true, dtype=float)
     error = error[np.isfinite(error).all(axis=1)]

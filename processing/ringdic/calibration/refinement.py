@@ -14,15 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.calibration.bundle import BundleFit
 from ringdic.calibration.parameters import LENS, PER_CAMERA, POSE, Parameters, projection_jacobians
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.triangulation import reprojection_residuals, triangulate
 
-Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 #: Residuals beyond this many σ count by their length, not by its square (Huber 1964).
@@ -44,27 +43,32 @@ class Refinement:
     """
 
     cameras: tuple[Camera, ...]
-    motion: Array
-    sigma: Array
-    before: Array
-    after: Array
+    motion: Floats
+    sigma: Floats
+    before: Floats
+    after: Floats
     scale: float
     points: int
 
 
-def pose_covariance(fit: BundleFit, ids: Sequence[str]) -> Array:
+def pose_covariance(fit: BundleFit, ids: Sequence[str]) -> Floats:
     """Covariance of the poses (6 C, 6 C) of some cameras, from the bundle adjustment, whatever their lenses are."""
     at = [PER_CAMERA * fit.cameras.index(id_) + LENS + k for id_ in ids for k in range(POSE)]
     return fit.covariance[np.ix_(at, at)]
 
 
-def loose_covariance(count: int) -> Array:
+def loose_covariance(count: int) -> Floats:
     """Covariance of poses of which nothing is known but that they are about right. (6 C, 6 C)."""
     return np.diag(np.tile(np.repeat(np.square(LOOSE), 3), count))
 
 
 def refine_poses(
-    cameras: Sequence[Camera], px: Array, sigma: Array | float, covariance: Array | None = None, *, iterations: int = 10
+    cameras: Sequence[Camera],
+    px: Floats,
+    sigma: Floats | float,
+    covariance: Floats | None = None,
+    *,
+    iterations: int = 10,
 ) -> Refinement:
     """Poses after which the lines of sight of matched points meet best.
 
@@ -110,11 +114,11 @@ def refine_poses(
     return Refinement(refined, motion, np.sqrt(np.diag(inverse)).reshape(count, POSE), before, after, scale, len(xyz))
 
 
-def _at(start: Parameters, motion: Array) -> Parameters:
+def _at(start: Parameters, motion: Floats) -> Parameters:
     return start.moved(np.concatenate([np.zeros(LENS), motion]))
 
 
-def _meeting(cameras: Sequence[Camera], px: Array) -> Array:
+def _meeting(cameras: Sequence[Camera], px: Floats) -> Floats:
     """RMS distance of each camera's points from the reprojection. (C,) px."""
     residuals = reprojection_residuals(cameras, triangulate(cameras, px), px)
     squares = np.sum(residuals**2, axis=2)
@@ -122,7 +126,7 @@ def _meeting(cameras: Sequence[Camera], px: Array) -> Array:
     return np.sqrt(np.where(count > 0, np.nansum(squares, axis=1) / np.maximum(count, 1), np.nan))
 
 
-def _scale(poses: Sequence[Parameters], xyz: Array, px: Array, sigma: Array) -> float:
+def _scale(poses: Sequence[Parameters], xyz: Floats, px: Floats, sigma: Floats) -> float:
     """Robust standard deviation of what is left over in units of σ: 1 or more.
 
     A point seen by m cameras leaves 2 m − 3 degrees of freedom; the median of its χ² is known.
@@ -136,8 +140,8 @@ def _scale(poses: Sequence[Parameters], xyz: Array, px: Array, sigma: Array) -> 
 
 
 def _step(
-    poses: Sequence[Parameters], xyz: Array, px: Array, sigma: Array, scale: float, prior: Array, motion: Array
-) -> tuple[Array, Array, Array]:
+    poses: Sequence[Parameters], xyz: Floats, px: Floats, sigma: Floats, scale: float, prior: Floats, motion: Floats
+) -> tuple[Floats, Floats, Floats]:
     """One Gauss-Newton step of the poses (C, 6) and of the points (n, 3), and the covariance of the poses."""
     count, n = len(poses), len(xyz)
     N, right = prior.copy(), -prior @ motion.ravel()

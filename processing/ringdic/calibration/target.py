@@ -18,14 +18,13 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.calibration import dlt, lattice
 from ringdic.calibration.dots import Dots
 from ringdic.errors import ComputationError, InputError
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.session.rig import Target
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 log = logging.getLogger(__name__)
 
 #: Fewest dots and columns that make a camera.
@@ -51,10 +50,10 @@ class DotObservations:
     """
 
     camera: str
-    rows: Index
-    columns: Index
-    px: Array
-    xyz: Array
+    rows: Indices
+    columns: Indices
+    px: Floats
+    xyz: Floats
     azimuth_deg: float
     margin_deg: float
 
@@ -66,7 +65,7 @@ class DotObservations:
     def __len__(self) -> int:
         return len(self.px)
 
-    def chosen(self, keep: NDArray[np.bool_]) -> DotObservations:
+    def chosen(self, keep: Mask) -> DotObservations:
         """Some of the dots."""
         return DotObservations(
             self.camera,
@@ -105,7 +104,7 @@ class DotObservations:
         )
 
 
-def dot_points(target: Target, rows: Index, columns: Index) -> Array:
+def dot_points(target: Target, rows: Indices, columns: Indices) -> Floats:
     """Centres of dots on the cylinder. rows, columns : (n,), from 1. (n, 3) mm."""
     angle = (np.asarray(columns) - 1) * target.column_angle
     z = target.first_row_z_mm + (np.asarray(rows) - 1) * target.row_spacing_mm
@@ -162,7 +161,7 @@ def identify(
     return DotObservations(camera, rows, columns, dots.px[found], xyz, azimuth, numbering.margin)
 
 
-def possible_azimuths(dots: Dots, target: Target, rotation_deg: float = 0.0) -> Array:
+def possible_azimuths(dots: Dots, target: Target, rotation_deg: float = 0.0) -> Floats:
     """Azimuths, degrees, at which the camera may stand by its own image alone, best first: one where it sees the seam
     or an edge of the columns, else one for each column. Empty where no lattice on a cylinder is seen.
     """
@@ -236,7 +235,7 @@ def _straightened(dots: Dots, bend: float) -> Dots:
     return replace(dots, px=middle + offset * (1 + bend * r2))
 
 
-def _middle(size: tuple[int, int]) -> Array:
+def _middle(size: tuple[int, int]) -> Floats:
     return (np.array(size, dtype=float) - 1) / 2
 
 
@@ -262,7 +261,7 @@ class _Numbering:
     margin : see ``DotObservations.margin_deg``.
     """
 
-    L: Array
+    L: Floats
     agreeing: int
     deviation: float
     rows: int
@@ -304,7 +303,7 @@ def _with_rows(
     target: Target,
     camera: str,
     height_mm: float | None,
-) -> Array:
+) -> Floats:
     """The DLT parameters with the rows numbered, where the image cuts some of them off.
 
     frame : the border of the image, a polygon (m, 2) in the coordinates of the dots.
@@ -333,14 +332,14 @@ def _with_rows(
     )
 
 
-def _lifted(L: Array, z: float) -> Array:
+def _lifted(L: Floats, z: float) -> Floats:
     """The camera that sees points lifted by z mm where this one sees them."""
     P = dlt.to_projection(L)
     P[:, 3] -= z * P[:, 2]
     return np.asarray((P / P[2, 3]).ravel()[:11])
 
 
-def _any_inside(L: Array, rows: list[int], frame: NDArray[np.float32], target: Target) -> bool:
+def _any_inside(L: Floats, rows: list[int], frame: NDArray[np.float32], target: Target) -> bool:
     """Whether dots of these rows, seen well, would lie in the image by more than their size."""
     if not rows:
         return False
@@ -359,7 +358,7 @@ def _any_inside(L: Array, rows: list[int], frame: NDArray[np.float32], target: T
 
 
 def _try(
-    dots: Dots, spots: Index, rows: Index, columns: Index, target: Target, azimuth_deg: float, lens_known: bool
+    dots: Dots, spots: Indices, rows: Indices, columns: Indices, target: Target, azimuth_deg: float, lens_known: bool
 ) -> _Numbering | None:
     """The camera of one numbering of the columns, or None where it is not one outside the target.
 
@@ -399,7 +398,7 @@ def _try(
     return _Numbering(L, len(spots), deviation, int(np.ptp(occupied)) + 1, bend)
 
 
-def _find_bend(dots: Dots, xyz: Array) -> float:
+def _find_bend(dots: Dots, xyz: Floats) -> float:
     """The bend after which a camera without distortion agrees best with the dots."""
 
     def misfit(bend: float) -> float:
@@ -411,15 +410,15 @@ def _find_bend(dots: Dots, xyz: Array) -> float:
     )
 
 
-def _occupied_rows(rows: Index, columns: Index) -> Index:
+def _occupied_rows(rows: Indices, columns: Indices) -> Indices:
     """Rows that hold dots in at least a third of the columns: a smudge above the target is not a row."""
     number, count = np.unique(rows, return_counts=True)
     return number[count >= max(2, len(np.unique(columns)) / 3)]
 
 
 def _match(
-    dots: Dots, L: Array, target: Target, all_rows: range, max_incidence_deg: float
-) -> tuple[Index, Index, Index]:
+    dots: Dots, L: Floats, target: Target, all_rows: range, max_incidence_deg: float
+) -> tuple[Indices, Indices, Indices]:
     """Spots that are where dots must be and as large as they must be: their indices, rows and columns."""
     camera = Camera("", dlt.to_projection(L), (1, 1))
     grid = np.mgrid[all_rows.start : all_rows.stop, 1 : target.columns + 1]
@@ -444,7 +443,7 @@ def _match(
     return nearest[ok], rows[ok], columns[ok]
 
 
-def _projected_size(camera: Camera, xyz: Array, target: Target) -> tuple[Array, Array]:
+def _projected_size(camera: Camera, xyz: Floats, target: Target) -> tuple[Floats, Floats]:
     """Width and height of the upright boxes round the dots' images. (n,) each, px."""
     half = target.dot_size_mm / 2
     angle = np.arctan2(xyz[:, 1], xyz[:, 0])

@@ -22,6 +22,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Mask
 from ringdic.correlation.correlate import Correlation, correlate, load_kernels, on_threads
 from ringdic.correlation.grid import grid
 from ringdic.correlation.machine import Machine, demand, measure_machine
@@ -139,7 +140,7 @@ def ratios(new: dict[str, Any], old: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def synthetic_pair(height: int = 2464, width: int = 3280) -> tuple[Image, Image, NDArray[np.bool_]]:
+def synthetic_pair(height: int = 2464, width: int = 3280) -> tuple[Image, Image, Mask]:
     """Speckle, the same moved and strained by a few per cent, and a region of about a sixth of the image."""
     rng = np.random.default_rng(0)
     noise = cv2.GaussianBlur(rng.normal(size=(height, width)).astype(np.float32), (0, 0), 2.0)
@@ -155,14 +156,14 @@ def synthetic_pair(height: int = 2464, width: int = 3280) -> tuple[Image, Image,
     return camera(speckle), camera(np.asarray(moved)), mask
 
 
-def _rig_pair(folder: Path) -> tuple[Image, Image, NDArray[np.bool_]]:
+def _rig_pair(folder: Path) -> tuple[Image, Image, Mask]:
     reference = read_gray(folder / "speckle" / "201_1.jpg")
     current = read_gray(folder / "speckle" / "201_2.jpg")
     return reference, current, read_mask(folder / "roi_mask.png", (reference.shape[0], reference.shape[1]))
 
 
 def _measure(
-    reference: Image, current: Image, mask: NDArray[np.bool_], xy: NDArray[np.float64],
+    reference: Image, current: Image, mask: Mask, xy: Floats,
     settings: CorrelationSettings, threads: int, repeats: int,
 ) -> dict[str, Any]:  # fmt: skip
     wholes, results, kernels, cpu = [], [], [], []
@@ -222,7 +223,7 @@ def _told(run: dict[str, Any]) -> str:
 
 
 def _stereo(
-    data: Path, reference: Image, mask: NDArray[np.bool_], xy: NDArray[np.float64], step: int, interpolation: str
+    data: Path, reference: Image, mask: Mask, xy: Floats, step: int, interpolation: str
 ) -> dict[str, Any] | None:
     """The neighbouring camera, second order: gradients up to 0.65. None where its image is missing."""
     path = data / "speckle" / "202_1.jpg"
@@ -250,9 +251,7 @@ def _stereo(
     }
 
 
-def _difference(
-    reference: Image, current: Image, mask: NDArray[np.bool_], xy: NDArray[np.float64], step: int, interpolation: str
-) -> float:
+def _difference(reference: Image, current: Image, mask: Mask, xy: Floats, step: int, interpolation: str) -> float:
     """Largest difference between the matches in single and in double precision, of every seventh point, px."""
     xy, found = xy[::7], []
     start = None
@@ -266,7 +265,7 @@ def _difference(
     return float(np.nanmax(np.abs(found[1] - found[0])))
 
 
-def _start_off(result: Correlation) -> NDArray[np.float64]:
+def _start_off(result: Correlation) -> Floats:
     """Start values (n, 12): the displacement found, 0.3 px off in a direction of its own, and its gradient."""
     start = np.zeros((len(result.xy), 12))
     angle = np.random.default_rng(1).uniform(0.0, 2.0 * np.pi, len(start))
@@ -281,7 +280,7 @@ def _identity(run: dict[str, Any]) -> tuple[int, int, int]:
 
 
 def _peak_memory(
-    reference: Image, current: Image, mask: NDArray[np.bool_], xy: NDArray[np.float64], settings: CorrelationSettings
+    reference: Image, current: Image, mask: Mask, xy: Floats, settings: CorrelationSettings
 ) -> float | None:
     """Largest resident set, MB, of a process of its own that correlates the pair; None where the system tells none."""
     if sys.platform == "win32":
@@ -290,9 +289,7 @@ def _peak_memory(
         return child.submit(_peak_of_pair, reference, current, mask, xy, settings).result()
 
 
-def _peak_of_pair(
-    reference: Image, current: Image, mask: NDArray[np.bool_], xy: NDArray[np.float64], settings: CorrelationSettings
-) -> float:
+def _peak_of_pair(reference: Image, current: Image, mask: Mask, xy: Floats, settings: CorrelationSettings) -> float:
     correlate(prepare_reference(reference, mask, settings), prepare_current(current, None, settings), xy, settings)
     status = Path("/proc/self/status")
     if status.is_file():  # a child's rusage on Linux would begin with its parent's size

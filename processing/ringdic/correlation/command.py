@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Mask
 from ringdic.correlation.correlate import Correlation, correlate, load_kernels, usable_threads
 from ringdic.correlation.grid import grid
 from ringdic.correlation.prepared import prepare_current, prepare_reference
@@ -100,7 +101,7 @@ def write_points(path: Path, result: Correlation, faces: NDArray[np.int32]) -> N
         partial.unlink(missing_ok=True)
 
 
-def _inner(shape: tuple[int, ...], radius: int) -> NDArray[np.bool_]:
+def _inner(shape: tuple[int, ...], radius: int) -> Mask:
     """The image less the subset radius at its borders. (height, width) bool."""
     mask = np.zeros(shape, bool)
     mask[radius : shape[0] - radius, radius : shape[1] - radius] = True

@@ -11,8 +11,8 @@ from functools import cache
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.correlation import kernels
 from ringdic.correlation.features import feature_starts
 from ringdic.correlation.hypotheses import search_hypotheses
@@ -23,8 +23,7 @@ from ringdic.correlation.settings import CorrelationSettings
 from ringdic.correlation.status import Status
 from ringdic.errors import InputError
 
-Array = NDArray[np.float64]
-StartValues = Callable[[Reference, Current, Array, int], Array]
+StartValues = Callable[[Reference, Current, Floats, int], Floats]
 
 log = logging.getLogger(__name__)
 
@@ -54,19 +53,19 @@ class Correlation:
     seconds : by stage: prepare, start, refine.
     """
 
-    xy: Array
-    uv: Array
-    gradient: Array
-    curvature: Array
-    zncc: Array
-    c_ls: Array
-    iterations: NDArray[np.int64]
-    status: NDArray[np.int64]
-    sigma: Array
+    xy: Floats
+    uv: Floats
+    gradient: Floats
+    curvature: Floats
+    zncc: Floats
+    c_ls: Floats
+    iterations: Indices
+    status: Indices
+    sigma: Floats
     seconds: dict[str, float]
 
     @property
-    def good(self) -> NDArray[np.bool_]:
+    def good(self) -> Mask:
         """Matched points. (n,) bool."""
         return self.status == Status.GOOD
 
@@ -74,10 +73,10 @@ class Correlation:
 def correlate(
     reference: Reference,
     current: Current,
-    xy: Array,
+    xy: Floats,
     settings: CorrelationSettings,
     *,
-    start: Array | None = None,
+    start: Floats | None = None,
     follow: bool = False,
     threads: int | None = None,
     progress: Progress | None = None,
@@ -108,7 +107,7 @@ def correlate(
 
 
 def refine_alone(
-    reference: Reference, current: Current, xy: Array, settings: CorrelationSettings, start: Array
+    reference: Reference, current: Current, xy: Floats, settings: CorrelationSettings, start: Floats
 ) -> Correlation:
     """Match points of the reference image each from its own start value alone: no neighbour leads to it or judges it.
 
@@ -125,7 +124,7 @@ def refine_alone(
     return _result(points, seconds)
 
 
-def _checked(reference: Reference, current: Current, xy: Array, settings: CorrelationSettings) -> Array:
+def _checked(reference: Reference, current: Current, xy: Floats, settings: CorrelationSettings) -> Floats:
     """The points (n, 2) as the kernels take them. InputError where they or the images do not fit the settings."""
     xy = np.ascontiguousarray(xy, dtype=np.float64)
     if current.degree != settings.degree:
@@ -180,7 +179,7 @@ def _match_automatically(points: Field, seconds: dict[str, float]) -> None:
             _carry_on(points, seconds)
 
 
-def _open(points: Field) -> NDArray[np.int64]:
+def _open(points: Field) -> Indices:
     return np.flatnonzero(~points.good & (points.status != Status.NO_TEXTURE))
 
 
@@ -189,7 +188,7 @@ def _worth(points: Field) -> int:
     return int((points.status != Status.NO_TEXTURE).sum())
 
 
-def _try_seeds(points: Field, seeds: NDArray[np.int64], start: Array) -> Field:
+def _try_seeds(points: Field, seeds: Indices, start: Floats) -> Field:
     """The seeds (k,) refined from start values (k, 12), apart from the other points, where they look alike at all."""
     bare = points.status[seeds] == Status.NO_TEXTURE
     trial = Field(points.reference, points.current, points.xy[seeds], points.settings, bare=np.asarray(bare))
@@ -203,7 +202,7 @@ def _try_seeds(points: Field, seeds: NDArray[np.int64], start: Array) -> Field:
     return trial
 
 
-def _match_from(points: Field, start: Array, seconds: dict[str, float], follow: bool) -> None:
+def _match_from(points: Field, start: Floats, seconds: dict[str, float], follow: bool) -> None:
     began = time.perf_counter()
     given = np.flatnonzero(np.isfinite(start).all(axis=1))
     if not len(given):
@@ -214,7 +213,7 @@ def _match_from(points: Field, start: Array, seconds: dict[str, float], follow: 
 
 
 def _carry_on(
-    points: Field, seconds: dict[str, float], index: NDArray[np.int64] | None = None, start: Array | None = None
+    points: Field, seconds: dict[str, float], index: Indices | None = None, start: Floats | None = None
 ) -> None:
     """All points from their own start values where given, then from neighbour to neighbour, and the judgement."""
     began = time.perf_counter()
@@ -231,7 +230,7 @@ def _carry_on(
     seconds["refine"] += time.perf_counter() - began
 
 
-def _parameters(start: Array, n: int) -> Array:
+def _parameters(start: Floats, n: int) -> Floats:
     start = np.asarray(start, dtype=np.float64)
     if start.shape not in ((n, 6), (n, 12)):
         raise ValueError(f"start values must be ({n}, 6) or ({n}, 12), not {start.shape}")
@@ -240,7 +239,7 @@ def _parameters(start: Array, n: int) -> Array:
     return out
 
 
-def in_order(parameters: Array) -> Array:
+def in_order(parameters: Floats) -> Floats:
     """Parameters (n, 12) of the kernels in the order in which start values are given. (n, 12)."""
     return np.asarray(parameters[:, _COLUMNS])
 

@@ -11,9 +11,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.correlation.prepared import Current, Reference, as_8_bit
-
-Array = NDArray[np.float64]
 
 _PIXELS = 0.45e6  # reduce larger images to this; the detector doubles them again
 _FEATURES = 2500
@@ -23,7 +22,7 @@ _TRIALS = 120
 _TOLERANCE = 3.0  # px of the full image a match may miss its local affine map
 
 
-def feature_starts(reference: Reference, current: Current, xy: Array, radius: int) -> Array:
+def feature_starts(reference: Reference, current: Current, xy: Floats, radius: int) -> Floats:
     """Start values (n, 12) from the affine map through the matched features around each point; NaN without one."""
     p, q = matched_features(reference, current)
     out = np.full((len(xy), 12), np.nan)
@@ -37,7 +36,7 @@ def feature_starts(reference: Reference, current: Current, xy: Array, radius: in
     return out
 
 
-def matched_features(reference: Reference, current: Current) -> tuple[Array, Array]:
+def matched_features(reference: Reference, current: Current) -> tuple[Floats, Floats]:
     """Positions (k, 2) px of mutually best features in the reference (inside its mask) and the current image."""
     scale = min(1.0, np.sqrt(_PIXELS / max(reference.image.size, current.image.size)))
     x0, y0 = reference.origin.astype(int)
@@ -58,7 +57,7 @@ def matched_features(reference: Reference, current: Current) -> tuple[Array, Arr
     return points_r[rows[:, 0]] + (x0, y0), points_c[rows[:, 1]]
 
 
-def _features(image: NDArray, mask: NDArray | None, scale: float) -> tuple[Array, NDArray[np.float32]]:
+def _features(image: NDArray, mask: NDArray | None, scale: float) -> tuple[Floats, NDArray[np.float32]]:
     """Feature positions (k, 2), px of the given image, and their descriptors (k, 128)."""
     grey: NDArray = as_8_bit(image)
     if scale < 1.0:
@@ -73,7 +72,7 @@ def _features(image: NDArray, mask: NDArray | None, scale: float) -> tuple[Array
     return (at + 0.5) / scale - 0.5, np.asarray(words, dtype=np.float32)
 
 
-def _local_affine(d: Array, uv: Array) -> Array:
+def _local_affine(d: Floats, uv: Floats) -> Floats:
     """Parameters (12,) at the origin of the affine map most of the matches agree on; NaN if fewer than five do.
 
     d : (k, 2) px from the point; uv : (k, 2) px displacement. Least median over drawn triples, then least squares.

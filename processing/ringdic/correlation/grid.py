@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Mask
 
-def grid(mask: NDArray[np.bool_], step: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+
+def grid(mask: Mask, step: int) -> tuple[Floats, NDArray[np.int32]]:
     """Points at the multiples of the step inside a mask, and their triangles.
 
     mask : (height, width) bool.

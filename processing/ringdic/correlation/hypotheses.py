@@ -9,9 +9,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.correlation.prepared import Current, Reference
-
-Array = NDArray[np.float64]
 
 _MANY = 16  # warps a point from which on they are first tried on fewer pixels
 _THINNED = 2  # every so many of the pixels each way at first
@@ -27,11 +26,11 @@ class Row:
     a quarter of the way from knot 2 to knot 3.
     """
 
-    knots: Array
-    places: Array
+    knots: Floats
+    places: Floats
 
     @property
-    def warps(self) -> Array:
+    def warps(self) -> Floats:
         """All of them. (n, K, 6)."""
         below = np.minimum(self.places.astype(np.int64), max(self.knots.shape[1] - 2, 0))
         share = (self.places - below)[:, None]
@@ -48,22 +47,22 @@ class Found:
     ZNCC of a warp that leads elsewhere, or -1. which : (n,), the number of the best.
     """
 
-    warps: Array
-    zncc: Array
-    second_peak: Array
-    which: NDArray[np.int64]
+    warps: Floats
+    zncc: Floats
+    second_peak: Floats
+    which: Indices
 
 
 def search_hypotheses(
     reference: Reference,
     current: Current,
-    xy: Array,
-    warps: Array,
+    xy: Floats,
+    warps: Floats,
     radius: int,
     *,
     stride: int = 2,
     separation: float = 4.0,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Floats, Floats, Floats]:
     """The best of K affine warps at each of n points, by ZNCC over every second pixel of a circular subset.
 
     xy : (n, 2) px on the reference; warps : (n, K, 6), u v ux uy vx vy at the point, NaN where not to be tried.
@@ -78,7 +77,7 @@ def search_hypotheses(
 
 
 def search_row(
-    image: NDArray, current: Current, xy: Array, row: Row, radius: int, *, least: float = -1.0, separation: float = 4.0
+    image: NDArray, current: Current, xy: Floats, row: Row, radius: int, *, least: float = -1.0, separation: float = 4.0
 ) -> Found:
     """The best warp of a row at each of n points xy (n, 2) px of an image, all pixels of which count.
 
@@ -90,10 +89,10 @@ def search_row(
 
 def _search(
     image: NDArray,
-    mask: NDArray[np.bool_],
+    mask: Mask,
     corner: tuple[int, ...],
     current: Current,
-    xy: Array,
+    xy: Floats,
     row: Row,
     radius: int,
     stride: int,

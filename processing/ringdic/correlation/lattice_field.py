@@ -14,12 +14,12 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ringdic.arrays import Floats
 
 ALL = 1.0 - 1e-9  # weight of the known corners from which on none of those that have a say is missing
 
 
-def between_corners(lattice: NDArray[Any], values: Array, spacing: float, xy: Array) -> tuple[Array, Array]:
+def between_corners(lattice: NDArray[Any], values: Floats, spacing: float, xy: Floats) -> tuple[Floats, Floats]:
     """Values at points xy (n, 2) px from those at a lattice, and the weight of the corners that were known.
 
     lattice : (m, 2) px, multiples of ``spacing``. values : (m, k) u v du/dx du/dy dv/dx dv/dy and any others that go

@@ -7,9 +7,8 @@ import math
 import numba as nb
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ringdic.arrays import Floats, Indices, Mask
 
 COUNT = 8
 _AROUND = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
@@ -20,7 +19,7 @@ _SCATTERS = 8.0
 _LEAST_ISLAND = 4
 
 
-def neighbours(xy: Array, step: float) -> NDArray[np.int64]:
+def neighbours(xy: Floats, step: float) -> Indices:
     """The up to eight nearest points within 1.6 steps of each point, nearest first, -1 where there is none. (n, 8)."""
     if len(xy) < 2:
         return np.full((len(xy), COUNT), -1, np.int64)
@@ -40,7 +39,7 @@ def neighbours(xy: Array, step: float) -> NDArray[np.int64]:
     return index[~own].reshape(len(xy), COUNT)
 
 
-def predicted(xy: Array, parameters: Array, source: NDArray[np.int64], target: NDArray[np.int64]) -> Array:
+def predicted(xy: Floats, parameters: Floats, source: Indices, target: Indices) -> Floats:
     """Parameters (k, 12) of target points extrapolated from source points with their derivatives."""
     out = parameters[source]
     d = xy[target] - xy[source]
@@ -54,13 +53,13 @@ def predicted(xy: Array, parameters: Array, source: NDArray[np.int64], target: N
 
 
 def inconsistent(
-    xy: Array,
-    parameters: Array,
-    good: NDArray[np.bool_],
-    near: NDArray[np.int64],
-    jump: Array,
-    stale: NDArray[np.bool_],
-) -> NDArray[np.bool_]:
+    xy: Floats,
+    parameters: Floats,
+    good: Mask,
+    near: Indices,
+    jump: Floats,
+    stale: Mask,
+) -> Mask:
     """Good points that contradict the median of what their good neighbours predict; if none does, small islands. (n,).
 
     The median of affine predictions is the robust local fit: half the neighbours may be wrong.
@@ -179,13 +178,13 @@ def _islands(xy, parameters, good, near, limit, least):  # type: ignore[no-untyp
 
 
 def local_fit(
-    xy: Array,
-    parameters: Array,
-    good: NDArray[np.bool_],
-    near: NDArray[np.int64],
-    wanted: NDArray[np.int64],
+    xy: Floats,
+    parameters: Floats,
+    good: Mask,
+    near: Indices,
+    wanted: Indices,
     count: int = 12,
-) -> Array:
+) -> Floats:
     """Parameters (k, 12) of wanted points from an affine least-squares fit of so many good points near them.
 
     near : (n, 8), neighbours; they lead from point to point. NaN where they lead to fewer than six good ones.

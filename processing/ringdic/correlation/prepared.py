@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Mask
 from ringdic.correlation.settings import CorrelationSettings
 from ringdic.correlation.spline import REACH, Box, coefficients, gradients
 from ringdic.errors import InputError
 
-Array = NDArray[np.float64]
 Levels = NDArray[np.floating]
 T = TypeVar("T")
 
@@ -32,7 +32,7 @@ class Reference:
 
     image: NDArray = field(repr=False)
     box: Box
-    mask: NDArray[np.bool_] = field(repr=False)
+    mask: Mask = field(repr=False)
     degree: int
     precision: type
     grey_range: float
@@ -44,7 +44,7 @@ class Reference:
         return self.image.shape[0], self.image.shape[1]
 
     @property
-    def origin(self) -> Array:
+    def origin(self) -> Floats:
         """(x, y) px of the box in the image."""
         return np.array(self.box[:2], dtype=np.float64)
 
@@ -94,7 +94,7 @@ class Current:
         return self.image.shape[0], self.image.shape[1]
 
     @property
-    def origin(self) -> Array:
+    def origin(self) -> Floats:
         """(x, y) px of the box in the image."""
         return np.array(self.box[:2], dtype=np.float64)
 
@@ -108,7 +108,7 @@ class Current:
         """The image turned about its diagonal: x and y exchanged."""
         return replace(self, image=_turned(self.image), box=_exchanged(self.box))
 
-    def around(self, positions: Array, margin: float) -> Current:
+    def around(self, positions: Floats, margin: float) -> Current:
         """The same with the box no larger than the positions (k, 2) px and a margin about them."""
         x0, y0, x1, y1 = self.box
         (left, right), (top, bottom) = (
@@ -122,7 +122,7 @@ class Current:
             return self
         return Current(self.image, box, self.degree, self.precision)
 
-    def about_all(self, at: Array, to: Array, xy: Array, radius: int) -> Current:
+    def about_all(self, at: Floats, to: Floats, xy: Floats, radius: int) -> Current:
         """The same with a box about where points xy (n, 2) px will lie, judged by some of which it is known.
 
         at, to : (k, 2) px. An affine fit of them moves and stretches all; the margin is three subset radii and 32 px.
@@ -133,7 +133,7 @@ class Current:
 
 
 def prepare_reference(
-    image: NDArray, mask: NDArray[np.bool_] | None = None, settings: CorrelationSettings | None = None
+    image: NDArray, mask: Mask | None = None, settings: CorrelationSettings | None = None
 ) -> Reference:
     """The reference image (h, w), 8 or 16 bits or float, and the box of its mask (h, w) bool.
 

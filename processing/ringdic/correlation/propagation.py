@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.correlation import kernels
 from ringdic.correlation.neighbours import COUNT, inconsistent, local_fit, neighbours, predicted
 from ringdic.correlation.prepared import Current, Reference
@@ -23,7 +24,6 @@ from ringdic.correlation.refinement import Subsets, refine, steep_along_rows, su
 from ringdic.correlation.settings import CorrelationSettings
 from ringdic.correlation.status import Status
 
-Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 _LEVELS = (0.9, 0.8, 0.6)  # reliability in steps, ZNCC; the last one is settings.zncc_min
@@ -50,24 +50,24 @@ class Field:
 
     reference: Reference
     current: Current
-    xy: Array
+    xy: Floats
     settings: CorrelationSettings
     progress: Progress | None = None
     region: Current | None = None
     filtering: float = 0.0
-    bare: NDArray[np.bool_] | None = None
+    bare: Mask | None = None
     alone: bool = False
-    near: NDArray[np.int64] = field(init=False)
-    parameters: Array = field(init=False)
-    status: NDArray[np.int64] = field(init=False)
-    zncc: Array = field(init=False)
-    iterations: NDArray[np.int64] = field(init=False)
-    sigma: Array = field(init=False)
-    tried: NDArray[np.bool_] = field(init=False)
-    fitted: NDArray[np.int64] = field(init=False)
-    drifting: NDArray[np.bool_] = field(init=False)
-    jump: Array = field(init=False)
-    stale: NDArray[np.bool_] = field(init=False)
+    near: Indices = field(init=False)
+    parameters: Floats = field(init=False)
+    status: Indices = field(init=False)
+    zncc: Floats = field(init=False)
+    iterations: Indices = field(init=False)
+    sigma: Floats = field(init=False)
+    tried: Mask = field(init=False)
+    fitted: Indices = field(init=False)
+    drifting: Mask = field(init=False)
+    jump: Floats = field(init=False)
+    stale: Mask = field(init=False)
     subsets: Subsets | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
@@ -88,18 +88,18 @@ class Field:
             self.subsets = subsets_of(self.reference, self.xy, self.settings)
 
     @property
-    def good(self) -> NDArray[np.bool_]:
+    def good(self) -> Mask:
         """Points matched so far. (n,) bool."""
         return self.status == Status.GOOD
 
     def attempt(
         self,
-        index: NDArray[np.int64],
-        start: Array,
+        index: Indices,
+        start: Floats,
         zncc_min: float | None = None,
         follow: bool = False,
         held: bool = False,
-    ) -> NDArray[np.bool_]:
+    ) -> Mask:
         """Refine points (k,) from start values (k, 12) and keep what is good; true where it was. (k,) bool.
 
         follow : a point beside one just matched starts from it, if it agrees with the start value. held : the second
@@ -137,10 +137,10 @@ class Field:
             self.progress(int(self.good.sum()), len(self.xy))
         return keep
 
-    def _kept(self, index: NDArray[np.int64]) -> tuple[Subsets, NDArray[np.int64]] | None:
+    def _kept(self, index: Indices) -> tuple[Subsets, Indices] | None:
         return None if self.subsets is None else (self.subsets, index)
 
-    def _patient(self, index: NDArray[np.int64]) -> CorrelationSettings:
+    def _patient(self, index: Indices) -> CorrelationSettings:
         """The settings for points (k,): where none has been matched from elsewhere before, fewer iterations will tell.
 
         Gauss-Newton from another start value converges in a few steps or, at the rim of what both images show, never.
@@ -149,12 +149,12 @@ class Field:
             return replace(self.settings, max_iterations=_PATIENCE)
         return self.settings
 
-    def _filter(self, part: Current, start: Array) -> None:
+    def _filter(self, part: Current, start: Floats) -> None:
         began = time.perf_counter()
         assert (part.turned if steep_along_rows(start) else part).coef.size  # computed when first asked for
         self.filtering += time.perf_counter() - began
 
-    def _reached(self, start: Array, index: NDArray[np.int64]) -> Current:
+    def _reached(self, start: Floats, index: Indices) -> Current:
         """The part of the current image where the points will lie, judged by the first start values (k, 12)."""
         known = np.isfinite(start).all(axis=1)
         if known.sum() < _FEWEST:
@@ -162,7 +162,7 @@ class Field:
         at = self.xy[index[known]]
         return self.current.about_all(at, at + start[known][:, [0, 6]], self.xy, self.settings.radius)
 
-    def adopt(self, index: NDArray[np.int64], other: Field) -> None:
+    def adopt(self, index: Indices, other: Field) -> None:
         """Take over the good points of another field, whose points are ``index`` (k,) here, where still open."""
         take = other.good & ~self.good[index]
         to = index[take]
@@ -189,7 +189,7 @@ class Field:
             ready = best >= level
             self._wave(index[ready], np.argmax(worth[ready], axis=1))
 
-    def _wave(self, index: NDArray[np.int64], slot: NDArray[np.int64]) -> None:
+    def _wave(self, index: Indices, slot: Indices) -> None:
         """Open points (k,) refined from one of their neighbours each (k,)."""
         self.tried[index, slot] = True
         start = predicted(self.xy, self.parameters, self.near[index, slot], index)
@@ -244,17 +244,17 @@ class Field:
             self.stale[bad] = True
         return True
 
-    def _open(self) -> NDArray[np.bool_]:
+    def _open(self) -> Mask:
         """Points not matched that another start value may help. (n,)."""
         return ~self.good & (self.status != Status.NO_TEXTURE) & ~self.drifting
 
-    def _good_neighbours(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _good_neighbours(self, index: Indices) -> Indices:
         """Which of the neighbours of points (k,) are good, as bits of a number. (k,)."""
         near = self.near[index]
         return np.asarray(((near >= 0) & self.good[near]) @ (1 << np.arange(COUNT)))
 
 
-def bare_points(reference: Reference, xy: Array, settings: CorrelationSettings) -> NDArray[np.bool_]:
+def bare_points(reference: Reference, xy: Floats, settings: CorrelationSettings) -> Mask:
     """Points (n,) with clearly too little texture about them, seen at once for all: no start value is sought there.
 
     The kernel judges the subset itself.
@@ -285,7 +285,7 @@ def _texture(reference: Reference, radius: int) -> tuple[NDArray[np.float32], in
     return (half_trace - np.sqrt(half * half + mean(gx * gy) ** 2)) / share, thin
 
 
-def _degenerate(parameters: Array) -> NDArray[np.bool_]:
+def _degenerate(parameters: Floats) -> Mask:
     """Warps (n, 12) that fold, or stretch an axis beyond what a view of a surface does: never a true match. (n,)."""
     a, b, c, d = 1.0 + parameters[:, 1], parameters[:, 2], parameters[:, 7], 1.0 + parameters[:, 8]
     half, det = 0.5 * (a * a + b * b + c * c + d * d), a * d - b * c

@@ -14,9 +14,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.correlation.warps import cholesky, solve
-
-Array = NDArray[np.float64]
 
 _LEAST = 10  # neighbours, itself included, that six coefficients are taken from
 _LEAST_SHARE = 0.3  # of the median sigma: no point weighs more than this lets it
@@ -32,14 +31,14 @@ class QuadraticFit:
     leave_out : (n, k), measured value minus the quadratic of the other points; NaN where not measured.
     """
 
-    value: Array
-    gradient: Array
-    curvature: Array
-    value_sigma: Array
-    curvature_sigma: Array
-    leave_out: Array
+    value: Floats
+    gradient: Floats
+    curvature: Floats
+    value_sigma: Floats
+    curvature_sigma: Floats
+    leave_out: Floats
 
-    def carried(self, index: NDArray[np.int64], offset: Array) -> Array:
+    def carried(self, index: Indices, offset: Floats) -> Floats:
         """The field (j, k) at offsets (j, 2) px from the points ``index`` (j,), by their quadratics."""
         dx, dy = offset[:, 0, None], offset[:, 1, None]
         (gx, gy), (xx, xy, yy) = np.moveaxis(self.gradient[index], -1, 0), np.moveaxis(self.curvature[index], -1, 0)
@@ -50,20 +49,20 @@ class QuadraticFit:
 class Neighbourhoods:
     """The neighbours within ``window`` of each of the points xy (n, 2), the point itself included."""
 
-    def __init__(self, xy: Array, window: float) -> None:
+    def __init__(self, xy: Floats, window: float) -> None:
         if not window > 0:
             raise ValueError(f"the window must be positive, not {window}")
         self.xy = np.ascontiguousarray(xy, dtype=np.float64)
         self.window = float(window)
         self._first, self._members = members_within(self.xy, self.xy, self.window)
 
-    def fit(self, values: Array, sigma: Array | None = None) -> QuadraticFit:
+    def fit(self, values: Floats, sigma: Floats | None = None) -> QuadraticFit:
         """Quadratics of a field.
 
         values : (n, k), a row with NaN is not measured. sigma : (n,) standard uncertainty, 1 if not given.
         """
         n, k = values.shape
-        known: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
+        known: Mask = np.asarray(np.isfinite(values).all(axis=1))
         weight = _weights(known, sigma)
         measured = np.ascontiguousarray(np.where(known[:, None], values, 0.0).T)
         c, scatter = np.full((n, k, 6), np.nan), np.full((n, 6), np.nan)
@@ -77,7 +76,7 @@ class Neighbourhoods:
         )
 
 
-def _weights(known: NDArray[np.bool_], sigma: Array | None) -> Array:
+def _weights(known: Mask, sigma: Floats | None) -> Floats:
     if sigma is None:
         return known.astype(np.float64)
     with np.errstate(invalid="ignore"):
@@ -89,7 +88,7 @@ def _weights(known: NDArray[np.bool_], sigma: Array | None) -> Array:
     return np.where(known, 1.0 / limited**2, 0.0)
 
 
-def members_within(centres: Array, xy: Array, window: float) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+def members_within(centres: Floats, xy: Floats, window: float) -> tuple[Indices, NDArray[np.int32]]:
     """Which of the points xy (m, 2) lie within ``window`` of each centre (n, 2).
 
     Their indices, one centre after the other (k,), and where those of each centre begin, (n + 1,).
@@ -104,7 +103,7 @@ def members_within(centres: Array, xy: Array, window: float) -> tuple[NDArray[np
     return _within(centres, xy, window, of_centre, columns, by_cell, starts)  # type: ignore[no-any-return]
 
 
-def _cells(xy: Array, side: float, columns: int) -> NDArray[np.int64]:
+def _cells(xy: Floats, side: float, columns: int) -> Indices:
     """The number (n,) of the square that holds each point, row by row."""
     column, row = np.floor(xy / side).astype(np.int64).T + 1
     return np.asarray(row * columns + column)
@@ -113,10 +112,10 @@ def _cells(xy: Array, side: float, columns: int) -> NDArray[np.int64]:
 class LowerQuartiles:
     """Lower quartiles, about each centre (n, 2), of what is known of the points xy (m, 2) within ``window``."""
 
-    def __init__(self, centres: Array, xy: Array, window: float) -> None:
+    def __init__(self, centres: Floats, xy: Floats, window: float) -> None:
         self._first, self._members = members_within(np.asarray(centres, float), np.asarray(xy, float), float(window))
 
-    def __call__(self, values: Array) -> Array:
+    def __call__(self, values: Floats) -> Floats:
         """Of values (m,). (n,), NaN where none is known."""
         out = np.full(len(self._first) - 1, np.nan)
         _quartiles(self._first, self._members, np.ascontiguousarray(values, dtype=np.float64), out)

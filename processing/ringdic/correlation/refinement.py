@@ -10,16 +10,15 @@ from __future__ import annotations
 from hashlib import sha256
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices
 from ringdic.correlation import kernels
 from ringdic.correlation.prepared import Current, Reference
 from ringdic.correlation.settings import CorrelationSettings
 from ringdic.correlation.status import Status
 
-Array = NDArray[np.float64]
 #: Status (n,), ZNCC (n,), iterations (n,), sigma (n, 2) px and parameters (n, 12) of points.
-Refined = tuple[NDArray[np.int64], Array, NDArray[np.int64], Array, Array]
+Refined = tuple[Indices, Floats, Indices, Floats, Floats]
 
 _WORTH_KEEPING = 500  # points
 _SETS = 2  # of points of one reference: a lattice and all
@@ -37,7 +36,7 @@ class Subsets:
         self.known = np.zeros(n, bool)
 
 
-def subsets_of(reference: Reference, xy: Array, settings: CorrelationSettings) -> Subsets | None:
+def subsets_of(reference: Reference, xy: Floats, settings: CorrelationSettings) -> Subsets | None:
     """What is known of the subsets about these points, kept with the reference for the next image; None for a few.
 
     The last sets of points that were asked for are kept.
@@ -62,11 +61,11 @@ def reference_bytes(reference: Reference, n: int, settings: CorrelationSettings)
 def refine(
     reference: Reference,
     current: Current,
-    xy: Array,
-    start: Array,
+    xy: Floats,
+    start: Floats,
     settings: CorrelationSettings,
     follow: bool = False,
-    kept: tuple[Subsets, NDArray[np.int64]] | None = None,
+    kept: tuple[Subsets, Indices] | None = None,
 ) -> Refined:
     """IC-GN of points xy (n, 2) from start values (n, 12), NaN rows left out.
 
@@ -81,7 +80,7 @@ def refine(
     return status, zncc, iterations, sigma[:, ::-1], parameters[:, _TURNED]
 
 
-def steep_along_rows(start: Array) -> bool:
+def steep_along_rows(start: Floats) -> bool:
     """Whether displacements (n, 12) change along rows of the image, and less than half as much along its columns."""
     some = start[:: max(1, len(start) // _SOME)]
     change = np.abs(some[:, [1, 2]]) + np.abs(some[:, [7, 8]])
@@ -95,11 +94,11 @@ def steep_along_rows(start: Array) -> bool:
 def _refine(
     reference: Reference,
     current: Current,
-    xy: Array,
-    start: Array,
+    xy: Floats,
+    start: Floats,
     settings: CorrelationSettings,
     follow: bool,
-    kept: tuple[Subsets, NDArray[np.int64]] | None,
+    kept: tuple[Subsets, Indices] | None,
 ) -> Refined:
     """The same along the rows of the images as they are."""
     n, xy, parameters = len(xy), np.ascontiguousarray(xy, dtype=np.float64), np.array(start, dtype=np.float64)
@@ -141,7 +140,7 @@ def _refine(
     return status, zncc, iterations, sigma, parameters
 
 
-def _tiles(xy: Array, settings: CorrelationSettings) -> NDArray[np.int64]:
+def _tiles(xy: Floats, settings: CorrelationSettings) -> Indices:
     """An order of points xy (n, 2) in which points that share pixels follow one another. (n,)."""
     side = max(8.0 * settings.step, 2.0 * settings.radius)
     column, row = np.floor(xy / side).T.astype(np.int64)

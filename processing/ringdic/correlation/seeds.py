@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices
 from ringdic.correlation.prepared import Current, Reference, as_8_bit
-
-Array = NDArray[np.float64]
 
 _SEEDS = 150
 _FLOW_SIDE = 700  # px of the longer side of the reduced region
@@ -21,7 +20,7 @@ _LEVELLED = 35  # px of the reduced image over which mean and contrast are level
 _SEARCH = 160  # px, largest displacement of the template search
 
 
-def spread(xy: Array, count: int = _SEEDS) -> NDArray[np.int64]:
+def spread(xy: Floats, count: int = _SEEDS) -> Indices:
     """Indices of about ``count`` points spread evenly over xy (n, 2): in each cell the one nearest its middle."""
     if len(xy) <= count:
         return np.arange(len(xy))
@@ -40,7 +39,7 @@ def spread(xy: Array, count: int = _SEEDS) -> NDArray[np.int64]:
     return np.sort(order[first])
 
 
-def flow_starts(reference: Reference, current: Current, xy: Array, radius: int) -> Array:
+def flow_starts(reference: Reference, current: Current, xy: Floats, radius: int) -> Floats:
     """Start values (n, 12) from dense inverse search flow (Kroeger et al. 2016) on a reduced region."""
     h, w = reference.mask.shape
     scale = _flow_scale(max(h, w))
@@ -73,7 +72,7 @@ def _flow_scale(side: int) -> float:
     return 1.0 / (round(times) if times > 1.5 else times)  # averages over whole pixels cost a tenth
 
 
-def search_starts(reference: Reference, current: Current, xy: Array, radius: int) -> Array:
+def search_starts(reference: Reference, current: Current, xy: Floats, radius: int) -> Floats:
     """Start values (n, 12) by normalised correlation of a template within ± 160 px; NaN where nothing resembles."""
     scale = 1.0 / max(1, min(4, radius // 8))
     ref, cur = _reduced(reference.image, scale), _reduced(current.image, scale)
@@ -104,12 +103,12 @@ def _reduced(image: NDArray, scale: float) -> NDArray[np.uint8]:
     return np.clip(128.0 + 40.0 * level / spread_of, 0, 255).astype(np.uint8)
 
 
-def _reduced_position(xy: Array, scale: float) -> Array:
+def _reduced_position(xy: Floats, scale: float) -> Floats:
     """Positions in the reduced image: area averaging keeps the corner of the corner pixel in place."""
     return (xy + 0.5) * scale - 0.5
 
 
-def _sample(flow: NDArray[np.float32], at: Array) -> Array:
+def _sample(flow: NDArray[np.float32], at: Floats) -> Floats:
     """Bilinear samples (n, 2) of a flow field at positions (n, 2), px of the field."""
     points = at.astype(np.float32)
     sampled = cv2.remap(flow, points[:, None, 0], points[:, None, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.correlation.filters import separable
 
-Array = NDArray[np.float64]
 Levels = NDArray[np.floating]
 Box = tuple[int, int, int, int]
 
@@ -26,7 +26,7 @@ REACH = max(_REACH.values()) + 2  # of any filter here
 PAD = 32  # coefficients outside the image: a position inside has its taps, a vector its lanes
 
 
-def prefilter_taps(degree: int, precision: str = "d") -> Array:
+def prefilter_taps(degree: int, precision: str = "d") -> Floats:
     """The inverse of the sampled B-spline, centred. (2 reach + 1,). precision : a float's character code, f or d."""
     reach = _REACH[precision, degree]
     samples = _SAMPLES[degree]
@@ -38,7 +38,7 @@ def prefilter_taps(degree: int, precision: str = "d") -> Array:
     return np.asarray(inverse[np.arange(-reach, reach + 1) % period])
 
 
-def gradient_taps(degree: int, precision: str = "d") -> Array:
+def gradient_taps(degree: int, precision: str = "d") -> Floats:
     """Derivative at the samples of the interpolating spline, as a correlation kernel. (odd,)."""
     return np.convolve(prefilter_taps(degree, precision), _SLOPES[degree])[::-1].copy()
 

@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Mask
 from ringdic.correlation import Correlation, CorrelationSettings, Current, Reference, correlate
 from ringdic.correlation.lattice_field import ALL, between_corners
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _FEWEST = 8  # matches of which an affine fit says where the others lie
 
@@ -21,7 +18,7 @@ def lattice_spacing(settings: CorrelationSettings, radii: float = 2.0) -> int:
     return settings.step * max(1, round(radii * settings.radius / settings.step))
 
 
-def on_lattice(xy: Array, spacing: int) -> Mask:
+def on_lattice(xy: Floats, spacing: int) -> Mask:
     """Points (n,) whose coordinates are multiples of ``spacing`` px."""
     return np.asarray((np.mod(xy, spacing) == 0).all(axis=1))
 
@@ -29,9 +26,9 @@ def on_lattice(xy: Array, spacing: int) -> Mask:
 def match_from_lattice(
     reference: Reference,
     current: Current,
-    xy: Array,
+    xy: Floats,
     settings: CorrelationSettings,
-    start: Array,
+    start: Floats,
     spacing: int,
 ) -> Correlation:
     """Matches of points xy (n, 2) px from start values (n, 6) of some of those ``spacing`` px apart, NaN elsewhere."""
@@ -51,7 +48,7 @@ def match_from_lattice(
     return found
 
 
-def between(coarse: Correlation, xy: Array, spacing: int, order: int) -> Array:
+def between(coarse: Correlation, xy: Floats, spacing: int, order: int) -> Floats:
     """Start values (n, 6), of second order (n, 12), of points xy (n, 2) px among matches on a lattice; NaN far from it.
 
     coarse : matches of m points whose coordinates are multiples of ``spacing`` px.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.io import savemat
 
+from ringdic.arrays import Floats
 from ringdic.errors import InputError
 from ringdic.export.arrays import arrays
 from ringdic.results.evaluation import Evaluated
@@ -19,7 +20,6 @@ from ringdic.strain.window import StrainWindow
 
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 _LARGEST = 2**31 - 2**20  # bytes of one variable of a level 5 file
 
 
@@ -142,7 +142,7 @@ def _floats_a_face() -> int:
     return sum(values.size for values in _named(Deformation(**found)).values())
 
 
-def _before(seen: Evaluated, step: int) -> Array:
+def _before(seen: Evaluated, step: int) -> Floats:
     return seen.results.before(step, seen.evaluation.previous)
 
 
@@ -158,7 +158,7 @@ def _camera_number(name: str, order: dict[str, int]) -> int:
     return int(name) if name.isascii() and name.isdigit() else order.get(name, 0)
 
 
-def column(values: Array) -> Array:
+def column(values: Floats) -> Floats:
     """Scalars as MATLAB has them, (n, 1)."""
     return np.asarray(values, dtype=float).reshape(-1, 1)
 

@@ -8,11 +8,10 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices
 from ringdic.results.colours import colours
 from ringdic.results.evaluation import Evaluated
 from ringdic.results.fields import Field, StepFields
-
-Array = NDArray[np.float64]
 
 _GLTF_FROM_WORLD = 1e-3 * np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 DEFAULT_COLOUR = "displacement"
@@ -47,7 +46,7 @@ def export_glb(seen: Evaluated, out: Path, colour: str = DEFAULT_COLOUR) -> None
         solid.export(out / f"{name}.glb", file_type="glb")
 
 
-def _solid(vertices: Array, faces: NDArray[np.int64], rgba: NDArray[np.uint8]) -> trimesh.Trimesh:
+def _solid(vertices: Floats, faces: Indices, rgba: NDArray[np.uint8]) -> trimesh.Trimesh:
     """A surface with colours; one without points has none."""
     return trimesh.Trimesh(vertices, faces, vertex_colors=rgba if len(rgba) else None, process=False)
 
@@ -69,7 +68,7 @@ class _Paint:
         rgb = colours(values, *self._limits, diverging=self._entry.centre is not None)
         return np.column_stack([np.rint(255 * rgb), np.full(len(rgb), 255.0)]).astype(np.uint8)
 
-    def _at_vertices(self, values: Array) -> Array:
+    def _at_vertices(self, values: Floats) -> Floats:
         known = np.isfinite(values)
         corners = self._faces[known].ravel()
         total = np.bincount(corners, np.repeat(values[known], 3), self._count)

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.results import vtkhdf
 from ringdic.results.evaluation import Evaluated
 from ringdic.results.fields import StepFields
@@ -39,10 +40,10 @@ def export_vtp(seen: Evaluated, out: Path) -> None:
     _write(out / "series.pvd", series)
 
 
-def _step(seen: Evaluated, step: int) -> tuple[NDArray[np.float64], Arrays, Arrays]:
+def _step(seen: Evaluated, step: int) -> tuple[Floats, Arrays, Arrays]:
     """Positions, all finite (a lost point stays at its reference), and the arrays of points and of faces."""
     current = seen.positions(step)
-    measured: NDArray[np.bool_] = np.asarray(np.isfinite(current).all(axis=1))
+    measured: Mask = np.asarray(np.isfinite(current).all(axis=1))
     flags: Arrays = {
         "measured": measured.astype(np.uint8),
         "status": seen.results.status[step].astype(np.int8),
@@ -64,7 +65,7 @@ def _arrays(seen: Evaluated, fields: StepFields, location: str) -> Arrays:
     return {name: np.asarray(values, dtype=np.float32) for name, values in (wide | scalars).items()}
 
 
-def _poly_data(positions: NDArray[np.float64], faces: NDArray[np.int64], point: Arrays, cell: Arrays) -> ET.Element:
+def _poly_data(positions: Floats, faces: Indices, point: Arrays, cell: Arrays) -> ET.Element:
     root = ET.Element("VTKFile", type="PolyData", version="1.0", byte_order="LittleEndian", header_type="UInt64")
     piece = ET.SubElement(
         ET.SubElement(root, "PolyData"), "Piece", NumberOfPoints=str(len(positions)), NumberOfPolys=str(len(faces))

@@ -9,11 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.geometry import lens
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -25,8 +23,8 @@ class Intrinsics:
     size : (width, height) of the image, px.
     """
 
-    K: Array
-    distortion: Array
+    K: Floats
+    distortion: Floats
     size: tuple[int, int]
 
     def __post_init__(self) -> None:
@@ -36,21 +34,21 @@ class Intrinsics:
             raise ValueError("focal lengths must be positive")
 
     @property
-    def K_undistorted(self) -> Array:
+    def K_undistorted(self) -> Floats:
         """K of undistorted pixels: the same without the skew. (3, 3), px."""
         K = self.K.copy()
         K[0, 1] = 0.0
         return K
 
-    def distort_normalised(self, xy: Array) -> Array:
+    def distort_normalised(self, xy: Floats) -> Floats:
         """Ideal normalised points (..., 2) to distorted normalised points."""
         return np.asarray(lens.distorted(_rows(xy), self.distortion)).reshape(np.shape(xy))
 
-    def _jacobian_normalised(self, xy: Array) -> Array:
+    def _jacobian_normalised(self, xy: Floats) -> Floats:
         """d(distorted)/d(ideal) of normalised points. (..., 2, 2)."""
         return np.asarray(lens.slopes(_rows(xy), self.distortion)).reshape(*np.shape(xy), 2)
 
-    def to_undistorted(self, px: Array) -> Array:
+    def to_undistorted(self, px: Floats) -> Floats:
         """Image pixels (..., 2) to undistorted pixels, by Newton's method to round-off; NaN where it diverges."""
         px = np.asarray(px, dtype=float)
         (fx, s, cx), (_, fy, cy) = self.K[0], self.K[1]
@@ -59,14 +57,14 @@ class Intrinsics:
         xy = np.asarray(lens.ideal(_rows(target), self.distortion)).reshape(px.shape)
         return xy * np.array([fx, fy]) + np.array([cx, cy])
 
-    def to_distorted(self, px: Array) -> Array:
+    def to_distorted(self, px: Floats) -> Floats:
         """Undistorted pixels (..., 2) to image pixels."""
         px = np.asarray(px, dtype=float)
         (fx, s, cx), (_, fy, cy) = self.K[0], self.K[1]
         xy_d = self.distort_normalised((px - np.array([cx, cy])) / np.array([fx, fy]))
         return np.stack([fx * xy_d[..., 0] + s * xy_d[..., 1] + cx, fy * xy_d[..., 1] + cy], axis=-1)
 
-    def slope(self, px: Array) -> Array:
+    def slope(self, px: Floats) -> Floats:
         """d(image pixel)/d(undistorted pixel) at undistorted pixels (..., 2). (..., 2, 2)."""
         K = np.ascontiguousarray(self.K)
         return np.asarray(lens.pixel_slopes(_rows(px), K, self.distortion)).reshape(*np.shape(px), 2)
@@ -82,27 +80,27 @@ class Camera:
     """
 
     id: str
-    P: Array
+    P: Floats
     size: tuple[int, int]
     intrinsics: Intrinsics | None = None
-    centre: Array = field(init=False)
+    centre: Floats = field(init=False)
 
     def __post_init__(self) -> None:
         P = np.asarray(self.P, dtype=float).reshape(3, 4)
         object.__setattr__(self, "P", P)
         object.__setattr__(self, "centre", -np.linalg.solve(P[:, :3], P[:, 3]))
 
-    def project_undistorted(self, xyz: Array) -> Array:
+    def project_undistorted(self, xyz: Floats) -> Floats:
         """World points (..., 3) mm to undistorted pixels (..., 2)."""
         h = np.asarray(xyz, dtype=float) @ self.P[:, :3].T + self.P[:, 3]
         return h[..., :2] / h[..., 2:]
 
-    def project(self, xyz: Array) -> Array:
+    def project(self, xyz: Floats) -> Floats:
         """World points (..., 3) mm to image pixels (..., 2)."""
         px = self.project_undistorted(xyz)
         return px if self.intrinsics is None else self.intrinsics.to_distorted(px)
 
-    def project_with_slope(self, xyz: Array) -> tuple[Array, Array]:
+    def project_with_slope(self, xyz: Floats) -> tuple[Floats, Floats]:
         """Image pixels (..., 2) of world points (..., 3) mm, and how they move with the points. (..., 2, 3), px/mm."""
         h = np.asarray(xyz, dtype=float) @ self.P[:, :3].T + self.P[:, 3]
         px = h[..., :2] / h[..., 2:]
@@ -111,11 +109,11 @@ class Camera:
             return px, slope
         return self.intrinsics.to_distorted(px), self.intrinsics.slope(px) @ slope
 
-    def undistort(self, px: Array) -> Array:
+    def undistort(self, px: Floats) -> Floats:
         """Image pixels (..., 2) to undistorted pixels."""
         return np.asarray(px, dtype=float) if self.intrinsics is None else self.intrinsics.to_undistorted(px)
 
-    def ray(self, px: Array) -> Array:
+    def ray(self, px: Floats) -> Floats:
         """Unit directions (..., 3) in the world of the lines of sight of image pixels (..., 2), outwards."""
         undistorted = self.undistort(px)
         h = np.concatenate([undistorted, np.ones((*undistorted.shape[:-1], 1))], axis=-1)
@@ -123,12 +121,12 @@ class Camera:
         d = np.linalg.solve(M, h.reshape(-1, 3).T).T.reshape(h.shape) * np.sign(np.linalg.det(M))
         return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
-    def incidence_cosine(self, xyz: Array, normals: Array) -> Array:
+    def incidence_cosine(self, xyz: Floats, normals: Floats) -> Floats:
         """Cosine of the angle between outward normals (..., 3) and the direction to the camera. (...)."""
         towards = self.centre - xyz
         return np.sum(towards * normals, axis=-1) / np.linalg.norm(towards, axis=-1)
 
 
-def _rows(xy: Array) -> Array:
+def _rows(xy: Floats) -> Floats:
     """Points (..., 2) as the loops take them, (n, 2)."""
     return np.ascontiguousarray(xy, dtype=float).reshape(-1, 2)

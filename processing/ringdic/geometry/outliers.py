@@ -7,10 +7,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.geometry import kernels
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _OPPOSITE = ((1, 0), (0, 1), (1, 1), (1, -1))
 _SIGMA_OF_MAD = 1.4826  # of a normal distribution
@@ -24,7 +22,7 @@ class Lost(IntEnum):
     UNCERTAIN = 18  # matched, but with too large a standard deviation in an image
 
 
-def crossing_outliers(residuals: Array, factor: float = 8.0, floor: float = 0.3) -> Mask:
+def crossing_outliers(residuals: Floats, factor: float = 8.0, floor: float = 0.3) -> Mask:
     """Points (n,) whose reprojection residuals (C, n, 2) px stand out.
 
     A common offset of a camera (it may have moved a little between frames) is no fault of the point: residuals are
@@ -36,7 +34,7 @@ def crossing_outliers(residuals: Array, factor: float = 8.0, floor: float = 0.3)
         return np.asarray((about > limit[:, None]).any(axis=(0, 2)))
 
 
-def midpoint_residuals(xy: Array, values: Array, step: int, doubt: Array | None = None) -> Array:
+def midpoint_residuals(xy: Floats, values: Floats, step: int, doubt: Floats | None = None) -> Floats:
     """How far values lie from the middle of opposite neighbours on the grid, (n,).
 
     xy : (n, 2) grid positions, multiples of ``step``. values : (n, k), NaN where lost. The prediction is the median
@@ -47,7 +45,7 @@ def midpoint_residuals(xy: Array, values: Array, step: int, doubt: Array | None 
     return _residuals(neighbours(xy, step), values, doubt)
 
 
-def neighbours(xy: Array, step: int) -> NDArray[np.int64]:
+def neighbours(xy: Floats, step: int) -> Indices:
     """The rows of up to four pairs of opposite neighbours on the grid, (n, 4, 2), -1 where there is none."""
     cells = np.round(xy / step).astype(int)
     cells -= cells.min(axis=0) - 1
@@ -57,16 +55,14 @@ def neighbours(xy: Array, step: int) -> NDArray[np.int64]:
     return np.ascontiguousarray(np.moveaxis(np.array(pairs), -1, 0))
 
 
-def _residuals(
-    pairs: NDArray[np.int64], values: Array, doubt: Array | None, rows: NDArray[np.intp] | None = None
-) -> Array:
+def _residuals(pairs: Indices, values: Floats, doubt: Floats | None, rows: NDArray[np.intp] | None = None) -> Floats:
     """The same of all points or of some rows (r,), by their neighbours."""
     doubt = np.zeros(len(values)) if doubt is None else doubt
     rows = np.arange(len(values)) if rows is None else rows
     return np.asarray(kernels.midpoint_residuals(pairs, np.ascontiguousarray(values, dtype=float), doubt, rows))
 
 
-def surface_outliers(pairs: NDArray[np.int64], values: Array, factor: float = 10.0, floor: float = 0.1) -> Mask:
+def surface_outliers(pairs: Indices, values: Floats, factor: float = 10.0, floor: float = 0.1) -> Mask:
     """Points (n,) whose values (n, 3) mm contradict their neighbours by more than ``floor`` mm and usual scatter.
 
     pairs : (n, 4, 2), of :func:`neighbours`.
@@ -82,12 +78,12 @@ def surface_outliers(pairs: NDArray[np.int64], values: Array, factor: float = 10
         return np.asarray(suspect)
 
 
-def _medians(values: Array) -> Array:
+def _medians(values: Floats) -> Floats:
     """Medians (C, 2) over the points of (C, n, 2), without NaN and without a warning where nothing is left."""
     return np.array([[_median(one[np.isfinite(one)]) for one in camera.T] for camera in values])
 
 
-def _median(values: Array) -> float:
+def _median(values: Floats) -> float:
     half = len(values) // 2
     if not half:
         return float(values[0]) if len(values) else np.nan

@@ -13,15 +13,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.geometry import kernels
 from ringdic.geometry.camera import Camera
 
-Array = NDArray[np.float64]
 
-
-def triangulate(cameras: Sequence[Camera], px: Array) -> Array:
+def triangulate(cameras: Sequence[Camera], px: Floats) -> Floats:
     """Points in space from their pixels in two or more images.
 
     Parameters
@@ -36,7 +34,7 @@ def triangulate(cameras: Sequence[Camera], px: Array) -> Array:
     return LinearSystem.of(cameras, px).solution
 
 
-def triangulate_undistorted(P: Array, px: Array) -> Array:
+def triangulate_undistorted(P: Floats, px: Floats) -> Floats:
     """The same from projection matrices (C, 3, 4) and undistorted pixels (C, n, 2). (n, 3) mm, NaN as above."""
     return LinearSystem(P, px).solution
 
@@ -45,15 +43,15 @@ def triangulate_undistorted(P: Array, px: Array) -> Array:
 class LinearSystem:
     """Eq. 7-9 of n points in C images: P (C, 3, 4) and undistorted pixels (C, n, 2), NaN for a camera without part."""
 
-    P: Array
-    undistorted: Array
+    P: Floats
+    undistorted: Floats
 
     def __post_init__(self) -> None:
         for name in ("P", "undistorted"):
             object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=float))
 
     @classmethod
-    def of(cls, cameras: Sequence[Camera], px: Array) -> LinearSystem:
+    def of(cls, cameras: Sequence[Camera], px: Floats) -> LinearSystem:
         """From image pixels (C, n, 2), NaN where a camera did not match the point."""
         px = np.asarray(px, dtype=float)
         if len(cameras) < 2 or px.shape[:1] != (len(cameras),) or px.ndim != 3 or px.shape[2] != 2:
@@ -64,19 +62,19 @@ class LinearSystem:
         return cls(np.stack([camera.P for camera in cameras]), undistorted)
 
     @cached_property
-    def _summed(self) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.bool_]]:
+    def _summed(self) -> tuple[Floats, Floats, Indices, Mask]:
         """``AᵀA`` (n, 3, 3), ``Aᵀb`` (n, 3), cameras a point (n,), and which ``AᵀA`` are well conditioned for sure."""
         n = self.undistorted.shape[1]
         normal, right, seen = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty(n, np.int64)
         return normal, right, seen, kernels.normal_equations(self.P, self.undistorted, normal, right, seen)
 
     @property
-    def normal(self) -> Array:
+    def normal(self) -> Floats:
         """``AᵀA``. (n, 3, 3)."""
         return self._summed[0]
 
     @cached_property
-    def solvable(self) -> NDArray[np.bool_]:
+    def solvable(self) -> Mask:
         """Points (n,) with two cameras whose lines of sight cross."""
         normal, _, seen, sure = self._summed
         solvable = sure.copy()
@@ -84,20 +82,20 @@ class LinearSystem:
         return np.asarray(solvable & (seen >= 2))
 
     @cached_property
-    def solution(self) -> Array:
+    def solution(self) -> Floats:
         """(n, 3) mm, NaN where it is not determined."""
         xyz = np.empty(self.normal.shape[:2])
         kernels.solve(self.normal, self._summed[1], self.solvable, xyz)
         return xyz
 
 
-def _well_conditioned(normal: Array) -> NDArray[np.bool_]:
+def _well_conditioned(normal: Floats) -> Mask:
     """Symmetric matrices (n, 3, 3) whose eigenvalues do not differ by more than a factor of 1e12. (n,)."""
     least, _, most = np.moveaxis(np.linalg.eigvalsh(normal), -1, 0)
     return np.asarray(least * 1e12 > most)
 
 
-def reprojection_residuals(cameras: Sequence[Camera], xyz: Array, px: Array) -> Array:
+def reprojection_residuals(cameras: Sequence[Camera], xyz: Floats, px: Floats) -> Floats:
     """Measured minus projected pixels.
 
     xyz : (n, 3) mm; px : (C, n, 2) image pixels. Returns (C, n, 2) px, NaN where either is.

@@ -11,12 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.geometry.camera import Camera
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 _STEPS = 8  # Gauss-Newton; two or three are enough unless a match is wrong
 _SETTLED = 1e-7  # mm
@@ -32,10 +29,10 @@ class WeightedPoints:
     views, 0 where lost.
     """
 
-    xyz: Array
-    covariance: Array
-    chi2: Array
-    degrees: NDArray[np.int64]
+    xyz: Floats
+    covariance: Floats
+    chi2: Floats
+    degrees: Indices
 
     def __post_init__(self) -> None:
         n = len(self.xyz)
@@ -43,7 +40,7 @@ class WeightedPoints:
             raise ValueError("weighted points need a place, a covariance and a chi-square each")
 
     @property
-    def sigma(self) -> Array:
+    def sigma(self) -> Floats:
         """Standard deviations of x, y and z. (n, 3) mm."""
         return np.sqrt(np.einsum("nii->ni", self.covariance))
 
@@ -53,12 +50,12 @@ class _View:
     """What one camera saw: which points (k,), their pixels (k, 2) and one over their standard deviations (k, 2)."""
 
     camera: Camera
-    index: Index
-    px: Array
-    weight: Array
+    index: Indices
+    px: Floats
+    weight: Floats
 
 
-def triangulate_weighted(cameras: Sequence[Camera], px: Array, sigma: Array) -> WeightedPoints:
+def triangulate_weighted(cameras: Sequence[Camera], px: Floats, sigma: Floats) -> WeightedPoints:
     """Points in space from their pixels in two or more images, each by its weight.
 
     Parameters
@@ -90,13 +87,13 @@ def triangulate_weighted(cameras: Sequence[Camera], px: Array, sigma: Array) -> 
     return WeightedPoints(xyz, covariance, chi2, np.where(lost, 0, 2 * count - 3))
 
 
-def _view(camera: Camera, px: Array, sigma: Array) -> _View:
+def _view(camera: Camera, px: Floats, sigma: Floats) -> _View:
     undistorted = np.isfinite(px).all(axis=1) & np.isfinite(sigma).all(axis=1)
     index = np.flatnonzero(undistorted)
     return _View(camera, index, px[index], 1.0 / sigma[index])
 
 
-def _linear(views: list[_View], n: int) -> tuple[Array, Array]:
+def _linear(views: list[_View], n: int) -> tuple[Floats, Floats]:
     """Solutions of the weighted equations of eq. 7-9 (n, 3) and their normal matrices (n, 3, 3)."""
     normal, right = np.zeros((n, 3, 3)), np.zeros((n, 3))
     for view in views:
@@ -111,7 +108,7 @@ def _linear(views: list[_View], n: int) -> tuple[Array, Array]:
     return (_inverse(normal) @ right[..., None])[..., 0], normal
 
 
-def _gauss_newton(views: list[_View], xyz: Array) -> tuple[Array, Array, Array]:
+def _gauss_newton(views: list[_View], xyz: Floats) -> tuple[Floats, Floats, Floats]:
     """Points (n, 3) moved to the least χ²; then their normal matrices (n, 3, 3) and χ² (n,)."""
     for _ in range(_STEPS):
         normal, right, chi2 = _normal_equations(views, xyz)
@@ -126,7 +123,7 @@ def _gauss_newton(views: list[_View], xyz: Array) -> tuple[Array, Array, Array]:
     return xyz, normal, np.maximum(chi2, 0.0)
 
 
-def _normal_equations(views: list[_View], xyz: Array) -> tuple[Array, Array, Array]:
+def _normal_equations(views: list[_View], xyz: Floats) -> tuple[Floats, Floats, Floats]:
     """JᵀWJ (n, 3, 3), JᵀW times the residuals (n, 3) and χ² (n,)."""
     n = len(xyz)
     normal, right, chi2 = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n)
@@ -140,19 +137,19 @@ def _normal_equations(views: list[_View], xyz: Array) -> tuple[Array, Array, Arr
     return normal, right, chi2
 
 
-def _determined(normal: Array) -> NDArray[np.bool_]:
+def _determined(normal: Floats) -> Mask:
     """Which points (n,) have lines of sight that cross."""
     trace = np.einsum("nii->n", normal)
     return np.asarray(27.0 * _determinant(normal) > _CROSSING * trace**3)
 
 
-def _determinant(N: Array) -> Array:
+def _determinant(N: Floats) -> Floats:
     """Of symmetric matrices (n, 3, 3)."""
     a, b, c, d, e, f = (N[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
     return np.asarray(a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d))
 
 
-def _inverse(N: Array) -> Array:
+def _inverse(N: Floats) -> Floats:
     """Inverses of positive definite matrices (n, 3, 3) by their adjugates; NaN where singular."""
     a, b, c, d, e, f = (N[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
     out = np.empty_like(N)

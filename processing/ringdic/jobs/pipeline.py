@@ -13,9 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ringdic.arrays import Floats
 from ringdic.calibration.quality import ReconstructionError
 from ringdic.calibration.rig import Ring, calibrate_ring, control_points
 from ringdic.correlation import CorrelationSettings
@@ -53,7 +51,7 @@ class Tracked:
     series: Series
     ring: Ring
     errors: dict[tuple[str, str], ReconstructionError]
-    drift: dict[str, NDArray[np.float64]]
+    drift: dict[str, Floats]
     agreement: dict[str, Any]
     warnings: tuple[str, ...]
 

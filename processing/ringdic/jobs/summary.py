@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.calibration.drift import drift_sentences
 from ringdic.calibration.quality import ReconstructionError
 from ringdic.calibration.rig import Ring
@@ -17,8 +17,6 @@ from ringdic.results.fields import available
 from ringdic.results.results import Results
 from ringdic.strain.deformation import Deformation
 from ringdic.strain.rigid_motion import RigidMotion
-
-Array = NDArray[np.float64]
 
 #: Why nothing is stated of what the calibration adds.
 ALONE = (
@@ -40,7 +38,7 @@ def summarise(
     steps: Sequence[StepFigures],
     ring: Ring,
     errors: dict[tuple[str, str], ReconstructionError],
-    drift: Mapping[str, Array],
+    drift: Mapping[str, Floats],
     agreement: Mapping[str, Any],
     warnings: tuple[str, ...],
 ) -> dict[str, Any]:
@@ -206,12 +204,12 @@ def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
     return rows
 
 
-def _median(values: Array) -> float | None:
+def _median(values: Floats) -> float | None:
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) else None
 
 
-def _rms(values: Array) -> float | None:
+def _rms(values: Floats) -> float | None:
     finite = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(finite**2))) if len(finite) else None
 
@@ -224,5 +222,5 @@ def _number(value: float) -> float | None:
     return round(value, 4) if np.isfinite(value) else None
 
 
-def _finite(values: Array) -> list[float | None]:
+def _finite(values: Floats) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]

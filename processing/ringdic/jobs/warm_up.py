@@ -6,8 +6,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.pairs.matching import StepMatches
 from ringdic.pairs.reconstruction import pair_shape
@@ -16,8 +16,6 @@ from ringdic.results.series import Shelf
 from ringdic.results.uncertainty import Stated
 from ringdic.results.writer import write_series
 from ringdic.settings import Settings
-
-Array = NDArray[np.float64]
 
 _SIDE = 16  # points along an edge of what a pair sees
 _PITCH = 10.0  # mm, and px
@@ -64,7 +62,7 @@ def _followed(cameras: tuple[Camera, Camera], left: float, shelf: Shelf) -> Foll
     return follow(shape, steps.__getitem__, _STEPS, shelf)
 
 
-def _matches(cameras: tuple[Camera, Camera], xyz: Array) -> StepMatches:
+def _matches(cameras: tuple[Camera, Camera], xyz: Floats) -> StepMatches:
     """What the cameras see of points (n, 3) mm."""
     n = len(xyz)
     px = np.stack([camera.project(xyz) for camera in cameras])

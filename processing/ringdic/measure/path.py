@@ -12,17 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from ringdic.arrays import Floats, Indices
 from ringdic.errors import ComputationError
 from ringdic.measure.place import Place
 from ringdic.mesh.geodesic import DETOUR, step_graph
 from ringdic.mesh.mesh import Mesh
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 #: Points on an edge in the searches, and how much longer than the shortest a way of the one before may be.
 _SEARCHES = ((3, DETOUR), (9, 1.03))
@@ -38,17 +35,17 @@ class SurfacePath:
 
     start: Place
     end: Place
-    edges: Ints
-    shares: Array
+    edges: Indices
+    shares: Floats
 
-    def line(self, vertices: Array, faces: Ints) -> Array:
+    def line(self, vertices: Floats, faces: Indices) -> Floats:
         """Its points (K + 2, 3) mm in the configuration ``vertices`` (N, 3); NaN where the material is lost."""
         a, b = vertices[self.edges[:, 0]], vertices[self.edges[:, 1]]
         shares = self.shares[:, None]
         crossings = np.where(shares == 0, a, np.where(shares == 1, b, a + shares * (b - a)))
         return np.vstack([self.start.at(vertices, faces), crossings, self.end.at(vertices, faces)])
 
-    def length(self, vertices: Array, faces: Ints) -> float:
+    def length(self, vertices: Floats, faces: Indices) -> float:
         """Its length in a configuration, mm; NaN if any of its material is lost."""
         return float(np.linalg.norm(np.diff(self.line(vertices, faces), axis=0), axis=1).sum())
 
@@ -76,7 +73,7 @@ def shortest_path(mesh: Mesh, start: Place, end: Place) -> SurfacePath:
     return _Strip(mesh, start, end, portals).tightened()
 
 
-def _search(mesh: Mesh, which: Ints, points: int, start: Place, end: Place) -> tuple[list[tuple[int, int]], Array]:
+def _search(mesh: Mesh, which: Indices, points: int, start: Place, end: Place) -> tuple[list[tuple[int, int]], Floats]:
     """Edges of the shortest way over ``points`` points set inside every edge of some triangles.
 
     Also how long the shortest such way over each vertex is, about, (N,) mm: over the nearest points beside it.
@@ -205,7 +202,7 @@ class _Strip:
                 share = _crossing(left[k], right[k], line[part - 1], line[part])
             self._shares.append(share if names[k][0] == a else 1.0 - share)
 
-    def _unfolded(self) -> tuple[Array, Array, list[tuple[int, int]], Array, Array]:
+    def _unfolded(self) -> tuple[Floats, Floats, list[tuple[int, int]], Floats, Floats]:
         """Left and right ends of the portals (K, 2) in a plane, their vertices, and the first and the last place."""
         V = self._mesh.vertices
         a, b = self._portals[0]
@@ -228,7 +225,7 @@ class _Strip:
         return left, right, ends, first, last
 
 
-def _beside(a: Array, b: Array, c: Array, at_a: Array, at_b: Array, side: float) -> Array:
+def _beside(a: Floats, b: Floats, c: Floats, at_a: Floats, at_b: Floats, side: float) -> Floats:
     """Where c, in space, lies in the plane in which a and b have been placed, on one side of the line from a to b."""
     along = (b - a) / np.linalg.norm(b - a)
     x = (c - a) @ along
@@ -237,10 +234,10 @@ def _beside(a: Array, b: Array, c: Array, at_a: Array, at_b: Array, side: float)
     return np.asarray(at_a + x * unit + side * y * np.array([-unit[1], unit[0]]))
 
 
-def _funnel(left: Array, right: Array, first: Array, last: Array) -> list[tuple[Array, int, int]]:
+def _funnel(left: Floats, right: Floats, first: Floats, last: Floats) -> list[tuple[Floats, int, int]]:
     """Corners of the shortest line from first to last through portals: point, number of the portal, side (0 left)."""
     ends = [*zip(left, right, strict=True), (last, last)]
-    corners: list[tuple[Array, int, int]] = []
+    corners: list[tuple[Floats, int, int]] = []
     apex, lo, hi = first, ends[0][0], ends[0][1]
     at_lo = at_hi = 0
     k = 1
@@ -270,12 +267,12 @@ def _funnel(left: Array, right: Array, first: Array, last: Array) -> list[tuple[
     return [corner for corner in corners if corner[1] < len(left)]
 
 
-def _turn(a: Array, b: Array, c: Array) -> float:
+def _turn(a: Floats, b: Floats, c: Floats) -> float:
     """Twice the signed area of a, b, c: above 0 if c lies to the left of the line from a to b."""
     return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
 
 
-def _crossing(left: Array, right: Array, a: Array, b: Array) -> float:
+def _crossing(left: Floats, right: Floats, a: Floats, b: Floats) -> float:
     """Share from left to right at which the line from a to b crosses a portal; where a is, if there is no line."""
     portal = right - left
     from_left, from_right = _turn(a, b, left), _turn(a, b, right)

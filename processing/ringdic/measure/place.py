@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from trimesh.triangles import closest_point, points_to_barycentric
 
+from ringdic.arrays import Floats, Indices
 from ringdic.errors import InputError
 from ringdic.mesh.mesh import Mesh
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -28,7 +26,7 @@ class Place:
         if abs(sum(self.weights) - 1.0) > 1e-9 or min(self.weights) < -1e-9:
             raise ValueError(f"weights {self.weights} are not those of a place in a triangle")
 
-    def at(self, values: Array, faces: NDArray[np.int64]) -> Array:
+    def at(self, values: Floats, faces: Indices) -> Floats:
         """Values of points (..., N, k) or (N,) interpolated here; NaN where a corner that has weight is NaN."""
         corners = faces[self.face]
         weights = np.array(self.weights)

@@ -7,15 +7,12 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Mask
 from ringdic.errors import InputError
 from ringdic.measure.table import Table
 from ringdic.mesh.mesh import Mesh
 from ringdic.results.evaluation import Evaluated
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 class Region(Protocol):
@@ -129,7 +126,7 @@ def region_statistics(seen: Evaluated, region: Region, fields: Sequence[str] = (
     return Table.of_rows(rows, {}, [note])
 
 
-def statistics(values: Array, weights: Array) -> dict[str, float | int]:
+def statistics(values: Floats, weights: Floats) -> dict[str, float | int]:
     """Weighted mean, standard deviation and RMS, plain percentiles, and how many are measured and lost."""
     known = np.isfinite(values)
     lost = int((~known).sum())
@@ -147,5 +144,5 @@ def statistics(values: Array, weights: Array) -> dict[str, float | int]:
     return {**dict(zip(names, map(float, found), strict=True)), "measured": len(v), "lost": lost}
 
 
-def _shares(mesh: Mesh, areas: Array) -> Array:
+def _shares(mesh: Mesh, areas: Floats) -> Floats:
     return np.asarray(np.bincount(mesh.faces.ravel(), np.repeat(areas / 3.0, 3), len(mesh.vertices)), dtype=float)

@@ -7,16 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.errors import InputError
 from ringdic.measure.table import Table
 from ringdic.mesh.mesh import Mesh
 from ringdic.results.evaluation import Evaluated
 from ringdic.results.fields import Field
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -54,13 +51,13 @@ class Crossings:
     along : (K,) mm, arc length from the line's begin to the middle of the crossing, in the reference.
     """
 
-    faces: Ints
-    edges: Ints
-    shares: Array
-    line: Ints
-    along: Array
+    faces: Indices
+    edges: Indices
+    shares: Floats
+    line: Indices
+    along: Floats
 
-    def at(self, values: Array) -> Array:
+    def at(self, values: Floats) -> Floats:
         """Values of points (N, ...) at the middle of each crossing, (K, ...)."""
         shares = self.shares.reshape(*self.shares.shape, *[1] * (values.ndim - 1))
         first, second = values[self.edges[..., 0]], values[self.edges[..., 1]]
@@ -123,13 +120,13 @@ def crossings(mesh: Mesh, cut: Cut) -> Crossings:
     return Crossings(which[order], edges, shares, line, total - 0.5 * steps - begin)
 
 
-def _points(mesh: Mesh, edges: Ints, shares: Array) -> Array:
+def _points(mesh: Mesh, edges: Indices, shares: Floats) -> Floats:
     """Where edges (K, 2, 2) are crossed: (K, 2, 3) mm."""
     a, b = mesh.vertices[edges[..., 0]], mesh.vertices[edges[..., 1]]
     return np.asarray(a + shares[..., None] * (b - a))
 
 
-def _chained(edges: Ints, vertices: int) -> tuple[Ints, NDArray[np.bool_], Ints]:
+def _chained(edges: Indices, vertices: int) -> tuple[Indices, Mask, Indices]:
     """Segments between edges (K, 2, 2) in order along their lines.
 
     Returns the order (K,), which of the ordered segments run backwards (K,), and the number of the line of each (K,),

@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.errors import InputError
 from ringdic.measure.table import Table
 from ringdic.results.results import Results
 from ringdic.strain.deformation import Deformation
 from ringdic.strain.window import Gauge, StrainWindow, strain_window
-
-Array = NDArray[np.float64]
 
 _RADIUS_PX = 20  # of a subset, where the results do not tell
 
@@ -74,6 +72,6 @@ def _figures(found: Deformation) -> dict[str, float]:
     return {**figures, **spread, "measured": int(known.sum())}
 
 
-def _percentile(values: Array, q: float) -> float:
+def _percentile(values: Floats, q: float) -> float:
     finite = values[np.isfinite(values)]
     return float(np.percentile(finite, q)) if len(finite) else float("nan")

@@ -8,12 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices
 from ringdic.mesh.mesh import Mesh
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 #: A path of :func:`step_graph` may be this much longer than the shortest one.
 DETOUR = 1.1
@@ -57,12 +54,12 @@ def reach(mesh: Mesh, distance: float) -> scipy.sparse.csr_matrix:
     return scipy.sparse.csr_matrix((found.data, (order[found.row], found.col)), (count, count))
 
 
-def _edges(mesh: Mesh) -> tuple[Ints, Ints, Array]:
+def _edges(mesh: Mesh) -> tuple[Indices, Indices, Floats]:
     edges, _ = mesh.edges()
     return edges[:, 0], edges[:, 1], np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=1)
 
 
-def _crossings(mesh: Mesh) -> tuple[Ints, Ints, Array]:
+def _crossings(mesh: Mesh) -> tuple[Indices, Indices, Floats]:
     """Opposite corners of two triangles at one edge, if the straight line in the unfolded plane crosses that edge."""
     directed = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     opposite = mesh.faces[:, [2, 0, 1]].reshape(-1)
@@ -82,15 +79,15 @@ def _crossings(mesh: Mesh) -> tuple[Ints, Ints, Array]:
     return np.minimum(i, j), np.maximum(i, j), np.hypot(qx - px, py + qy)[direct]
 
 
-def _dot(a: Array, b: Array) -> Array:
+def _dot(a: Floats, b: Floats) -> Floats:
     return np.einsum("ij,ij->i", a, b)
 
 
-def _height(a: Array, unit: Array) -> Array:
+def _height(a: Floats, unit: Floats) -> Floats:
     return np.linalg.norm(a - _dot(a, unit)[:, None] * unit, axis=1)
 
 
-def _along_cells(points: Array, block: int) -> Ints:
+def _along_cells(points: Floats, block: int) -> Indices:
     """An order of points (n, 3) in which ``block`` that follow one another lie together: cells of a bisection."""
     order = np.arange(len(points))
     pending, done = [order], []
@@ -106,7 +103,7 @@ def _along_cells(points: Array, block: int) -> Ints:
     return np.concatenate(done) if done else order
 
 
-def _near(tree: scipy.spatial.cKDTree, index: Ints, points: Array, distance: float) -> Ints:
+def _near(tree: scipy.spatial.cKDTree, index: Indices, points: Floats, distance: float) -> Indices:
     """Sorted vertices in the ball round all of ``points`` that is ``distance`` larger than they need."""
     middle = points.mean(axis=0)
     radius = float(np.linalg.norm(points - middle, axis=1).max()) + distance

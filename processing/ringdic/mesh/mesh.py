@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from ringdic.arrays import Floats, Indices, Mask
 
 
 @dataclass(frozen=True)
@@ -18,7 +16,7 @@ class Mesh:
     vertices : (N, 3) mm, NaN where a point is lost. faces : (M, 3) vertex indices.
     """
 
-    vertices: Array
+    vertices: Floats
     faces: Indices
 
     def __post_init__(self) -> None:
@@ -28,7 +26,7 @@ class Mesh:
             raise ValueError(f"faces name vertices beyond the {len(self.vertices)} of the mesh")
 
     @property
-    def area_vectors(self) -> Array:
+    def area_vectors(self) -> Floats:
         """Normals with the length of the areas, (M, 3) mm²."""
         from ringdic.mesh.kernels import area_vectors  # compiled, and loaded only where it is asked for
 
@@ -37,24 +35,24 @@ class Mesh:
         return vectors
 
     @property
-    def areas(self) -> Array:
+    def areas(self) -> Floats:
         """Areas of the triangles, (M,) mm²."""
         return np.linalg.norm(self.area_vectors, axis=1)
 
     @property
-    def normals(self) -> Array:
+    def normals(self) -> Floats:
         """Unit normals of the triangles, (M, 3); NaN for a triangle without area."""
         vectors = self.area_vectors
         length = np.linalg.norm(vectors, axis=1, keepdims=True)
         return vectors / np.where(length > 0, length, np.nan)
 
     @property
-    def centroids(self) -> Array:
+    def centroids(self) -> Floats:
         """Centroids of the triangles, (M, 3) mm."""
         return self.vertices[self.faces].mean(axis=1)
 
     @property
-    def vertex_normals(self) -> Array:
+    def vertex_normals(self) -> Floats:
         """Unit normals of the vertices, weighted by area, (N, 3); NaN for a vertex without a whole triangle."""
         from ringdic.mesh.kernels import corner_sums
 
@@ -81,7 +79,7 @@ class Mesh:
         half = half_edges(self.faces)
         return half.min(axis=1) * len(self.vertices) + half.max(axis=1)
 
-    def whole_faces(self) -> NDArray[np.bool_]:
+    def whole_faces(self) -> Mask:
         """Which triangles have three measured corners and an area. (M,)."""
         return np.isfinite(self.vertices[self.faces]).all(axis=(1, 2)) & (np.nan_to_num(self.areas) > 0)
 
@@ -96,13 +94,13 @@ class Mesh:
         renumber[used] = np.arange(len(used))
         return Mesh(self.vertices[used], renumber[self.faces]), used
 
-    def flipped(self, which: NDArray[np.bool_]) -> Mesh:
+    def flipped(self, which: Mask) -> Mesh:
         """The mesh with the orientation of some triangles (M,) turned over."""
         faces = self.faces.copy()
         faces[which] = faces[which][:, ::-1]
         return Mesh(self.vertices, faces)
 
-    def facing(self, viewpoints: Array) -> Mesh:
+    def facing(self, viewpoints: Floats) -> Mesh:
         """The mesh with every triangle turned towards the cameras that saw it.
 
         viewpoints : (3,) or (M, 3) mm, a point in front of each triangle, such as the mean of its cameras' centres.

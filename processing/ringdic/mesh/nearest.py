@@ -6,10 +6,8 @@ from typing import NamedTuple
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from ringdic.arrays import Floats, Indices
 
 _MOST = 4  # cubes a point: a few far points do not make many empty cubes
 
@@ -22,15 +20,15 @@ class Cubes(NamedTuple):
     order : (n,) numbers of the points. at : (n, 3) mm, the points in that order.
     """
 
-    low: Array
+    low: Floats
     size: float
     shape: Indices
     start: Indices
     order: Indices
-    at: Array
+    at: Floats
 
 
-def cubes(points: Array, size: float) -> Cubes:
+def cubes(points: Floats, size: float) -> Cubes:
     """Points (n, 3) mm, finite, in cubes with edges of ``size`` mm, or larger ones where these would be too many."""
     low = points.min(axis=0, initial=np.inf) if len(points) else np.zeros(3)
     extent = (points.max(axis=0, initial=-np.inf) if len(points) else low) - low

@@ -6,13 +6,10 @@ from dataclasses import dataclass
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices
 from ringdic.mesh.mesh import Mesh
 from ringdic.mesh.nearest import cubes, near
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 _CANDIDATES = 8  # nearest triangles that are tried: the one that is hit has its middle among the nearest
 _NARROW = 2.5  # usual radii of triangles: about as far off as the eighth centroid
@@ -29,8 +26,8 @@ class Hits:
 
     point: Indices
     face: Indices
-    weights: Array
-    height: Array
+    weights: Floats
+    height: Floats
 
 
 class Projector:
@@ -54,7 +51,7 @@ class Projector:
         self._low = at.min(axis=0, initial=np.inf) - reach
         self._high = at.max(axis=0, initial=-np.inf) + reach
 
-    def hits(self, points: Array, directions: Array) -> Hits:
+    def hits(self, points: Floats, directions: Floats) -> Hits:
         """Where lines through points (n, 3) mm along unit directions (n, 3), outwards, pass the surface."""
         if not len(self._corners):
             return Hits(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
@@ -161,7 +158,7 @@ def _line_hit(point, dx, dy, dz, corner):  # type: ignore[no-untyped-def]
     return u, v, (gx * bx + gy * by + gz * bz) / determinant
 
 
-def line_hits(points: Array, directions: Array, corners: Array) -> tuple[Array, Array]:
+def line_hits(points: Floats, directions: Floats, corners: Floats) -> tuple[Floats, Floats]:
     """Where lines through points along unit directions (n, 3) pass the planes of triangles (n, 3, 3) mm.
 
     Returns the weights of the corners (n, 3), all positive inside the triangle, and the place along the line (n,) mm;

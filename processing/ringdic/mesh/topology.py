@@ -11,14 +11,11 @@ from enum import Enum
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.mesh.adjacency import fan_numbers, piece_numbers, twins, vertices_of_several_fans
 from ringdic.mesh.mesh import Mesh, half_edges
 from ringdic.mesh.projection import line_hits
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 #: Where a triangle is looked at for a second layer: its middle and the middles of its corner parts.
 _SAMPLES = np.array([[1 / 3, 1 / 3, 1 / 3], [2 / 3, 1 / 6, 1 / 6], [1 / 6, 2 / 3, 1 / 6], [1 / 6, 1 / 6, 2 / 3]])
@@ -76,7 +73,7 @@ def fans(mesh: Mesh) -> Indices:
     return np.asarray(fan_numbers(half_edges(mesh.faces)))
 
 
-def without_pinches(mesh: Mesh) -> NDArray[np.bool_]:
+def without_pinches(mesh: Mesh) -> Mask:
     """Triangles (M,) left when at every vertex only the fan of the largest area stays."""
     kept = np.ones(len(mesh.faces), bool)
     while True:
@@ -148,7 +145,7 @@ def is_closed_tube(mesh: Mesh, largest_hole: float = 0.0) -> bool:
     return sorted(kind.value for kind in kinds) == ["end", "end"]
 
 
-def doubly_covered(mesh: Mesh, reach: float) -> Array:
+def doubly_covered(mesh: Mesh, reach: float) -> Floats:
     """Share of each triangle that has another layer of the surface above or below it, (M,), in quarters.
 
     reach : mm, how far off along the normal a layer may lie to count; one of opposite orientation is another side of
@@ -188,13 +185,13 @@ def overlap_area(mesh: Mesh, reach: float) -> float:
     return float(0.5 * (doubly_covered(mesh, reach) * mesh.areas).sum())
 
 
-def _enclosed(points: Array) -> float:
+def _enclosed(points: Floats) -> float:
     """Length of the vector area that a closed line of points (n, 3) encloses."""
     about = points - points.mean(axis=0)
     return float(np.linalg.norm(0.5 * np.cross(about, np.roll(about, -1, axis=0)).sum(axis=0)))
 
 
-def _corner_angles(mesh: Mesh) -> Array:
+def _corner_angles(mesh: Mesh) -> Floats:
     """Angles of the triangles at their corners, (M, 3) rad."""
     corners = mesh.vertices[mesh.faces]
     ahead, behind = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners

@@ -5,21 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.weighted_triangulation import WeightedPoints, triangulate_weighted
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _LIMIT = 25.0  # χ² a degree of freedom, in units of the usual one
 _ROUNDS = 2
 
 
 def triangulate_agreeing(
-    cameras: Sequence[Camera], px: Array, sigma: Array, given: Ints | None = None
+    cameras: Sequence[Camera], px: Floats, sigma: Floats, given: Indices | None = None
 ) -> tuple[WeightedPoints, Mask]:
     """Points (n) from px, sigma (C, n, 2), up to two views dropped where a point's χ² is far beyond the usual.
 
@@ -54,7 +50,7 @@ def _contradicted(points: WeightedPoints, usual: float) -> Mask:
     return np.asarray((points.degrees > 0) & (np.nan_to_num(points.chi2) > _LIMIT * usual * points.degrees))
 
 
-def _worst(cameras: Sequence[Camera], xyz: Array, px: Array, sigma: Array, given: Ints | None) -> Ints:
+def _worst(cameras: Sequence[Camera], xyz: Floats, px: Floats, sigma: Floats, given: Indices | None) -> Indices:
     """Index (n,) of the view that fits worst."""
     residual = np.stack([camera.project(xyz) for camera in cameras]) - px
     each = np.nansum((residual / sigma) ** 2, axis=2)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.geometry.camera import Camera
 from ringdic.multiview.motion import Motion
 from ringdic.multiview.shape import ReferenceShape
@@ -21,8 +21,6 @@ from ringdic.uncertainty.position import (
 )
 from ringdic.uncertainty.strain import corners_alike, stretch_sigma
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Certainty:
@@ -31,9 +29,9 @@ class Certainty:
     position : (F, n, 3) mm. displacement : (F, n, 3) mm, zero at the reference. stretches : (F, M, 2) of λ1 and λ2.
     """
 
-    position: Array
-    displacement: Array
-    stretches: Array
+    position: Floats
+    displacement: Floats
+    stretches: Floats
 
 
 def certainty(cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, radius: float, order: int) -> Certainty:
@@ -66,7 +64,7 @@ def certainty(cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, 
     return Certainty(position, displacement, stretches)
 
 
-def _of_step(count: int, motion: Motion, step: int) -> tuple[Array, Array]:
+def _of_step(count: int, motion: Motion, step: int) -> tuple[Floats, Floats]:
     """Standard deviations (C, n, 2) of the pixels that the positions rest on: the weights, and by noise alone."""
     n = motion.status.shape[1]
     sigma, noise = np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan)
@@ -77,5 +75,5 @@ def _of_step(count: int, motion: Motion, step: int) -> tuple[Array, Array]:
     return sigma, noise
 
 
-def _sigma(covariances: Array) -> Array:
+def _sigma(covariances: Floats) -> Floats:
     return np.sqrt(np.einsum("nii->ni", covariances))

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.multiview.lattice import TURN, Lattice, Pieces, robust_pieces
-
-Array = NDArray[np.float64]
 
 _SMOOTHING = 12.0  # mm, reach of the pieces that join the samples of the sweeps
 _MARGIN = 3  # rows beyond the samples
@@ -28,7 +26,7 @@ def px_per_mm(cameras: Sequence[Camera], radius: float) -> float:
     return float(np.median(scales))
 
 
-def lay_lattice(samples: Array, spacing: float) -> Lattice:
+def lay_lattice(samples: Floats, spacing: float) -> Lattice:
     """A lattice over points of the surface (n, 3) mm, its nodes ``spacing`` mm apart on the middling radius."""
     radius = float(np.median(np.hypot(samples[:, 0], samples[:, 1])))
     columns = max(8, round(TURN * radius / spacing))
@@ -38,7 +36,7 @@ def lay_lattice(samples: Array, spacing: float) -> Lattice:
     return Lattice(radius, columns, (first + np.arange(count)) * spacing)
 
 
-def rough_surface(lattice: Lattice, samples: Array) -> Pieces:
+def rough_surface(lattice: Lattice, samples: Floats) -> Pieces:
     """Smooth pieces through samples (n, 3) mm of the surface that are scattered over the lattice and may be wrong.
 
     Raises ComputationError where they do not make a surface.
@@ -54,7 +52,7 @@ def rough_surface(lattice: Lattice, samples: Array) -> Pieces:
     return pieces
 
 
-def _density(known: NDArray[np.bool_]) -> float:
+def _density(known: Mask) -> float:
     """Share of known nodes where there are any about."""
     blocks = [
         known[i : i + 8, j : j + 8].mean() for i in range(0, known.shape[0], 8) for j in range(0, known.shape[1], 8)
@@ -63,7 +61,7 @@ def _density(known: NDArray[np.bool_]) -> float:
     return float(np.median(occupied)) if occupied else 0.0
 
 
-def _medians(shape: tuple[int, int], column: NDArray[np.int64], row: NDArray[np.int64], values: Array) -> Array:
+def _medians(shape: tuple[int, int], column: Indices, row: Indices, values: Floats) -> Floats:
     """Median of the values (n,) that fall on each node, NaN where none does."""
     out = np.full(shape, np.nan)
     node = column * shape[1] + row

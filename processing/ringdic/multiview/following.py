@@ -18,6 +18,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.correlation import (
     Correlation,
     CorrelationSettings,
@@ -31,8 +32,6 @@ from ringdic.correlation import (
 from ringdic.correlation.quadratic import QuadraticFit
 from ringdic.correlation.seeds import flow_starts
 from ringdic.multiview.places import Places, robust
-
-Array = NDArray[np.float64]
 
 _LOOSE = 5e-3  # px, tolerance of the first of two passes
 _PATIENCE = 10  # iterations of the first of two passes
@@ -54,14 +53,14 @@ class Followed:
     c_ls : (n,). rest : (n,), mean square difference of the two subsets, grey levels². status : (n,), see ``Status``.
     """
 
-    warp: Array
-    sigma: Array
-    c_ls: Array
-    rest: Array
-    status: NDArray[np.int64]
+    warp: Floats
+    sigma: Floats
+    c_ls: Floats
+    rest: Floats
+    status: Indices
 
     @property
-    def good(self) -> NDArray[np.bool_]:
+    def good(self) -> Mask:
         """Matched points. (n,) bool."""
         return self.status == Status.GOOD
 
@@ -74,7 +73,7 @@ def follow(
     reference: Reference,
     current: Current,
     points: Places,
-    start: Array | None,
+    start: Floats | None,
     settings: CorrelationSettings,
     *,
     two_pass: bool = True,
@@ -99,7 +98,7 @@ def follow(
     return _judged(_unbiased(first, second, points), points)
 
 
-def shifted(warp: Array, shift: Array) -> Array:
+def shifted(warp: Floats, shift: Floats) -> Floats:
     """Warps (n, 12) at points moved by shift (n, 2) px: displacement and gradient by their Taylor series."""
     out = warp.copy()
     dx, dy = shift[:, 0], shift[:, 1]
@@ -127,7 +126,7 @@ def _at_knots(
     reference: Reference,
     current: tuple[Current, Current],
     points: Places,
-    start: Array | None,
+    start: Floats | None,
     settings: CorrelationSettings,
     search: bool,
 ) -> Correlation:
@@ -154,7 +153,7 @@ def _at_knots(
     return placed(found, lost, refine_alone(reference, part, xy[lost], settings, again))
 
 
-def placed(found: Correlation, index: NDArray[np.int64], other: Correlation) -> Correlation:
+def placed(found: Correlation, index: Indices, other: Correlation) -> Correlation:
     """``found`` with the points ``index`` (k,) as in ``other`` where that found them."""
     good = other.good
     changed = {}
@@ -167,7 +166,7 @@ def placed(found: Correlation, index: NDArray[np.int64], other: Correlation) -> 
     return Correlation(**changed)
 
 
-def _about(positions: Array, radius: int, part: Current, whole: Current) -> Current:
+def _about(positions: Floats, radius: int, part: Current, whole: Current) -> Current:
     """The part of the current image about positions (n, 2) px, NaN where unknown: the one at hand if it holds them."""
     known = positions[np.isfinite(positions).all(axis=1)]
     if not len(known):
@@ -185,13 +184,13 @@ def _about(positions: Array, radius: int, part: Current, whole: Current) -> Curr
 def _matched(
     reference: Reference,
     current: Current,
-    pixel: Array,
-    start: Array | None,
+    pixel: Floats,
+    start: Floats | None,
     settings: CorrelationSettings,
     search: bool,
 ) -> Correlation:
     """From the start values, or from the images where too few of them hold."""
-    known: NDArray[np.bool_] = np.zeros(len(pixel), bool)
+    known: Mask = np.zeros(len(pixel), bool)
     if start is not None:
         known = np.asarray(np.isfinite(start).all(axis=1))
     if start is None or not known.any():
@@ -203,21 +202,21 @@ def _matched(
     return searched if searched.good.sum() > found.good.sum() else found
 
 
-def _warp(found: Correlation) -> Array:
+def _warp(found: Correlation) -> Floats:
     n = len(found.xy)
     return np.concatenate([found.uv, found.gradient.reshape(n, 4), found.curvature.reshape(n, 6)], axis=1)
 
 
-def _smooth(first: Correlation, points: Places) -> Array:
+def _smooth(first: Correlation, points: Places) -> Floats:
     """Warps (m, 12) of the knots by the quadratics of their neighbours' displacement; NaN where these are too few."""
     return _warp_of(robust(points.around, first.uv, np.hypot(*first.sigma.T)))
 
 
-def _warp_of(fit: QuadraticFit) -> Array:
+def _warp_of(fit: QuadraticFit) -> Floats:
     return np.concatenate([fit.value, fit.gradient.reshape(-1, 4), fit.curvature.reshape(-1, 6)], axis=1)
 
 
-def _foretold(first: Correlation, points: Places, radius: int) -> Array:
+def _foretold(first: Correlation, points: Places, radius: int) -> Floats:
     """Warps (n, 12) of the points as the knots' matches foretell them, with the second derivatives to hold."""
     fit = robust(points.around, first.uv, np.hypot(*first.sigma.T))
     warp = _warp_of(fit)
@@ -229,7 +228,7 @@ def _foretold(first: Correlation, points: Places, radius: int) -> Array:
     return out
 
 
-def _held(fit: QuadraticFit, first: Correlation, points: Places, radius: int) -> Array:
+def _held(fit: QuadraticFit, first: Correlation, points: Places, radius: int) -> Floats:
     """Second derivatives (n, 6) to hold: at the rim, where a knot's own are too uncertain, those of the nearest knot.
 
     A wrong second derivative δ moves a round first-order subset of radius r by δ r²/8, the mean of δ x²/2 over it.
@@ -259,14 +258,14 @@ def _unbiased(first: Correlation, second: Correlation, points: Places) -> Correl
     known = np.isfinite(fit.value).all(axis=1) & np.isfinite(s).all(axis=1)
     knot = points.nearest(known, points.around.window)
     bias = fit.carried(knot, points.pixel - points.around.xy[knot])
-    there: NDArray[np.bool_] = np.asarray((knot >= 0) & second.good)
+    there: Mask = np.asarray((knot >= 0) & second.good)
     uv = np.where(there[:, None], second.uv - share[knot] * bias, second.uv)
     doubt = share[knot] * np.hypot(s[knot], _LEFT * bias)
     sigma = np.where(there[:, None], np.hypot(second.sigma, doubt), second.sigma)
     return replace(second, uv=uv, sigma=sigma)
 
 
-def _clear(values: Array, sigma: Array, limit: float) -> Array:
+def _clear(values: Floats, sigma: Floats, limit: float) -> Floats:
     """How much (n, 1) of vectors (n, k) stands clear of their uncertainty: 1 - limit / Σ(v/σ)², or nothing.
 
     The estimator of James & Stein (1961), its positive part: noise alone gives 0, so it costs nothing.
@@ -276,12 +275,12 @@ def _clear(values: Array, sigma: Array, limit: float) -> Array:
         return np.nan_to_num(np.maximum(0.0, 1.0 - limit / squares))
 
 
-def _rest(found: Correlation, points: Places) -> Array:
+def _rest(found: Correlation, points: Places) -> Floats:
     """C_LS times the variance of the reference's subset, and no less than rounding to whole grey levels makes. (n,)."""
     return np.where(found.good, np.maximum(found.c_ls * points.variance, points.least), np.nan)
 
 
-def _nowhere(points: Places, status: NDArray[np.int64]) -> Followed:
+def _nowhere(points: Places, status: Indices) -> Followed:
     """None of the points found, for the reasons (n,) given."""
     n = len(points.at)
     lost = np.full(n, np.nan)

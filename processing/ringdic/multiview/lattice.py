@@ -12,10 +12,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from ringdic.arrays import Floats, Indices, Mask
 
 TURN = 2.0 * math.pi
 #: Powers of a and b of the coefficients, the second degree first.
@@ -33,7 +31,7 @@ class Lattice:
 
     radius: float
     columns: int
-    z: Array
+    z: Floats
 
     def __post_init__(self) -> None:
         if not (self.radius > 0 and self.columns >= 8 and len(self.z) >= 2):
@@ -45,7 +43,7 @@ class Lattice:
         return self.columns, len(self.z)
 
     @property
-    def theta(self) -> Array:
+    def theta(self) -> Floats:
         """Angles of the columns. (columns,) rad, from 0."""
         return np.asarray(np.arange(self.columns) * (TURN / self.columns))
 
@@ -55,19 +53,19 @@ class Lattice:
         return TURN * self.radius / self.columns, float(self.z[1] - self.z[0])
 
     @property
-    def places(self) -> tuple[Array, Array]:
+    def places(self) -> tuple[Floats, Floats]:
         """θ rad and z mm of all nodes, (columns, rows) each."""
         theta, z = np.meshgrid(self.theta, self.z, indexing="ij")
         return theta, z
 
-    def nearest(self, theta: Array, z: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Mask]:
+    def nearest(self, theta: Floats, z: Floats) -> tuple[Indices, Indices, Mask]:
         """Column and row of the node nearest to θ, z (n,), and whether the lattice reaches there."""
         column = np.rint(np.nan_to_num(theta) / (TURN / self.columns)).astype(np.int64) % self.columns
         row = np.rint((np.nan_to_num(z, nan=-1e9) - self.z[0]) / self.spacing[1]).astype(np.int64)
         inside = (row >= 0) & (row < len(self.z)) & np.isfinite(theta)
         return column, np.clip(row, 0, len(self.z) - 1), inside
 
-    def arc(self, theta: Array, theta_0: Array) -> Array:
+    def arc(self, theta: Floats, theta_0: Floats) -> Floats:
         """R (θ - θ₀) the short way round, mm."""
         return self.radius * ((theta - theta_0 + math.pi) % TURN - math.pi)
 
@@ -81,16 +79,16 @@ class Pieces:
     """
 
     lattice: Lattice
-    coefficients: Array
-    support: Array
+    coefficients: Floats
+    support: Floats
 
     @property
-    def radius(self) -> Array:
+    def radius(self) -> Floats:
         """Fitted radius of the nodes. (columns, rows) mm."""
         return self.coefficients[..., 0]
 
     @property
-    def normals(self) -> Array:
+    def normals(self) -> Floats:
         """Outward unit normals (columns, rows, 3)."""
         theta, _ = self.lattice.places
         radius, along, up = np.moveaxis(self.coefficients[..., :3], -1, 0)
@@ -100,14 +98,14 @@ class Pieces:
         return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
 
     @property
-    def xyz(self) -> Array:
+    def xyz(self) -> Floats:
         """Fitted positions of the nodes. (columns, rows, 3) mm."""
         theta, z = self.lattice.places
         return np.stack([self.radius * np.cos(theta), self.radius * np.sin(theta), z + 0 * self.radius], axis=-1)
 
 
 def fit_pieces(
-    lattice: Lattice, radius: Array, reach: float, degree: int = 3, *, least: float = 0.2, density: float = 1.0
+    lattice: Lattice, radius: Floats, reach: float, degree: int = 3, *, least: float = 0.2, density: float = 1.0
 ) -> Pieces:
     """Fit a piece about every node that has enough known nodes within reach.
 
@@ -120,7 +118,7 @@ def fit_pieces(
     level = float(np.mean(radius[known])) if known.any() else 0.0
     a, b, weight = _window(lattice, reach)
     values = np.where(known, radius - level, 0.0)
-    sums: dict[tuple[int, int], Array] = {}
+    sums: dict[tuple[int, int], Floats] = {}
     for power in {(p + r, q + s) for p, q in POWERS for r, s in POWERS}:
         sums[power] = _correlate(known.astype(float), weight * a ** power[0] * b ** power[1])
     right = np.stack([_correlate(values, weight * a**p * b**q) for p, q in POWERS], axis=-1)
@@ -147,7 +145,7 @@ def fit_pieces(
 
 def robust_pieces(
     lattice: Lattice,
-    radius: Array,
+    radius: Floats,
     reach: float,
     degree: int = 3,
     *,
@@ -179,7 +177,7 @@ def robust_pieces(
     return pieces, kept
 
 
-def evaluate(coefficients: Array, a: Array, b: Array) -> tuple[Array, Array, Array]:
+def evaluate(coefficients: Floats, a: Floats, b: Floats) -> tuple[Floats, Floats, Floats]:
     """Radius (...) of pieces (..., 10) at a, b (...) mm from their nodes, and its derivatives by a and b."""
     c = np.moveaxis(coefficients, -1, 0)
     value = (
@@ -192,7 +190,7 @@ def evaluate(coefficients: Array, a: Array, b: Array) -> tuple[Array, Array, Arr
     return value, by_a, by_b
 
 
-def _window(lattice: Lattice, reach: float) -> tuple[Array, Array, Array]:
+def _window(lattice: Lattice, reach: float) -> tuple[Floats, Floats, Floats]:
     """a, b and weights of the nodes within reach; a and b in units of the reach."""
     along, up = lattice.spacing
     half = (max(2, math.ceil(reach / along)), max(2, math.ceil(reach / up)))
@@ -205,7 +203,7 @@ def _window(lattice: Lattice, reach: float) -> tuple[Array, Array, Array]:
     return a, b, np.maximum(1.0 - (a * a + b * b), 0.0)
 
 
-def _correlate(values: Array, kernel: Array) -> Array:
+def _correlate(values: Floats, kernel: Floats) -> Floats:
     """Σ kernel · values about each node (columns, rows): round the ring, and nothing beyond the rows."""
     over, up = kernel.shape[0] // 2, kernel.shape[1] // 2
     padded = np.pad(np.pad(values, ((over, over), (0, 0)), mode="wrap"), ((0, 0), (up, up)))

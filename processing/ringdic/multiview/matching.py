@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Image, Indices, Mask
 from ringdic.correlation import (
     Correlation,
     CorrelationSettings,
@@ -27,11 +28,6 @@ from ringdic.multiview.warps import surface_stencil, warps_to
 from ringdic.uncertainty.matches import match_parts
 from ringdic.uncertainty.noise import flat_noise
 from ringdic.uncertainty.texture import Texture, TextureMap, texture_map
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 _KEPT = 16  # filtered images held at a time, the surface's part of each
 _MARGIN = 48.0  # px that are filtered about the subsets
@@ -72,7 +68,7 @@ class Ring:
         self._filtered.move_to_end(k)
         return self._filtered[k]
 
-    def look_at(self, k: int, px: Array) -> None:
+    def look_at(self, k: int, px: Floats) -> None:
         """Camera k is searched about px (n, 2) from now on."""
         box = self._boxes.get(k)
         edge = np.array(self.cameras[k].size)
@@ -84,7 +80,7 @@ class Ring:
         self._boxes[k] = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
         self._filtered.pop(k, None)
 
-    def texture(self, k: int, px: Array) -> Texture:
+    def texture(self, k: int, px: Floats) -> Texture:
         """What the image of camera k shows about px (n, 2)."""
         if k not in self._textures:
             self._textures[k] = texture_map(self.grey(k), self.settings.radius)
@@ -98,7 +94,7 @@ class Ring:
             self._noise[k] = flat_noise(grey[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4])
         return self._noise[k]
 
-    def reference(self, k: int, px: Array) -> Reference:
+    def reference(self, k: int, px: Floats) -> Reference:
         """The image of camera k about px (n, 2), filtered to be searched for."""
         grey = self.grey(k)
         mask = np.zeros(grey.shape, bool)
@@ -119,11 +115,11 @@ class NodeMatches:
     fewer than two views, 0 where it has.
     """
 
-    px: Array
-    sigma: Array
-    noise: Array
-    systematic: Array
-    c_ls: Array
+    px: Floats
+    sigma: Floats
+    noise: Floats
+    systematic: Floats
+    c_ls: Floats
     status: NDArray[np.int8]
     made: int = 0
     seconds: float = 0.0
@@ -132,8 +128,8 @@ class NodeMatches:
 def match_nodes(
     ring: Ring,
     pieces: Pieces,
-    nodes: tuple[Ints, Ints],
-    reference: Ints,
+    nodes: tuple[Indices, Indices],
+    reference: Indices,
     partners: Mask,
     *,
     order: int,
@@ -189,11 +185,11 @@ def match_nodes(
 class _Parts:
     """Variances (C, n, 2) px² by noise and by what is none, and the number (n,) of matches of each node."""
 
-    noise: Array
-    systematic: Array
-    matches: Array
+    noise: Floats
+    systematic: Floats
+    matches: Floats
 
-    def add(self, ring: Ring, cameras: tuple[int, int], found: Correlation, nodes: Ints) -> None:
+    def add(self, ring: Ring, cameras: tuple[int, int], found: Correlation, nodes: Indices) -> None:
         """Add the matches found from the first camera to the second. The first has the mean of its nodes' matches.
 
         Half of what is no noise is laid to either image.

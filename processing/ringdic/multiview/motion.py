@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.correlation import CorrelationSettings, Status
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.outliers import Lost, neighbours, surface_outliers
@@ -21,10 +22,7 @@ from ringdic.uncertainty.matches import match_parts
 from ringdic.uncertainty.noise import camera_noise
 from ringdic.uncertainty.texture import Texture
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-Placed = Callable[[int, Array, Array], Sequence[Camera]]
+Placed = Callable[[int, Floats, Floats], Sequence[Camera]]
 
 log = logging.getLogger(__name__)
 
@@ -43,13 +41,13 @@ class CameraTrack:
     """
 
     camera: int
-    vertex: Ints
-    px: Array
-    sigma: Array
-    noise: Array
-    weight: Array
+    vertex: Indices
+    px: Floats
+    sigma: Floats
+    noise: Floats
+    weight: Floats
     grey_noise: float
-    c_ls: Array
+    c_ls: Floats
     status: NDArray[np.int8]
     used: Mask
 
@@ -63,14 +61,14 @@ class Motion:
     tracks : of the cameras. drift : (F, C) px, mean vertical residual of a camera: it moved between the steps.
     """
 
-    xyz: Array
-    covariance: Array
-    chi2: Array
-    degrees: Ints
-    c_ls: Array
+    xyz: Floats
+    covariance: Floats
+    chi2: Floats
+    degrees: Indices
+    c_ls: Floats
     status: NDArray[np.int8]
     tracks: tuple[CameraTrack, ...]
-    drift: Array
+    drift: Floats
 
 
 def measure_motion(
@@ -112,7 +110,7 @@ def measure_motion(
 
 
 def camera_track(
-    camera: int, x0: Array, vertex: Ints, shape: ReferenceShape, found: Track, step: int, sigma_max: float
+    camera: int, x0: Floats, vertex: Indices, shape: ReferenceShape, found: Track, step: int, sigma_max: float
 ) -> CameraTrack:
     """One camera's track with what its pixels are uncertain by.
 
@@ -130,7 +128,7 @@ def camera_track(
     return CameraTrack(camera, vertex, found.px, sigma, noise, weight, variance, found.c_ls, status, used)
 
 
-def _parted(found: Track, texture: Texture, variance: float) -> tuple[Array, Array]:
+def _parted(found: Track, texture: Texture, variance: float) -> tuple[Floats, Floats]:
     """Standard deviations (F, k, 2) px of the displacements by noise alone, and by all."""
     noise, total = np.zeros_like(found.sigma), np.zeros_like(found.sigma)
     for step in range(1, len(found.px)):

@@ -13,13 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.correlation import CorrelationSettings, Reference
 from ringdic.correlation.quadratic import LowerQuartiles, Neighbourhoods, QuadraticFit
 from ringdic.correlation.seeds import spread
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _APART = 0.8  # subset radii, side of the squares with a knot each
 _REACH = 3.0  # subset radii about a knot in which its neighbours tell its curvature and its bias
@@ -39,27 +36,27 @@ class Places:
     neighbourhoods, quartile : of the knots about each point.
     """
 
-    at: Array
-    pixel: Array
-    variance: Array
+    at: Floats
+    pixel: Floats
+    variance: Floats
     least: float
-    seeds: Ints
-    knots: Ints
-    knot: Ints
+    seeds: Indices
+    knots: Indices
+    knot: Indices
     around: Neighbourhoods
     quartile: LowerQuartiles
 
     @property
-    def shift(self) -> Array:
+    def shift(self) -> Floats:
         """From the points to their whole pixels. (n, 2) px."""
         return self.pixel - self.at
 
     @property
-    def beside(self) -> Array:
+    def beside(self) -> Floats:
         """From the knot of each point to the point, whole pixels. (n, 2)."""
         return self.pixel - self.around.xy[self.knot]
 
-    def nearest(self, known: Mask, reach: float = np.inf) -> Ints:
+    def nearest(self, known: Mask, reach: float = np.inf) -> Indices:
         """The nearest of the known knots (m,) of every point, (n,), -1 where none lies within reach, px."""
         if not known.any():
             return np.full(len(self.at), -1)
@@ -71,11 +68,11 @@ class Places:
             out[lost] = np.where(np.isfinite(distance), which[np.minimum(index, len(which) - 1)], -1)
         return out
 
-    def quadratics(self, values: Array, sigma: Array) -> QuadraticFit:
+    def quadratics(self, values: Floats, sigma: Floats) -> QuadraticFit:
         """Quadratics of a field about the knots, those that contradict it left out. values (n, 2), sigma (n,)."""
         return robust(self.around, values[self.knots], sigma[self.knots])
 
-    def contradict(self, values: Array, sigma: Array) -> Mask:
+    def contradict(self, values: Floats, sigma: Floats) -> Mask:
         """Points (n,) whose values (n, 2) lie far off the quadratic of their neighbours; NaN does not."""
         fit = self.quadratics(values, sigma)
         knot = self.nearest(np.asarray(np.isfinite(fit.value).all(axis=1)), self.around.window)
@@ -86,7 +83,7 @@ class Places:
         with np.errstate(invalid="ignore"):
             return np.asarray(off > _limit(off))
 
-    def most_unlike(self, rest: Array) -> Array:
+    def most_unlike(self, rest: Floats) -> Floats:
         """The largest mean square difference (n,) of a good match, from those of all, (n,); NaN where none is known.
 
         A point whose subsets differ by far more than those about it is partly covered, or worn; beside what covers it
@@ -100,7 +97,7 @@ class Places:
 
 
 def places(
-    reference: Reference, at: Array, settings: CorrelationSettings, window: float | None = None, *, thin: bool = True
+    reference: Reference, at: Floats, settings: CorrelationSettings, window: float | None = None, *, thin: bool = True
 ) -> Places:
     """Of points ``at`` (n, 2) px of a reference image. window : px, by default 3 subset radii.
 
@@ -116,7 +113,7 @@ def places(
     return Places(at, pixel, variance, least, spread(at), knots, np.asarray(knot, np.int64), around, quartile)
 
 
-def thinned(xy: Array, side: float) -> Ints:
+def thinned(xy: Floats, side: float) -> Indices:
     """Of points (n, 2), in every square of this side the one nearest its middle. (m,) indices, rising."""
     place = (xy - xy.min(axis=0)) / side
     cell = np.floor(place).astype(np.int64)
@@ -125,7 +122,7 @@ def thinned(xy: Array, side: float) -> Ints:
     return np.sort(order[np.flatnonzero(np.diff(label[order], prepend=-1))])
 
 
-def robust(around: Neighbourhoods, values: Array, sigma: Array) -> QuadraticFit:
+def robust(around: Neighbourhoods, values: Floats, sigma: Floats) -> QuadraticFit:
     """Quadratics of a field (m, 2), points far off their neighbours' left out."""
     kept = values
     fit = around.fit(values, sigma)
@@ -140,21 +137,21 @@ def robust(around: Neighbourhoods, values: Array, sigma: Array) -> QuadraticFit:
     return replace(fit, leave_out=np.where(np.isfinite(kept), fit.leave_out, values - fit.value))
 
 
-def _limit(off: Array) -> float:
+def _limit(off: Floats) -> float:
     """The distance from a quadratic beyond which a point contradicts it, from the distances of all, px."""
     known = np.isfinite(off)
     scatter = 1.4826 * float(np.median(off[known])) if known.any() else 0.0
     return max(_LEAST_OFF, _SCATTERS * scatter)
 
 
-def _variance(reference: Reference, xy: Array, radius: int) -> Array:
+def _variance(reference: Reference, xy: Floats, radius: int) -> Floats:
     """Variance (n,) of the grey levels in the squares about points xy (n, 2), what the mask cuts left out."""
     size = (2 * radius + 1,) * 2
     inside = reference.mask.astype(np.float32)
     level = (reference.grey - np.float32(reference.grey.mean())).astype(np.float32) * inside
     column, row = np.rint(xy - reference.origin).astype(np.int64).T
 
-    def total(values: NDArray[np.float32]) -> Array:
+    def total(values: NDArray[np.float32]) -> Floats:
         summed = cv2.boxFilter(values, cv2.CV_32F, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
         return np.asarray(summed[row, column], dtype=np.float64)
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.correlation import CorrelationSettings, Status
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
@@ -31,10 +32,6 @@ from ringdic.multiview.views import seen
 from ringdic.multiview.weights import smooth_sigma
 from ringdic.sweep.sweep import Search, radii_of, sweep
 from ringdic.uncertainty.texture import Texture, TextureMap
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 
@@ -81,19 +78,19 @@ class ReferenceShape:
     NOT_REACHED also where there is no surface. made, seconds : matches and the time they took.
     """
 
-    xyz: Array
-    node: Ints
-    reference: Ints
-    px: Array
-    sigma: Array
-    noise: Array
+    xyz: Floats
+    node: Indices
+    reference: Indices
+    px: Floats
+    sigma: Floats
+    noise: Floats
     textures: tuple[Texture, ...]
-    grey_noise: Array
-    covariance: Array
-    chi2: Array
-    degrees: Ints
-    c_ls: Array
-    faces: Ints
+    grey_noise: Floats
+    covariance: Floats
+    chi2: Floats
+    degrees: Indices
+    c_ls: Floats
+    faces: Indices
     pieces: Pieces
     status: NDArray[np.int8]
     made: int
@@ -159,12 +156,12 @@ def reference_shape(
     return surface.result()
 
 
-def _spacing(cameras: Sequence[Camera], samples: Array, correlation: CorrelationSettings) -> float:
+def _spacing(cameras: Sequence[Camera], samples: Floats, correlation: CorrelationSettings) -> float:
     radius = float(np.median(np.hypot(samples[:, 0], samples[:, 1])))
     return correlation.step / px_per_mm(cameras, radius)
 
 
-def _samples(ring: Ring, pairs: Sequence[tuple[int, int]], search: Search, progress: Callable[[float], None]) -> Array:
+def _samples(ring: Ring, pairs: Sequence[tuple[int, int]], search: Search, progress: Callable[[float], None]) -> Floats:
     """Places (n, 3) mm where the sweeps of the pairs found the surface."""
     found = []
     for k, (a, b) in enumerate(pairs):
@@ -268,7 +265,7 @@ class _Surface:
         self.xyz[off] = np.nan
         return int(off.sum())
 
-    def _node_radius(self) -> Array:
+    def _node_radius(self) -> Floats:
         """Radius at the nodes from points measured near them: what is left to the piece is the same at both."""
         lattice, coefficients = self.pieces.lattice, self.pieces.coefficients
         theta, z = lattice.places
@@ -276,7 +273,7 @@ class _Surface:
         there, _, _ = evaluate(coefficients, lattice.arc(np.arctan2(y, x), theta), height - z)
         return np.hypot(x, y) - there + coefficients[..., 0]
 
-    def _keep(self, nodes: tuple[Ints, Ints], reference: Ints, found: NodeMatches) -> None:
+    def _keep(self, nodes: tuple[Indices, Indices], reference: Indices, found: NodeMatches) -> None:
         settings, cameras = self.settings, self.ring.cameras
         sigma = np.sqrt(found.noise**2 + found.systematic**2 + settings.floor**2)
         with np.errstate(invalid="ignore"):
@@ -338,6 +335,6 @@ def _some(shape: tuple[int, int]) -> Mask:
     return out
 
 
-def _indices(which: Mask) -> tuple[Ints, Ints]:
+def _indices(which: Mask) -> tuple[Indices, Indices]:
     columns, rows = np.nonzero(which)
     return columns, rows

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Image, Indices, Mask
 from ringdic.calibration.moving_cameras import SteadiedCameras
 from ringdic.correlation import CorrelationSettings, Status
 from ringdic.errors import ComputationError
@@ -28,10 +28,6 @@ from ringdic.results.results import Matches, Results
 from ringdic.settings import Settings
 from ringdic.sweep.sweep import Search
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-Image = NDArray[np.uint8] | NDArray[np.uint16]
 Tell = Callable[[float, str, str], None]
 
 _SHAPE_SHARE = 0.5  # of the time, with few steps
@@ -47,7 +43,7 @@ class RingSurface:
     """
 
     results: Results
-    drift: dict[str, Array]
+    drift: dict[str, Floats]
     agreement: dict[str, Any]
     warnings: list[str]
 
@@ -121,7 +117,7 @@ def surface_of_tracks(
     return _found(rig, cameras, pairs, steps, shape, motion, steadied, settings)
 
 
-def reference_places(camera: Camera, shape: ReferenceShape, k: int) -> tuple[Ints, Array]:
+def reference_places(camera: Camera, shape: ReferenceShape, k: int) -> tuple[Indices, Floats]:
     """The points (n,) that camera k saw at the reference, and the pixels (n, 2) from which it follows them."""
     vertex = np.flatnonzero(np.isfinite(shape.px[k, :, 0]))
     return vertex, camera.project(shape.xyz[vertex])
@@ -167,7 +163,7 @@ def _found(
     )
 
 
-def _drift(cameras: Sequence[Camera], residuals: Array, motion: Motion) -> dict[str, Array]:
+def _drift(cameras: Sequence[Camera], residuals: Floats, motion: Motion) -> dict[str, Floats]:
     """Mean vertical residuals (F,) px of each camera that took part.
 
     At the reference they are between the cameras; the points are followed from where the reference puts them, so what
@@ -181,7 +177,7 @@ def _drift(cameras: Sequence[Camera], residuals: Array, motion: Motion) -> dict[
     return found
 
 
-def _agreement(shape: ReferenceShape, residuals: Array) -> dict[str, Any]:
+def _agreement(shape: ReferenceShape, residuals: Floats) -> dict[str, Any]:
     reasons = {int(reason): reason.name.lower() for kind in (Status, Lost) for reason in kind}
     lost, count = np.unique(shape.status, return_counts=True)
     matched = residuals.copy()
@@ -257,7 +253,7 @@ def _results(
 
 def _facing_pairs(
     cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]], shape: ReferenceShape
-) -> tuple[tuple[tuple[str, str], ...], Ints]:
+) -> tuple[tuple[tuple[str, str], ...], Indices]:
     """The pairs and, for each point (n,), which of them are the two cameras used that face it most squarely.
 
     Two cameras that are no pair of the rig are added to the list, in the order of the ring.

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ringdic.arrays import Floats, Image, Indices, Mask
 from ringdic.correlation import (
     CorrelationSettings,
     Current,
@@ -28,10 +29,6 @@ from ringdic.correlation import (
 from ringdic.errors import InputError
 from ringdic.multiview.following import Followed, follow
 from ringdic.multiview.places import Places, places
-
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8] | NDArray[np.uint16]
-Mask = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 
@@ -74,9 +71,9 @@ class Track:
     status : (F, n), see ``Status``. updated : (F, n) bool, found by way of another image than the reference.
     """
 
-    px: Array
-    sigma: Array
-    c_ls: Array
+    px: Floats
+    sigma: Floats
+    c_ls: Floats
     status: NDArray[np.int8]
     updated: Mask
 
@@ -100,13 +97,13 @@ class TrackState:
     moved : () bool, whether any was found in any image.
     """
 
-    warp: Array
-    before: Array
-    sigma: Array
-    c_ls: Array
-    last: NDArray[np.int64]
-    by_way: NDArray[np.int64]
-    moved: NDArray[np.bool_]
+    warp: Floats
+    before: Floats
+    sigma: Floats
+    c_ls: Floats
+    last: Indices
+    by_way: Indices
+    moved: Mask
 
     @classmethod
     def at_rest(cls, k: int) -> TrackState:
@@ -125,7 +122,7 @@ def track(
     reference_image: Image,
     image_of_step: Callable[[int], Image | None],
     steps: int,
-    x0: Array,
+    x0: Floats,
     mask: Mask | None,
     settings: CorrelationSettings,
     options: Tracking = Tracking(),
@@ -145,7 +142,7 @@ def track_block(
     reference_image: Image,
     image_of_step: Callable[[int], Image | None],
     steps: range,
-    x0: Array,
+    x0: Floats,
     mask: Mask | None,
     settings: CorrelationSettings,
     options: Tracking = Tracking(),
@@ -181,7 +178,7 @@ def track_block(
     return result, points.state
 
 
-def at_reference(x0: Array, shape: tuple[int, ...]) -> Track:
+def at_reference(x0: Floats, shape: tuple[int, ...]) -> Track:
     """The points x0 (n, 2) px in the reference image of this shape, one step."""
     x0 = np.asarray(x0, dtype=np.float64)
     inside = _inside(x0, shape)
@@ -191,12 +188,12 @@ def at_reference(x0: Array, shape: tuple[int, ...]) -> Track:
     return result
 
 
-def _inside(x0: Array, shape: tuple[int, ...]) -> Mask:
+def _inside(x0: Floats, shape: tuple[int, ...]) -> Mask:
     with np.errstate(invalid="ignore"):
         return np.asarray(((x0 >= 0) & (x0 <= (shape[1] - 1, shape[0] - 1))).all(axis=1))
 
 
-def _lost(steps: int, x0: Array, inside: Mask) -> Track:
+def _lost(steps: int, x0: Floats, inside: Mask) -> Track:
     """Every point lost in every step."""
     n = len(x0)
     status = np.full((steps, n), Status.NOT_REACHED, np.int8)
@@ -205,7 +202,7 @@ def _lost(steps: int, x0: Array, inside: Mask) -> Track:
     return Track(px, sigma, np.full((steps, n), np.nan), status, np.zeros((steps, n), bool))
 
 
-def painted(xy: Array, shape: tuple[int, ...], reach: float) -> Mask:
+def painted(xy: Floats, shape: tuple[int, ...], reach: float) -> Mask:
     """All pixels of an image of this shape within ``reach`` px of one of the points xy (n, 2). (h, w) bool."""
     out = np.zeros(shape[:2], np.uint8)
     at = np.rint(xy).astype(np.int64)
@@ -220,7 +217,7 @@ class _Points:
 
     reference: Reference
     image_of_step: Callable[[int], Image | None]
-    x0: Array
+    x0: Floats
     places: Places
     settings: CorrelationSettings
     options: Tracking
@@ -228,7 +225,7 @@ class _Points:
 
     @classmethod
     def of(
-        cls, image: Image, image_of_step: Callable[[int], Image | None], x0: Array, mask: Mask | None,
+        cls, image: Image, image_of_step: Callable[[int], Image | None], x0: Floats, mask: Mask | None,
         settings: CorrelationSettings, options: Tracking, state: TrackState,
     ) -> _Points:  # fmt: skip
         """The points x0 (n, 2) of the reference image, as the steps before left them."""
@@ -257,14 +254,14 @@ class _Points:
         return found
 
     def _follow(
-        self, reference: Reference, current: Current, points: Places, start: Array | None, search: bool = True
+        self, reference: Reference, current: Current, points: Places, start: Floats | None, search: bool = True
     ) -> Followed:
         return follow(reference, current, points, start, self.settings, two_pass=self.options.two_pass, search=search)
 
-    def _places(self, reference: Reference, at: Array) -> Places:
+    def _places(self, reference: Reference, at: Floats) -> Places:
         return places(reference, at, self.settings, self.options.window, thin=self.options.two_pass)
 
-    def _start(self, current: Current) -> Array | None:
+    def _start(self, current: Current) -> Floats | None:
         """Start values (n, 12): the motion so far, or that carried on, whichever resembles the image better."""
         state = self.state
         if not state.moved:
@@ -277,7 +274,7 @@ class _Points:
         scores = [self._resemblance(current, seeds, warp) for warp in (state.warp, ahead)]
         return state.warp if scores[0] >= scores[1] else np.where(np.isfinite(ahead), ahead, state.warp)
 
-    def _resemblance(self, current: Current, seeds: NDArray[np.int64], warp: Array) -> float:
+    def _resemblance(self, current: Current, seeds: Indices, warp: Floats) -> float:
         xy = self.x0[seeds]
         found = search_hypotheses(self.reference, current, np.rint(xy), warp[seeds][:, None, :6], self.settings.radius)
         return float(np.median(found[1]))
@@ -289,7 +286,7 @@ class _Points:
         order = np.argsort(-count, kind="stable")[:_ASKED]
         return [int(step[k]) for k in order if count[k] >= _FEW * len(self.x0)]
 
-    def _through(self, step: int, found: Followed, current: Current, by_way: NDArray[np.int64]) -> Followed:
+    def _through(self, step: int, found: Followed, current: Current, by_way: Indices) -> Followed:
         """Points lost now that were last seen at ``step``, sought from the image of that step. Fills by_way."""
         image, last, warp = self.image_of_step(step), self.state.last, self.state.warp
         lost = np.flatnonzero(~found.good & (last == step))
@@ -323,13 +320,13 @@ class _Points:
         by_way[lost[there]] = np.where(agree, 0, step)
         return self._accepted(found, lost[there], _placed(composed, np.flatnonzero(agree), direct.part(agree)))
 
-    def _accepted(self, found: Followed, index: NDArray[np.int64], other: Followed) -> Followed:
+    def _accepted(self, found: Followed, index: Indices, other: Followed) -> Followed:
         """The points found, and the points ``index`` (k,) as others found them where they agree with the rest."""
         both = _placed(found, index, other)
         odd = self.places.contradict(both.warp[:, :2], np.hypot(*both.sigma.T))[index]
         return _placed(found, index[~odd], other.part(~odd))
 
-    def _composed(self, index: NDArray[np.int64], since: Followed) -> Followed:
+    def _composed(self, index: Indices, since: Followed) -> Followed:
         """Points ``index`` (k,): their motion until they were last seen, and since."""
         state = self.state
         G = np.eye(2) + since.warp[:, 2:6].reshape(-1, 2, 2)
@@ -340,7 +337,7 @@ class _Points:
         variance = np.einsum("nij,nj->ni", G**2, state.sigma[index] ** 2) + since.sigma**2
         return Followed(warp, np.sqrt(variance), np.fmax(state.c_ls[index], since.c_ls), since.rest, since.status)
 
-    def _remember(self, step: int, found: Followed, by_way: NDArray[np.int64]) -> None:
+    def _remember(self, step: int, found: Followed, by_way: Indices) -> None:
         good, state = found.good, self.state
         self.state = TrackState(
             warp=np.where(good[:, None], found.warp, state.warp),
@@ -353,7 +350,7 @@ class _Points:
         )
 
 
-def _between(first: Array, second: Array) -> Array:
+def _between(first: Floats, second: Floats) -> Floats:
     """The warps (n, 12) from where ``first`` leads to where ``second`` leads, at first's end, of first order."""
     G1 = np.eye(2) + first[:, 2:6].reshape(-1, 2, 2)
     G2 = np.eye(2) + second[:, 2:6].reshape(-1, 2, 2)
@@ -363,7 +360,7 @@ def _between(first: Array, second: Array) -> Array:
     return out
 
 
-def _placed(found: Followed, index: NDArray[np.int64], other: Followed) -> Followed:
+def _placed(found: Followed, index: Indices, other: Followed) -> Followed:
     """``found`` with the points ``index`` (k,) as in ``other``."""
     arrays = []
     for name in ("warp", "sigma", "c_ls", "rest", "status"):

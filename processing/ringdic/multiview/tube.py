@@ -8,15 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from ringdic.arrays import Floats, Indices
 from ringdic.mesh.adjacency import fan_numbers, piece_numbers
 from ringdic.mesh.mesh import half_edges
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _LARGEST_HOLE = 5.0  # mm², filled
 _MOST_NODES = 16  # lost side by side in a hole worth a look
@@ -27,19 +24,19 @@ _LEAST_PIECE = 32  # triangles of a piece by itself, about those of a subset: fe
 class _Nodes:
     """The nodes of a lattice (columns, rows) that closes round; places (columns, rows, 3) mm, NaN where lost."""
 
-    xyz: Array
+    xyz: Floats
 
     @property
-    def index(self) -> Ints:
+    def index(self) -> Indices:
         """Number of each node, -1 where lost. (columns, rows)."""
         numbers = np.arange(self.xyz[..., 0].size).reshape(self.xyz.shape[:2])
         return np.where(np.isfinite(self.xyz).all(axis=2), numbers, -1)
 
-    def place(self, node: Ints) -> Ints:
+    def place(self, node: Indices) -> Indices:
         """Column and row (n, 2) of nodes (n,)."""
         return np.stack(np.divmod(node, self.xyz.shape[1]), axis=-1)
 
-    def unrolled(self, node: Ints) -> Ints:
+    def unrolled(self, node: Indices) -> Indices:
         """Columns and rows (n, 2), the columns counted on from the first node's across the seam."""
         place = self.place(node)
         columns = self.xyz.shape[0]
@@ -47,7 +44,7 @@ class _Nodes:
         return place
 
 
-def lattice_faces(xyz: Array) -> tuple[Ints, tuple[Ints, Ints]]:
+def lattice_faces(xyz: Floats) -> tuple[Indices, tuple[Indices, Indices]]:
     """Triangles between the measured nodes of a lattice (columns, rows, 3) mm that closes from the last column to the
     first; NaN where not measured.
 
@@ -68,7 +65,7 @@ def lattice_faces(xyz: Array) -> tuple[Ints, tuple[Ints, Ints]]:
     return renumber[faces], (column, row)
 
 
-def _cells(nodes: _Nodes) -> Ints:
+def _cells(nodes: _Nodes) -> Indices:
     """One or two triangles (M, 3) in every cell with three or four measured corners."""
     index = nodes.index
     onward = np.roll(index, -1, axis=0)
@@ -88,7 +85,7 @@ def _cells(nodes: _Nodes) -> Ints:
     return np.concatenate(parts)
 
 
-def _fillings(nodes: _Nodes, faces: Ints) -> Ints:
+def _fillings(nodes: _Nodes, faces: Indices) -> Indices:
     """Triangles (k, 3) that close the small holes of a sheet."""
     edges = _borders(faces)
     holes, size = _holes(nodes)
@@ -113,7 +110,7 @@ def _fillings(nodes: _Nodes, faces: Ints) -> Ints:
     return np.array(found, np.int64).reshape(-1, 3)
 
 
-def _borders(faces: Ints) -> Ints:
+def _borders(faces: Indices) -> Indices:
     """Edges (k, 2) with one triangle, as that triangle runs along them."""
     directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     span = int(directed.max(initial=0)) + 1
@@ -123,7 +120,7 @@ def _borders(faces: Ints) -> Ints:
     return directed[count[inverse] == 1]
 
 
-def _holes(nodes: _Nodes) -> tuple[Ints, Ints]:
+def _holes(nodes: _Nodes) -> tuple[Indices, Indices]:
     """The number of the group of lost nodes, side by side or corner to corner, each belongs to, -1 where measured
     (columns, rows), and the sizes of the groups. Those on the first or last row count as endless."""
     lost = nodes.index < 0
@@ -147,7 +144,7 @@ def _holes(nodes: _Nodes) -> tuple[Ints, Ints]:
     return np.where(flat, label, -1).reshape(columns, rows), size
 
 
-def _beside(nodes: _Nodes, edges: Ints) -> Ints:
+def _beside(nodes: _Nodes, edges: Indices) -> Indices:
     """A lost node (k, 2), column and row, in the cell on the open side of each border edge (k, 2); row -1 if none."""
     index = nodes.index
     columns, rows = index.shape
@@ -167,7 +164,7 @@ def _beside(nodes: _Nodes, edges: Ints) -> Ints:
     return out
 
 
-def _loop(edges: Ints) -> Ints | None:
+def _loop(edges: Indices) -> Indices | None:
     """The nodes (k,) of directed edges (k, 2) that make one closed loop, in the hole's own sense; None if not one."""
     onward = {int(b): int(a) for a, b in edges}  # against the triangles' sense: the hole lies to the left
     if len(onward) != len(edges):
@@ -180,7 +177,7 @@ def _loop(edges: Ints) -> Ints | None:
     return np.array(loop) if following is not None and len(loop) == len(edges) else None
 
 
-def _clipped(loop: Ints, place: Ints) -> Ints:
+def _clipped(loop: Indices, place: Indices) -> Indices:
     """Triangles (k, 3) of a polygon of nodes (n,) at places (n, 2), by clipping the ear of the shortest cut."""
     left = list(range(len(loop)))
     found = []
@@ -203,17 +200,17 @@ def _clipped(loop: Ints, place: Ints) -> Ints:
     return loop[np.array(found, np.int64).reshape(-1, 3)]
 
 
-def _turn(a: Ints, b: Ints, c: Ints) -> int:
+def _turn(a: Indices, b: Indices, c: Indices) -> int:
     """Twice the signed area of a triangle of places."""
     return int((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
 
 
-def _inside(p: Ints, triangle: Ints) -> bool:
+def _inside(p: Indices, triangle: Indices) -> bool:
     """Whether a place lies in a triangle or on its rim."""
     return all(_turn(triangle[k], triangle[(k + 1) % 3], p) >= 0 for k in range(3))
 
 
-def _without_pinches(faces: Ints, count: int) -> Ints:
+def _without_pinches(faces: Indices, count: int) -> Indices:
     """The triangles without those that hang on the rest by one vertex alone; the larger fan at a vertex stays."""
     for _ in range(20):
         fan = fan_numbers(half_edges(faces)).reshape(faces.shape)
@@ -229,7 +226,7 @@ def _without_pinches(faces: Ints, count: int) -> Ints:
     return faces
 
 
-def _without_scraps(faces: Ints) -> Ints:
+def _without_scraps(faces: Indices) -> Indices:
     """The triangles of the largest piece, and of all others that are no scraps."""
     if not len(faces):
         return faces

@@ -6,19 +6,16 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Mask
 from ringdic.geometry.camera import Camera
 from ringdic.multiview.lattice import TURN, Pieces
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _CLEARANCE = 0.7  # mm that a line of sight must keep above the surface it passes
 _LOOK_ALONG = np.array([2.0, 4.0, 6.0, 9.0, 13.0, 18.0, 25.0, 34.0, 46.0, 60.0])  # mm from the node
 
 
-def incidence(pieces: Pieces, cameras: Sequence[Camera]) -> Array:
+def incidence(pieces: Pieces, cameras: Sequence[Camera]) -> Floats:
     """Cosine of the angle between normal and line of sight. (C, columns, rows), NaN where there is no surface."""
     xyz, normals = pieces.xyz, pieces.normals
     return np.stack([camera.incidence_cosine(xyz, normals) for camera in cameras])
@@ -26,7 +23,7 @@ def incidence(pieces: Pieces, cameras: Sequence[Camera]) -> Array:
 
 def seen(
     pieces: Pieces, cameras: Sequence[Camera], masks: Mapping[str, Mask], incidence_deg: float, margin: float
-) -> tuple[Mask, Array]:
+) -> tuple[Mask, Floats]:
     """Which cameras see which nodes, (C, columns, rows), and the cosine of incidence likewise.
 
     A node is seen under less than ``incidence_deg``, ``margin`` px inside the image, inside the camera's mask where
@@ -52,7 +49,7 @@ def seen(
     return sight, cosine
 
 
-def _hidden(pieces: Pieces, camera: Camera, xyz: Array) -> Mask:
+def _hidden(pieces: Pieces, camera: Camera, xyz: Floats) -> Mask:
     """Points (n, 3) whose line of sight passes below the surface on its way to the camera. (n,)."""
     towards = camera.centre - xyz
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)

@@ -7,12 +7,10 @@ The derivatives are central differences over a subset's reach: what a subset of 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.geometry.camera import Camera
 from ringdic.multiview.lattice import Lattice, evaluate
-
-Array = NDArray[np.float64]
 
 #: Positions of the differences: centre, ± x, ± y, and the four corners.
 _STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]], dtype=float)
@@ -20,8 +18,8 @@ _NEWTON = 6
 
 
 def surface_stencil(
-    lattice: Lattice, coefficients: Array, theta: Array, z: Array, camera: Camera, px: Array, reach: float
-) -> Array:
+    lattice: Lattice, coefficients: Floats, theta: Floats, z: Floats, camera: Camera, px: Floats, reach: float
+) -> Floats:
     """Where pixels about px (n, 2) of a camera meet the pieces of the surface. (n, 9, 3) mm.
 
     coefficients : (n, 10), pieces about the places theta, z (n,). reach : px from the centre to its neighbours.
@@ -46,7 +44,7 @@ def surface_stencil(
     return np.where(np.abs(step)[..., None] < 1e-6, origin + t[..., None] * d, np.nan)
 
 
-def warps_to(camera: Camera, px: Array, stencil: Array, reach: float) -> Array:
+def warps_to(camera: Camera, px: Floats, stencil: Floats, reach: float) -> Floats:
     """Warps (n, 12) from px (n, 2) of the reference camera into another: u v ux uy vx vy uxx uxy uyy vxx vxy vyy.
 
     stencil : (n, 9, 3) mm of :func:`surface_stencil`, with the same reach.

@@ -8,13 +8,12 @@ a single match scatters by a tenth from one texture to the next: shared out by i
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-Array = NDArray[np.float64]
+from ringdic.arrays import Floats
 
 
-def smooth_sigma(px: Array, sigma: Array, cell: float) -> Array:
+def smooth_sigma(px: Floats, sigma: Floats, cell: float) -> Floats:
     """The usual standard deviation about each point of one camera. (n, 2) px, NaN where ``sigma`` is.
 
     px, sigma : (n, 2). cell : px, side of the squares whose medians are taken, blurred over a square's width and
@@ -37,7 +36,7 @@ def smooth_sigma(px: Array, sigma: Array, cell: float) -> Array:
         for axis in range(2):
             total[axis].flat[which] = len(members) * np.median(values[members, axis])
 
-    def blurred(values: Array) -> Array:
+    def blurred(values: Floats) -> Floats:
         soft = gaussian_filter(values, 1.0, mode="constant")
         return np.asarray(map_coordinates(soft, place.T[::-1] - 0.5, order=1, mode="nearest"))
 

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Image, Mask
 from ringdic.correlation import CorrelationSettings, Current, Status, grid, prepare_current, prepare_reference
 from ringdic.correlation.start_field import lattice_spacing, match_from_lattice
 from ringdic.errors import ComputationError
@@ -20,10 +21,6 @@ from ringdic.geometry.camera import Camera
 from ringdic.pairs.tracking import Places
 from ringdic.sweep.region import paint, well_seen
 from ringdic.sweep.sweep import SWEEP_RADII, Search, radii_of, sweep
-
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8] | NDArray[np.uint16]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,7 @@ class Stereo:
     settings: CorrelationSettings
 
     @cached_property
-    def radii(self) -> Array:
+    def radii(self) -> Floats:
         """Radii (K,) mm of the sweep."""
         return radii_of(self.cameras, self.search)
 
@@ -51,7 +48,7 @@ class Grid:
     and the triangles between them (m, 3)."""
 
     region: Mask
-    xy: Array
+    xy: Floats
     faces: NDArray[np.int32]
 
 
@@ -63,7 +60,7 @@ class StepMatches:
     both. seconds : of the match between the cameras, by stage.
     """
 
-    px: Array
+    px: Floats
     sigma: NDArray[np.float32]
     c_ls: NDArray[np.float32]
     status: NDArray[np.int8]
@@ -75,7 +72,7 @@ class StepMatches:
         return np.asarray(self.status == Status.GOOD)
 
     @property
-    def second(self) -> Array:
+    def second(self) -> Floats:
         """Places (n, 2) px of the matched points in the second camera's image, NaN elsewhere."""
         return np.where(self.good[:, None], self.px[1], np.nan)
 
@@ -121,7 +118,7 @@ def at_step(at_reference: StepMatches, seen: tuple[Places | None, Places | None]
     return StepMatches(px, sigma, c_ls, status)
 
 
-def _find_region(stereo: Stereo, image: Image, current: Current, mask: Mask | None) -> tuple[Mask, Array, Array]:
+def _find_region(stereo: Stereo, image: Image, current: Current, mask: Mask | None) -> tuple[Mask, Floats, Floats]:
     """The region of interest (height, width), lattice positions (k, 2) px in it and their warps (k, 6)."""
     first, second = stereo.cameras
     found = sweep(stereo.cameras, image, current, mask, stereo.radii, stereo.search, stereo.settings)
@@ -140,7 +137,7 @@ def _find_region(stereo: Stereo, image: Image, current: Current, mask: Mask | No
     return region, found.px[good.ravel()], found.warps[good.ravel()]
 
 
-def _start_at(xy: Array, seeds: Array, warps: Array) -> Array:
+def _start_at(xy: Floats, seeds: Floats, warps: Floats) -> Floats:
     """Start values (n, 6) of the grid: known at the seeds, NaN elsewhere."""
     start = np.full((len(xy), 6), np.nan)
     high = max(xy[:, 1].max(), seeds[:, 1].max()) + 1.0

@@ -9,14 +9,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.outliers import Lost, crossing_outliers, neighbours, surface_outliers
 from ringdic.geometry.triangulation import LinearSystem, reprojection_residuals
 from ringdic.mesh.mesh import Mesh
 from ringdic.uncertainty.position import linear_sigma
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 class Matched(Protocol):
@@ -27,7 +25,7 @@ class Matched(Protocol):
     """
 
     @property
-    def px(self) -> Array: ...
+    def px(self) -> Floats: ...
     @property
     def sigma(self) -> NDArray[Any]: ...
     @property
@@ -46,7 +44,7 @@ class PairStep:
     those dropped that cannot be right in space. drift : px, mean vertical reprojection residual of the first camera.
     """
 
-    vertices: Array
+    vertices: Floats
     correlation: NDArray[np.float32]
     sigma: NDArray[np.float32]
     status: NDArray[np.int8]
@@ -63,12 +61,12 @@ class PairShape:
     """
 
     cameras: tuple[Camera, Camera]
-    xy: Array
-    rows: Ints
-    faces: Ints
+    xy: Floats
+    rows: Indices
+    faces: Indices
     at_first: PairStep
-    beside: Ints
-    xyz: Array
+    beside: Indices
+    xyz: Floats
     scatter: NDArray[Any]
     sigma_max_px: float
 
@@ -78,7 +76,7 @@ class PairShape:
         return self.cameras[0].id, self.cameras[1].id
 
     @property
-    def vertex(self) -> Ints:
+    def vertex(self) -> Indices:
         """The vertex of each match, (n,), -1 where it has none."""
         found = np.full(len(self.xy), -1)
         found[self.rows] = np.arange(len(self.rows))
@@ -100,7 +98,7 @@ class PairShape:
 
 def pair_shape(
     cameras: tuple[Camera, Camera],
-    xy: Array,
+    xy: Floats,
     faces: NDArray[np.int32],
     found: Matched,
     step_px: int,
@@ -122,7 +120,7 @@ def pair_shape(
 
 def _placed(
     cameras: tuple[Camera, Camera], found: Matched, scatter: NDArray[Any], sigma_max_px: float
-) -> tuple[Array, Array, NDArray[np.int8], float]:
+) -> tuple[Floats, Floats, NDArray[np.int8], float]:
     """Places (n, 3) mm and their standard deviations, status (n,) and drift px, by where the lines of sight cross.
 
     scatter : (2, n, 2) px, of the places in the images.
@@ -141,19 +139,21 @@ def _placed(
     return xyz, sigma, status, drift
 
 
-def _drop(lost: NDArray[np.bool_], xyz: Array, status: NDArray[np.int8], why: Lost = Lost.SURFACE) -> None:
+def _drop(lost: Mask, xyz: Floats, status: NDArray[np.int8], why: Lost = Lost.SURFACE) -> None:
     status[lost] = why
     xyz[lost] = np.nan
 
 
-def _of_rows(rows: Ints, xyz: Array, sigma: Array, status: NDArray[np.int8], found: Matched, drift: float) -> PairStep:
+def _of_rows(
+    rows: Indices, xyz: Floats, sigma: Floats, status: NDArray[np.int8], found: Matched, drift: float
+) -> PairStep:
     lost = status[rows] != 0
     correlation, scatter = found.c_ls[rows].astype(np.float32), sigma[rows].astype(np.float32)
     correlation[lost], scatter[lost] = np.nan, np.nan
     return PairStep(xyz[rows], correlation, scatter, status, drift)
 
 
-def _whole_faces(xyz: Array, faces: NDArray[np.int32], cameras: Sequence[Camera]) -> Ints:
+def _whole_faces(xyz: Floats, faces: NDArray[np.int32], cameras: Sequence[Camera]) -> Indices:
     """Triangles between measured points, turned towards the cameras; none across a step in depth.
 
     A triangle whose longest edge is far longer than the grid's usual one joins two surfaces.

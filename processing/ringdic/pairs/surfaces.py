@@ -9,15 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices
 from ringdic.geometry.camera import Camera
 from ringdic.pairs.merging import Merged, Mismatch, Seam, Sheet, merge, mismatches
 from ringdic.pairs.reconstruction import Matched, PairShape, PairStep
 from ringdic.results.results import Matches, Results
 from ringdic.results.series import Shelf, usual
 from ringdic.settings import Settings
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _MOST = 0.5  # a step at which fewer points of a pair were measured says nothing about single points
 
@@ -32,9 +30,9 @@ class FollowedPair:
 
     shape: PairShape
     at: Callable[[int], tuple[PairStep, Matched]]
-    correlation: Array
-    drift: Array
-    noise: Array
+    correlation: Floats
+    drift: Floats
+    noise: Floats
 
     @property
     def sheet(self) -> Sheet:
@@ -110,10 +108,10 @@ class PairsSeries:
     names: tuple[str, ...]
     reference: Results
     pairs: tuple[FollowedPair, ...]
-    kept: Ints
+    kept: Indices
 
     @property
-    def noise(self) -> list[Array]:
+    def noise(self) -> list[Floats]:
         """See `Series`."""
         return [pair.noise for pair in self.pairs]
 
@@ -224,7 +222,7 @@ def _agreement(results: Results, found: Sequence[Mismatch]) -> dict[str, Any]:
     beside = [one for one in found if set(results.pairs[one.first]) & set(results.pairs[one.second])]
     if not beside:
         return {"mismatch_mm": None, "mismatch_std_mm": None, "mismatches": rows}
-    weights: NDArray[np.float64] = np.array([one.points for one in beside], dtype=float)
+    weights: Floats = np.array([one.points for one in beside], dtype=float)
     weights /= weights.sum()
     mean = float(weights @ [one.mean for one in beside])
     square = float(weights @ [one.mean**2 + one.std**2 for one in beside])

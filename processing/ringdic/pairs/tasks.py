@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.correlation import CorrelationSettings, Reference, prepare_reference, reference_bytes
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
@@ -35,7 +35,7 @@ class CameraJob:
 
     steps: tuple[Task | None, ...]
 
-    def places(self, step: int, xy: NDArray[np.float64]) -> Places | None:
+    def places(self, step: int, xy: Floats) -> Places | None:
         """Where places xy (n, 2) px of the reference image lie at a step from 1 on; None without an image."""
         task = self.steps[step - 1]
         if task is None:

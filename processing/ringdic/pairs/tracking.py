@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Image, Mask
 from ringdic.correlation import (
     Correlation,
     CorrelationSettings,
@@ -28,10 +29,6 @@ from ringdic.correlation.lattice_field import between_corners
 from ringdic.correlation.seeds import flow_starts
 from ringdic.correlation.start_field import lattice_spacing, match_from_lattice, on_lattice
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8] | NDArray[np.uint16]
-Mask = NDArray[np.bool_]
-
 _HELD = 0.6  # ZNCC under the warp that optical flow tells, from which on it is a start value
 _ENOUGH = 0.8  # share of the points that must be matched, or start values are looked for in other ways
 _SOME = 0.2  # share of the lattice that must hold for the rest of it to be reached from there
@@ -39,9 +36,9 @@ _LEAST = 0.02  # weight of the matched corners about a place below which nothing
 _DIGITS = 4  # binary digits after the point of the pixels that triangles are drawn with
 
 #: Of a pair whose first camera it is: the region (height, width) and the grid points (n, 2) px that were matched.
-Own = tuple[Mask, Array]
+Own = tuple[Mask, Floats]
 #: Of a pair whose second camera it is: places (n, 2) px of the points, NaN where not matched, and triangles (m, 3).
-Shared = tuple[Array, NDArray[np.int32]]
+Shared = tuple[Floats, NDArray[np.int32]]
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,7 @@ class CameraGrid:
     multiples of ``step`` px."""
 
     region: Mask
-    xy: Array
+    xy: Floats
     step: int
 
 
@@ -63,7 +60,7 @@ class Followed:
 
     xy: NDArray[np.int32]
     step: int
-    uv: Array
+    uv: Floats
     gradient: NDArray[np.float32]
     sigma: NDArray[np.float32]
     c_ls: NDArray[np.float32]
@@ -77,9 +74,9 @@ class Places:
     px : (n, 2) there now. sigma : (n, 2) px. c_ls : (n,). status : (n,), 0 good.
     """
 
-    px: Array
-    sigma: Array
-    c_ls: Array
+    px: Floats
+    sigma: Floats
+    c_ls: Floats
     status: NDArray[np.int8]
 
 
@@ -121,7 +118,7 @@ def follow(reference: Reference, image: Image, grid: CameraGrid, settings: Corre
     )
 
 
-def places(found: Followed, xy: Array) -> Places:
+def places(found: Followed, xy: Floats) -> Places:
     """Where places xy (n, 2) px of the camera's reference image lie in its image of a step."""
     values = np.column_stack([found.uv, found.gradient.reshape(-1, 4), found.sigma, found.c_ls]).astype(np.float64)
     told, weight = between_corners(found.xy, values, found.step, xy)
@@ -132,7 +129,7 @@ def places(found: Followed, xy: Array) -> Places:
     return Places(xy + told[:, :2], told[:, 6:8], told[:, 8], status)
 
 
-def match_in_time(reference: Reference, current: Current, xy: Array, settings: CorrelationSettings) -> Correlation:
+def match_in_time(reference: Reference, current: Current, xy: Floats, settings: CorrelationSettings) -> Correlation:
     """Points xy (n, 2) px of a camera's reference image in a later one, from where optical flow puts some of them.
 
     Where that leads to few matches the correlation looks for start values in its own ways.
@@ -153,7 +150,7 @@ def match_in_time(reference: Reference, current: Current, xy: Array, settings: C
     return searched if searched.good.sum() > found.good.sum() else found
 
 
-def _beside(found: Followed, xy: Array) -> NDArray[np.int8]:
+def _beside(found: Followed, xy: Floats) -> NDArray[np.int8]:
     """Why nothing is known at places xy (k, 2) px: what befell the grid's point nearest to each."""
     cells = found.xy // found.step
     told = np.full((found.xy.max(axis=0, initial=0) // found.step + 2), Status.NOT_REACHED, np.int8)

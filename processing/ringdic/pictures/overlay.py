@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Image
 from ringdic.errors import InputError
 from ringdic.geometry.camera import Camera
 from ringdic.mesh.mesh import Mesh
@@ -14,8 +14,6 @@ from ringdic.pictures.views import through_camera
 from ringdic.results.evaluation import Evaluated
 from ringdic.session.folder import Session
 from ringdic.session.images import read_gray
-
-Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 def overlay(seen: Evaluated, camera_id: str, image: Image, scale: Scale, step: int, opacity: float = 0.65) -> Picture:

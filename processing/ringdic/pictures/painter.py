@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ringdic.arrays import Floats, Indices
+
 FaceImage = NDArray[np.int32]
 
 _AT_ONCE = 2_000_000  # pixels tried at a time
 
 
-def paint(corners: Array, depth: Array, shape: tuple[int, int]) -> FaceImage:
+def paint(corners: Floats, depth: Floats, shape: tuple[int, int]) -> FaceImage:
     """The number of the triangle that each pixel's centre shows, (height, width); -1 where there is none.
 
     corners : (M, 3, 2) px; a triangle with a corner that is not finite is left out. depth : (M,), the smaller the
@@ -41,11 +42,11 @@ def paint(corners: Array, depth: Array, shape: tuple[int, int]) -> FaceImage:
 def _fill(
     image: FaceImage,
     width: int,
-    corners: Array,
-    faces: NDArray[np.int64],
-    first: NDArray[np.int64],
-    across: NDArray[np.int64],
-    tried: NDArray[np.int64],
+    corners: Floats,
+    faces: Indices,
+    first: Indices,
+    across: Indices,
+    tried: Indices,
 ) -> None:
     """Fill some triangles, in their order, by trying every pixel of their bounding boxes."""
     of = np.repeat(np.arange(len(faces)), tried)
@@ -57,7 +58,7 @@ def _fill(
     image[y[inside] * width + x[inside]] = faces[of[inside]]  # of several, the last one stays
 
 
-def _turn(a: Array, b: Array, x: NDArray[np.int64], y: NDArray[np.int64], of: NDArray[np.int64]) -> Array:
+def _turn(a: Floats, b: Floats, x: Indices, y: Indices, of: Indices) -> Floats:
     """On which side of the line from a to b a pixel lies."""
     along = b - a
     constant = along[:, 0] * a[:, 1] - along[:, 1] * a[:, 0]

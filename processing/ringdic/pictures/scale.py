@@ -11,12 +11,12 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.errors import InputError
 from ringdic.results.colours import colours
 from ringdic.results.evaluation import Evaluated
 from ringdic.results.fields import Field
 
-Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 
@@ -44,7 +44,7 @@ class Scale:
         """The field's label with its unit."""
         return f"{self.field.label}, {self.field.unit}" if self.field.unit else self.field.label
 
-    def colours(self, values: Array) -> Array:
+    def colours(self, values: Floats) -> Floats:
         """sRGB (..., 3) from 0 to 1."""
         return colours(values, self.low, self.high, self.diverging)
 
@@ -75,7 +75,7 @@ def scale_of(seen: Evaluated, name: str, limits: tuple[float, float] | None = No
     return Scale(seen.field(name), float(low), float(high))
 
 
-def on_faces(seen: Evaluated, entry: Field, values: Array, step: int) -> Array:
+def on_faces(seen: Evaluated, entry: Field, values: Floats, step: int) -> Floats:
     """Values of a field at a step on the triangles (M,): of points, the mean of the corners; NaN where not measured."""
     faces = seen.results.faces
     if entry.location == "point":
@@ -91,7 +91,7 @@ def palette(scale: Scale) -> Picture:
     return np.rint(255.0 * np.concatenate([steps, greys])).astype(np.uint8)
 
 
-def looked_up(faces: NDArray[np.int32], values: Array, scale: Scale) -> Array:
+def looked_up(faces: NDArray[np.int32], values: Floats, scale: Scale) -> Floats:
     """The picture (h, w, 4) RGBA from 0 to 1 of an image of face numbers; clear where nothing was measured."""
     of_face = np.zeros((len(values) + 1, 4))
     of_face[:-1, :3] = scale.colours(values)

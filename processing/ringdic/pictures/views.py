@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Mask
 from ringdic.geometry.camera import Camera
 from ringdic.mesh.mesh import Mesh
 from ringdic.pictures.painter import FaceImage, paint
-
-Array = NDArray[np.float64]
 
 Extent = tuple[float, float, float, float]
 
@@ -29,7 +27,7 @@ class View:
     """
 
     faces: FaceImage
-    inside: NDArray[np.bool_]
+    inside: Mask
     extent: Extent
     aspect: float
 
@@ -97,7 +95,7 @@ def side_extent(mesh: Mesh, azimuth: float, tilt: float = _TILT) -> Extent:
     return float(low[0]) - margin, float(high[0]) + margin, float(low[1]) - margin, float(high[1]) + margin
 
 
-def _axes(azimuth: float, tilt: float) -> tuple[Array, Array, Array]:
+def _axes(azimuth: float, tilt: float) -> tuple[Floats, Floats, Floats]:
     """Unit vectors towards the onlooker, to the right and up of the picture."""
     towards = np.array([np.cos(azimuth) * np.cos(tilt), np.sin(azimuth) * np.cos(tilt), np.sin(tilt)])
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
@@ -116,7 +114,7 @@ def through_camera(mesh: Mesh, camera: Camera) -> FaceImage:
     return paint(px, np.linalg.norm(centroids - camera.centre, axis=1), (height, width))
 
 
-def _cut(azimuth: Array) -> float:
+def _cut(azimuth: Floats) -> float:
     """Where a surface is cut to be unrolled, degrees: in the middle of its widest gap, at 0 for a whole ring."""
     ordered = np.sort(azimuth[np.isfinite(azimuth)])
     gaps = np.diff(ordered, append=ordered[0] + 360.0)
@@ -124,7 +122,7 @@ def _cut(azimuth: Array) -> float:
     return float(ordered[widest] + 0.5 * gaps[widest]) if gaps[widest] > 20.0 else 0.0
 
 
-def _in_pixels(xy: Array, extent: Extent, shape: tuple[int, int]) -> Array:
+def _in_pixels(xy: Floats, extent: Extent, shape: tuple[int, int]) -> Floats:
     """Places (..., 2) of the axes in pixels of a picture whose borders are the extent's."""
     left, right, low, high = extent
     x = (xy[..., 0] - left) / (right - left) * shape[1] - 0.5

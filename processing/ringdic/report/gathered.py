@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.measure.region import statistics
 from ringdic.pictures.scale import Scale, on_faces
 from ringdic.results.evaluation import Evaluated
 from ringdic.results.fields import Field
 from ringdic.results.ranges import Ranges, even_limits
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ def _scale(entry: Field, row: dict[str, Any]) -> Scale:
     return Scale(entry, *even_limits(row["range"], entry.centre))
 
 
-def _weights(seen: Evaluated) -> dict[str, Array]:
+def _weights(seen: Evaluated) -> dict[str, Floats]:
     """Area in the reference of each triangle, and of each point a third of its triangles'."""
     mesh = seen.results.mesh
     areas = mesh.areas

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.geometry.camera import Camera
 from ringdic.mesh.mesh import Mesh
 from ringdic.report.speckle import speckle_size
@@ -14,8 +14,6 @@ from ringdic.results.results import Results
 from ringdic.session.folder import Capture, Session
 from ringdic.session.images import read_gray
 from ringdic.uncertainty.noise import flat_noise, rest_noise
-
-Array = NDArray[np.float64]
 
 _SQUARELY = 0.8  # cosine of incidence above which a point counts for a camera's figures
 _FEWEST = 20
@@ -62,7 +60,7 @@ def camera_facts(session: Session, results: Results) -> tuple[CameraFacts, ...]:
 
 
 def _facts(
-    camera: Camera, mesh: Mesh, normals: Array, reference: Capture | None, at_rest: tuple[Capture, ...]
+    camera: Camera, mesh: Mesh, normals: Floats, reference: Capture | None, at_rest: tuple[Capture, ...]
 ) -> CameraFacts:
     lens = camera.intrinsics
     found: dict[str, object] = {"focal": None if lens is None else float(np.sqrt(lens.K[0, 0] * lens.K[1, 1]))}
@@ -87,7 +85,7 @@ def _facts(
 
 
 def _of_images(
-    camera: Camera, px: Array, reference: Capture, at_rest: tuple[Capture, ...]
+    camera: Camera, px: Floats, reference: Capture, at_rest: tuple[Capture, ...]
 ) -> dict[str, float | bool | None]:
     """Speckle, contrast and noise about the middle of the points."""
     middle = np.median(px, axis=0)

@@ -7,13 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.pictures.scale import Scale, looked_up
 from ringdic.pictures.views import View
 from ringdic.report.gathered import Gathered
-
-Array = NDArray[np.float64]
 
 _INSIDE = np.array([0.86, 0.87, 0.89])
 _LINES = ("#1d6ec4", "#c4581d", "#2c8a4b", "#7b3fa0", "#a0762f")
@@ -41,7 +39,7 @@ def maps(gathered: Gathered, scale: Scale, shown: Sequence[StepViews]) -> Figure
     return drawn
 
 
-def _map(axes: Axes, view: View, picture: Array, name: str) -> None:
+def _map(axes: Axes, view: View, picture: Floats, name: str) -> None:
     axes.imshow(picture, extent=view.extent, aspect="auto", interpolation="nearest")
     axes.set_title(name, fontsize=9, loc="left")
     axes.set_xlabel("azimuth, °", fontsize=8)
@@ -49,7 +47,7 @@ def _map(axes: Axes, view: View, picture: Array, name: str) -> None:
     axes.tick_params(labelsize=8)
 
 
-def _body(axes: Axes, view: View, picture: Array, side: str) -> None:
+def _body(axes: Axes, view: View, picture: Floats, side: str) -> None:
     picture = picture.copy()
     picture[view.inside] = (*_INSIDE, 1.0)
     axes.imshow(picture, extent=view.extent, interpolation="antialiased")

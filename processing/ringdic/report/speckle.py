@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ringdic.arrays import Floats
+
 Image = NDArray[np.generic]
 
 _SIDE = 64  # px, of a patch
 _PATCHES = 64
 
 
-def speckle_size(image: Image, px: Array, noise: float = 0.0) -> float | None:
+def speckle_size(image: Image, px: Floats, noise: float = 0.0) -> float | None:
     """Width at half height of the autocorrelation's peak, px, the mean over all directions; None without patches.
 
     image : (h, w) grey levels. px : (n, 2) places about which patches of 64 px are taken. noise : variance, grey
@@ -33,7 +34,7 @@ def speckle_size(image: Image, px: Array, noise: float = 0.0) -> float | None:
     return _width(_profile(total), noise)
 
 
-def _autocovariance(patch: Array) -> Array:
+def _autocovariance(patch: Floats) -> Floats:
     """Mean product of the grey levels' deviations a lag apart, lag zero at the corner; unbiased by the edges."""
     size = 2 * _SIDE
     ones = np.abs(np.fft.rfft2(np.ones_like(patch), (size, size))) ** 2
@@ -44,7 +45,7 @@ def _autocovariance(patch: Array) -> Array:
     return np.asarray(both[:_SIDE, :_SIDE])
 
 
-def _profile(covariance: Array) -> Array:
+def _profile(covariance: Floats) -> Floats:
     """Mean over all directions at lags of 0, 1, 2 … px."""
     y, x = np.indices(covariance.shape) - _SIDE // 2
     ring = np.hypot(x, y)
@@ -55,7 +56,7 @@ def _profile(covariance: Array) -> Array:
     return np.asarray(np.interp(lags, radius, mean))
 
 
-def _width(profile: Array, noise: float) -> float | None:
+def _width(profile: Floats, noise: float) -> float | None:
     peak = profile[0] - noise
     if not peak > 0:
         return None

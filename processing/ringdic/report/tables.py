@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ringdic.correlation.status import Status
 from ringdic.geometry.outliers import Lost
@@ -17,8 +16,6 @@ from ringdic.report.hardware import CameraFacts
 from ringdic.results.results import Results
 from ringdic.session.folder import Capture, Session
 from ringdic.settings import Settings
-
-Array = NDArray[np.float64]
 
 _REASONS: dict[int, str] = {
     Status.GOOD: "measured",

@@ -6,9 +6,8 @@ The scales are those of the page, made in the perceptual space OKLCH (Ottosson 2
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ringdic.arrays import Floats
 
 UNMEASURED = (0.5, 0.5, 0.5)
 _FROM_OKLAB = np.array([[0.3963377774, 0.2158037573], [-0.1055613458, -0.0638541728], [-0.0894841775, -1.291485548]])
@@ -21,7 +20,7 @@ _LINEAR_FROM_CUBES = np.array(
 )
 
 
-def colours(values: Array, low: float, high: float, diverging: bool = False) -> Array:
+def colours(values: Floats, low: float, high: float, diverging: bool = False) -> Floats:
     """sRGB colours (..., 3) from 0 to 1 of values (...) between two limits; what is not finite is grey.
 
     Sequential: dark violet over blue and green to light yellow. Diverging: blue over near-white to red.
@@ -39,12 +38,12 @@ def colours(values: Array, low: float, high: float, diverging: bool = False) -> 
     return np.asarray(np.where(np.isfinite(values)[..., None], rgb, UNMEASURED))
 
 
-def _linear(lightness: Array, chroma: Array, hue: Array) -> Array:
+def _linear(lightness: Floats, chroma: Floats, hue: Floats) -> Floats:
     plane = np.stack([chroma * np.cos(hue), chroma * np.sin(hue)], axis=-1)
     cubes = (lightness[..., None] + plane @ _FROM_OKLAB.T) ** 3
     return np.clip(cubes @ _LINEAR_FROM_CUBES.T, 0.0, 1.0)
 
 
-def _encoded(linear: Array) -> Array:
+def _encoded(linear: Floats) -> Floats:
     """sRGB's transfer curve (IEC 61966-2-1)."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)

@@ -9,9 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.errors import InputError
 from ringdic.mesh.mesh import Mesh
 from ringdic.results.fields import Field, StepFields, available, field, seth_hill_fields
@@ -19,8 +17,6 @@ from ringdic.results.ranges import Ranges, even_limits
 from ringdic.results.results import Results, read_results
 from ringdic.strain.window import StrainWindow, strain_window
 from ringdic.uncertainty.window import WindowScatter
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -113,14 +109,14 @@ class Evaluated:
             )
         return self._last[1]
 
-    def positions(self, step: int) -> Array:
+    def positions(self, step: int) -> Floats:
         """Positions of the vertices, (N, 3) mm, NaN where lost; moved back if the rigid motion is removed."""
         current = self.results.vertices[step]
         if self.evaluation.rigid_motion_removed:
             return self.results.motion(step, self.evaluation.previous).apply(current)
         return current
 
-    def measured(self, step: int) -> tuple[Mesh, NDArray[np.int64], NDArray[np.bool_]]:
+    def measured(self, step: int) -> tuple[Mesh, Indices, Mask]:
         """The measured part of a step, the old index (K,) of its vertices, and which triangles (M,) it has."""
         moved = Mesh(self.positions(step), self.results.faces)
         whole = moved.whole_faces()

@@ -14,18 +14,16 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices
 from ringdic.strain import families as strain
 from ringdic.strain.deformation import Deformation, deformation
 from ringdic.strain.rigid_motion import RigidMotion
 from ringdic.strain.window import StrainWindow
 from ringdic.uncertainty.window import WindowScatter
 
-Array = NDArray[np.float64]
 
-
-def _itself(values: Array) -> Array:
+def _itself(values: Floats) -> Floats:
     return values
 
 
@@ -46,7 +44,7 @@ class Field:
     rigid: bool = False
     group: str = "Quality"
     of: tuple[str, ...] = ()
-    value: Callable[..., Array] = _itself
+    value: Callable[..., Floats] = _itself
 
     def __post_init__(self) -> None:
         if self.location not in ("point", "face"):
@@ -59,40 +57,40 @@ class Field:
         names = ("name", "label", "unit", "location", "centre", "rigid", "group")
         return {name: getattr(self, name) for name in names}
 
-    def from_arrays(self, array: Callable[[str], Array], rigid_motion_removed: bool = False) -> Array:
+    def from_arrays(self, array: Callable[[str], Floats], rigid_motion_removed: bool = False) -> Floats:
         """Its values, from what ``array`` knows under the names in ``of``."""
         suffix = "_without_rigid_motion" if self.rigid and rigid_motion_removed else ""
         with np.errstate(invalid="ignore", divide="ignore"):
             return self.value(*(array(name + suffix) for name in self.of))
 
 
-def _column(index: int, values: Array) -> Array:
+def _column(index: int, values: Floats) -> Floats:
     return values[..., index]
 
 
-def _length(values: Array) -> Array:
+def _length(values: Floats) -> Floats:
     return np.asarray(np.linalg.norm(values, axis=-1))
 
 
-def _stretch(E: Array) -> Array:
+def _stretch(E: Floats) -> Floats:
     return np.sqrt(1.0 + 2.0 * E)
 
 
-def _seth_hill(m: float, E: Array) -> Array:
+def _seth_hill(m: float, E: Floats) -> Floats:
     """Principal strain of the Seth-Hill family m from that of Green-Lagrange; small strains keep their digits."""
     return strain.seth_hill_of_log(0.5 * np.log1p(2.0 * E), m)
 
 
-def _bazant(E: Array) -> Array:
+def _bazant(E: Floats) -> Floats:
     """The same of Bažant's family with m = 1, ½ (λ - 1/λ)."""
     return np.sinh(0.5 * np.log1p(2.0 * E))
 
 
-def _scalar(measure: Callable[[Array, Array], Array], principal: Callable[[Array], Array], *two: Array) -> Array:
+def _scalar(measure: Callable[[Floats, Floats], Floats], principal: Callable[[Floats], Floats], *two: Floats) -> Floats:
     return measure(*(principal(values) for values in two))
 
 
-_SCALARS: tuple[tuple[str, str, Callable[[Array, Array], Array], float | None], ...] = (
+_SCALARS: tuple[tuple[str, str, Callable[[Floats, Floats], Floats], float | None], ...] = (
     ("1", "smaller principal", lambda first, second: first, 0.0),
     ("2", "larger principal", lambda first, second: second, 0.0),
     ("_magnitude", "magnitude", strain.magnitude, None),
@@ -102,7 +100,7 @@ _SCALARS: tuple[tuple[str, str, Callable[[Array, Array], Array], float | None], 
 
 
 def _family(
-    name: str, label: str, principal: Callable[[Array], Array], of: tuple[str, str] = ("E1", "E2")
+    name: str, label: str, principal: Callable[[Floats], Floats], of: tuple[str, str] = ("E1", "E2")
 ) -> Iterator[Field]:
     symbol = f"{label} {name}" if name in "Ee" else label
     for suffix, scalar, measure, centre in _SCALARS:
@@ -122,7 +120,7 @@ _DEFORMATION = (
     *_family("bazant", "Bažant (m = 1)", _bazant),
     *_family("linear", "Linear (infinitesimal)", _itself, ("linear1", "linear2")),
 )
-_OVER_STRETCHES: dict[str, Callable[..., Array]] = {
+_OVER_STRETCHES: dict[str, Callable[..., Floats]] = {
     "J": lambda E1, E2: _stretch(E1) * _stretch(E2),
     "lambda1": lambda E1, E2: _stretch(E1),
     "lambda2": lambda E1, E2: _stretch(E2),
@@ -138,7 +136,7 @@ def _windowed(entry: Field) -> Field:
     )  # fmt: skip
 
 
-def _strain_sigma(E: Array, sigma_stretch: Array) -> Array:
+def _strain_sigma(E: Floats, sigma_stretch: Floats) -> Floats:
     return _stretch(E) * sigma_stretch  # dE = λ dλ
 
 
@@ -202,15 +200,15 @@ class StepFields:
     Vectors are (·, 3); symmetric tensors (·, 6) in the order xx yy zz xy yz xz.
     """
 
-    point: dict[str, Array]
-    face: dict[str, Array]
+    point: dict[str, Floats]
+    face: dict[str, Floats]
 
     @property
     def names(self) -> set[str]:
         """The arrays there are."""
         return {*self.point, *self.face}
 
-    def scalar(self, entry: Field, rigid_motion_removed: bool = False) -> Array:
+    def scalar(self, entry: Field, rigid_motion_removed: bool = False) -> Floats:
         """The values of a field, (N,) or (M,)."""
         arrays = self.point if entry.location == "point" else self.face
         return entry.from_arrays(arrays.__getitem__, rigid_motion_removed)
@@ -225,14 +223,14 @@ class Certainty:
     (M, 2), by the covariance of the cameras.
     """
 
-    correlation: Array
-    sigma_xyz: Array
-    sigma_displacement: Array | None = None
-    sigma_lambda: Array | None = None
-    chi2: Array | None = None
-    sigma_calibration: Array | None = None
-    sigma_displacement_calibration: Array | None = None
-    sigma_lambda_calibration: Array | None = None
+    correlation: Floats
+    sigma_xyz: Floats
+    sigma_displacement: Floats | None = None
+    sigma_lambda: Floats | None = None
+    chi2: Floats | None = None
+    sigma_calibration: Floats | None = None
+    sigma_displacement_calibration: Floats | None = None
+    sigma_lambda_calibration: Floats | None = None
 
     def fields(self) -> StepFields:
         """What is known, as arrays of the points and the triangles."""
@@ -241,7 +239,7 @@ class Certainty:
             "sigma_displacement_calibration",
         )  # fmt: skip
         point = {name: getattr(self, name) for name in on_points}
-        face: dict[str, Array] = {}
+        face: dict[str, Floats] = {}
         for name in ("sigma_lambda", "sigma_lambda_calibration"):
             if (sigma := getattr(self, name)) is not None:
                 face[f"{name}1"], face[f"{name}2"] = sigma.T
@@ -280,12 +278,12 @@ def available(names: Collection[str]) -> tuple[Field, ...]:
 
 
 def compute_fields(
-    reference: Array,
-    current: Array,
-    faces: NDArray[np.int64],
+    reference: Floats,
+    current: Floats,
+    faces: Indices,
     to_reference: RigidMotion,
     certainty: Certainty,
-    pair: NDArray[np.int64],
+    pair: Indices,
     window: StrainWindow | None = None,
     scatter: WindowScatter | None = None,
     found: Deformation | None = None,
@@ -327,19 +325,19 @@ def compute_fields(
     return StepFields(point, face)
 
 
-def _of_deformation(found: Deformation, both_tensors: bool) -> dict[str, Array]:
+def _of_deformation(found: Deformation, both_tensors: bool) -> dict[str, Floats]:
     names = ("J", "lambda1", "lambda2", "E1", "E2", *_DIRECTIONS)
     tensors = {"E_tensor": _six(found.E)} | ({"e_tensor": _six(found.e)} if both_tensors else {})
     return {**{name: getattr(found, name) for name in names}, **tensors}
 
 
-def _linear(found: Deformation, to_reference: RigidMotion) -> dict[str, Array]:
+def _linear(found: Deformation, to_reference: RigidMotion) -> dict[str, Floats]:
     """Principal linear strains, after the rigid motion: what is left of the rotation counts as strain."""
     values = strain.infinitesimal_principal(found.F, found.normal_reference, to_reference.R)
     return dict(zip(("linear1", "linear2"), values, strict=True))
 
 
-def _six(tensor: Array) -> Array:
+def _six(tensor: Floats) -> Floats:
     return np.take(tensor.reshape(*tensor.shape[:-2], 9), [3 * i + j for i, j in _SYMMETRIC], axis=-1)
 
 

@@ -8,12 +8,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.results.results import Results
 from ringdic.strain.window import strain_window
-
-Array = NDArray[np.float64]
 
 
 def noise_floor(at_rest: Results) -> dict[str, Any]:
@@ -28,7 +26,7 @@ def noise_floor(at_rest: Results) -> dict[str, Any]:
     rest = [at_rest.motion(k).apply(at_rest.vertices[k]) - at_rest.vertices_ref for k in steps]
     alone = [at_rest.deformation(k) for k in steps]
     lengths = [np.linalg.norm(each, axis=1) for each in moved]
-    rows: list[tuple[str, str, str, list[Array]]] = [
+    rows: list[tuple[str, str, str, list[Floats]]] = [
         ("displacement", "Displacement", "mm", lengths),
         *((f"displacement_{a}", f"Displacement {a}", "mm", [d[:, i] for d in moved]) for i, a in enumerate("xyz")),
         ("displacement_rest", "Displacement, rigid motion removed", "mm", [np.linalg.norm(d, axis=1) for d in rest]),
@@ -51,12 +49,12 @@ def noise_floor(at_rest: Results) -> dict[str, Any]:
     }
 
 
-def _median(values: Array) -> float:
+def _median(values: Floats) -> float:
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) else 0.0
 
 
-def _statistics(values: Array) -> dict[str, float | None]:
+def _statistics(values: Floats) -> dict[str, float | None]:
     finite = values[np.isfinite(values)]
     if not len(finite):
         return dict.fromkeys(("mean", "std", "rms", "median", "p95"))

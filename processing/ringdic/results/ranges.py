@@ -9,9 +9,10 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.results.fields import Field, StepFields
 
-Extent = dict[tuple[str, bool], NDArray[np.float64] | None]
+Extent = dict[tuple[str, bool], Floats | None]
 
 _PERCENTILES = np.array([0.0, 2.0, 98.0, 100.0])
 _FEW = 4096  # numbers that are sorted sooner than counted
@@ -22,7 +23,7 @@ class Ranges:
 
     def __init__(self, fields: Sequence[Field]) -> None:
         self._fields = tuple(fields)
-        self._seen: dict[tuple[str, bool], list[NDArray[np.float64] | None]] = {}
+        self._seen: dict[tuple[str, bool], list[Floats | None]] = {}
 
     def add(self, fields: StepFields) -> None:
         """Take one more step in; the reference comes first."""
@@ -72,7 +73,7 @@ def even_limits(span: Sequence[float] | None, centre: float | None) -> tuple[flo
     return (low, high) if high > low else (low - 0.5, low + 0.5)
 
 
-def percentiles(values: NDArray[np.float32]) -> NDArray[np.float64] | None:
+def percentiles(values: NDArray[np.float32]) -> Floats | None:
     """The least, the 2nd and 98th percentile and the greatest of what is finite; None where nothing is."""
     keys = np.empty(values.size, np.uint32)
     count = _ordered_keys(np.ascontiguousarray(values).reshape(-1).view(np.uint32), keys)

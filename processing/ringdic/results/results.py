@@ -28,6 +28,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices
 from ringdic.errors import InputError
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.mesh.mesh import Mesh
@@ -40,8 +41,6 @@ from ringdic.strain.window import StrainWindow
 from ringdic.uncertainty.strain import overlap
 from ringdic.uncertainty.window import WindowScatter, window_scatter
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 SCHEMA = 2
 
 #: Arrays of a result that not every run has, and whether they have a number or a vector a point, or two numbers a face.
@@ -62,12 +61,12 @@ class Matches:
     """
 
     cameras: tuple[str, ...]
-    xy: Array
-    px: Array
-    c_ls: Array
-    sigma: Array
+    xy: Floats
+    px: Floats
+    c_ls: Floats
+    sigma: Floats
     status: NDArray[np.int8]
-    vertex: Ints
+    vertex: Indices
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -95,24 +94,24 @@ class Results:
     steps: tuple[str, ...]
     cameras: tuple[Camera, ...]
     pairs: tuple[tuple[str, str], ...]
-    vertices_ref: Array
-    vertices: Array
-    faces: Ints
-    pair: Ints
-    vertex_pair: Ints
-    correlation: Array
-    sigma_xyz: Array
+    vertices_ref: Floats
+    vertices: Floats
+    faces: Indices
+    pair: Indices
+    vertex_pair: Indices
+    correlation: Floats
+    sigma_xyz: Floats
     status: NDArray[np.int8]
     matches: tuple[Matches, ...] = ()
     settings: str = ""
     calibration: dict[str, Any] = field(default_factory=dict)
     summary: dict[str, Any] = field(default_factory=dict)
-    sigma_displacement: Array | None = None
-    sigma_lambda: Array | None = None
-    chi2: Array | None = None
-    sigma_calibration: Array | None = None
-    sigma_displacement_calibration: Array | None = None
-    sigma_lambda_calibration: Array | None = None
+    sigma_displacement: Floats | None = None
+    sigma_lambda: Floats | None = None
+    chi2: Floats | None = None
+    sigma_calibration: Floats | None = None
+    sigma_displacement_calibration: Floats | None = None
+    sigma_lambda_calibration: Floats | None = None
 
     def __post_init__(self) -> None:
         F, N, M = len(self.steps), len(self.vertices_ref), len(self.faces)
@@ -165,7 +164,7 @@ class Results:
             return None
         return window_scatter(window, lambda apart: overlap(apart * scale, radius), (2 * radius + 1) / scale)
 
-    def before(self, step: int, previous: bool = False) -> Array:
+    def before(self, step: int, previous: bool = False) -> Floats:
         """Positions (N, 3) mm that a step is compared with: the reference, or the step before it (NaN where lost)."""
         return self.vertices[step - 1] if previous and step > 0 else self.vertices_ref
 
@@ -225,7 +224,7 @@ class Results:
             _at(self.sigma_lambda_calibration, of_motion),
         )
 
-    def _since(self, sigma: Array | None, step: int, previous: bool) -> Array | None:
+    def _since(self, sigma: Floats | None, step: int, previous: bool) -> Floats | None:
         """Standard deviations of a step's motion, since the reference or since the step before it.
 
         Half of the variance of a motion since the reference is the reference image's, half the step's own: two
@@ -235,7 +234,7 @@ class Results:
             return _at(sigma, step)
         return np.asarray(np.sqrt(0.5 * (sigma[step] ** 2 + sigma[step - 1] ** 2)))
 
-    def _stretches_since(self, step: int, previous: bool) -> Array | None:
+    def _stretches_since(self, step: int, previous: bool) -> Floats | None:
         """The same of the stretches: the step before turned and sized the triangle, so both have their mean."""
         sigma = self._since(self.sigma_lambda, step, previous)
         if sigma is None or not previous or step < 2:
@@ -244,7 +243,7 @@ class Results:
         return np.broadcast_to(mean, sigma.shape)
 
 
-def _at(known: Array | None, step: int | None) -> Array | None:
+def _at(known: Floats | None, step: int | None) -> Floats | None:
     return None if known is None or step is None else known[step]
 
 
@@ -308,7 +307,7 @@ def read_mesh(path: Path) -> Mesh:
         return Mesh(file["ringdic/reference"][:], file["ringdic/faces"][:])
 
 
-def read_positions(path: Path, step: int, rigid_motion_removed: bool = False) -> Array:
+def read_positions(path: Path, step: int, rigid_motion_removed: bool = False) -> Floats:
     """Positions of the vertices at one step. (N, 3) mm, NaN where lost. Raises InputError for a step it has not."""
     with _open(path) as file:
         group, own = file["VTKHDF"], file["ringdic"]
@@ -331,7 +330,7 @@ def read_field(path: Path, name: str, step: int, rigid_motion_removed: bool = Fa
         entry = _field_in(path, group, name)
         place = "PointData" if entry.location == "point" else "CellData"
 
-        def array(stored: str) -> Array:
+        def array(stored: str) -> Floats:
             if stored != "displacement_without_rigid_motion":
                 return np.asarray(vtkhdf.read_step(group, place, stored, step), dtype=float)
             rows = len(own["reference"])

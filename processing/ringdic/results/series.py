@@ -14,9 +14,8 @@ from weakref import finalize
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.results.results import WHERE_KNOWN, Results
-
-Array = NDArray[np.float64]
 
 
 class Series(Protocol):
@@ -31,7 +30,7 @@ class Series(Protocol):
     @property
     def reference(self) -> Results: ...
     @property
-    def noise(self) -> Sequence[Array]: ...
+    def noise(self) -> Sequence[Floats]: ...
 
     def at(self, step: int) -> Results:
         """The results of the reference and a later step; of step 0 those of the reference alone."""
@@ -57,7 +56,7 @@ class InMemory:
         return self.at(0)
 
     @property
-    def noise(self) -> list[Array]:
+    def noise(self) -> list[Floats]:
         """See `Series`."""
         return [
             np.array([usual(*step) for step in zip(matches.sigma, matches.status, strict=True)])
@@ -73,7 +72,7 @@ class InMemory:
         return InMemory(replace(self.results, matches=()))
 
 
-def usual(sigma: NDArray[Any], status: NDArray[np.int8]) -> Array:
+def usual(sigma: NDArray[Any], status: NDArray[np.int8]) -> Floats:
     """The medians (C,) of the standard deviations (C, n, 2) px of good matches (n,); NaN where there are none."""
     good = [each[np.isfinite(each)] for each in sigma[:, status == 0]]
     return np.array([np.median(each) if len(each) else np.nan for each in good], dtype=float)

@@ -20,8 +20,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices
 from ringdic.calibration.bundle import BundleFit
 from ringdic.calibration.parameters import PER_CAMERA
 from ringdic.geometry.camera import Camera
@@ -37,9 +37,6 @@ from ringdic.uncertainty.calibration import (
 )
 from ringdic.uncertainty.position import covariance, position_gain
 from ringdic.uncertainty.strain import corners_alike, stretch_sigma
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 # The square of a stated deviation counts the noise of the reference and what the interpolation leaves of the other's.
 _BOTH = 1.85
@@ -73,7 +70,7 @@ class Stated:
     reference : the results of the reference alone. known : of the cameras, None where nothing is. noise : of `Series`.
     """
 
-    def __init__(self, reference: Results, known: CameraCovariance | None, noise: Sequence[Array]) -> None:
+    def __init__(self, reference: Results, known: CameraCovariance | None, noise: Sequence[Floats]) -> None:
         pairwise = any(len(matches.cameras) == 2 for matches in reference.matches)
         scattered = pairwise and reference.sigma_displacement is None
         self._scatter = _Scatter(reference, noise) if scattered else None
@@ -100,7 +97,7 @@ class _ByCalibration:
         self._at_first: Shares = shares(reference.cameras, places, _gain(reference, 0), known)
         self._position = sigma_of(self._at_first)
 
-    def of(self, results: Results, found: Deformation) -> dict[str, Array]:
+    def of(self, results: Results, found: Deformation) -> dict[str, Floats]:
         """The standard deviations at the reference and at the step of some results, by their names."""
         N, M = len(results.vertices_ref), len(results.faces)
         rows = [(self._position, np.zeros((N, 3)), np.zeros((M, 2)))]
@@ -113,7 +110,7 @@ class _ByCalibration:
         return {name: np.stack(values) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
 
 
-def _gain(results: Results, step: int) -> Array:
+def _gain(results: Results, step: int) -> Floats:
     """How the points of a step move with each pixel of each camera, (C, N, 3, 2) mm a px."""
     index = {camera.id: k for k, camera in enumerate(results.cameras)}
     sigma = np.full((len(results.cameras), len(results.vertices_ref), 2), np.nan)
@@ -133,8 +130,8 @@ class _Sources:
     gain : (4, N, 3, 2) mm a px. sigma : (4, N, 2) px.
     """
 
-    gain: Array
-    sigma: Array
+    gain: Floats
+    sigma: Floats
 
 
 class _Scatter:
@@ -144,7 +141,7 @@ class _Scatter:
     motion and light add to the others.
     """
 
-    def __init__(self, reference: Results, noise: Sequence[Array]) -> None:
+    def __init__(self, reference: Results, noise: Sequence[Floats]) -> None:
         self._shares = [_share_of_noise(level) for level in noise]
         group = tomllib.loads(reference.settings).get("correlation", {})
         radius, order = int(group.get("radius_px", 20)), int(group.get("order", 1))
@@ -157,7 +154,7 @@ class _Scatter:
         alike = corners_alike(px, reference.faces, radius, order)
         self._alike = np.concatenate([alike, alike])
 
-    def of(self, results: Results, step: int, found: Deformation) -> dict[str, Array]:
+    def of(self, results: Results, step: int, found: Deformation) -> dict[str, Floats]:
         """The standard deviations at the reference and at the step of some results, by their names."""
         N = len(results.vertices_ref)
         displacement, stretches = [np.zeros((N, 3))], [np.zeros((len(results.faces), 2))]
@@ -184,10 +181,10 @@ class _Pair:
     """
 
     cameras: tuple[Camera, ...]
-    vertex: Ints
-    held: Ints
-    px: Array
-    gain: Array
+    vertex: Indices
+    held: Indices
+    px: Floats
+    gain: Floats
 
     @classmethod
     def of(cls, results: Results, cameras: Mapping[str, Camera], k: int) -> _Pair:
@@ -200,7 +197,7 @@ class _Pair:
         return cls(own, matches.vertex, held, px, gain)
 
 
-def _share_of_noise(level: Array) -> Array:
+def _share_of_noise(level: Floats) -> Floats:
     """Of what each step's matches state, (F, 2) px, the share that is noise, (F, 2); NaN where nothing is stated."""
     later = level.copy()
     later[0] = np.nan  # the grid itself, or the match between the cameras
@@ -208,7 +205,7 @@ def _share_of_noise(level: Array) -> Array:
         return np.asarray(np.fmin.reduce(later, axis=0) / later)
 
 
-def _fill(parts: _Sources, xyz: Array, pair: _Pair, matches: Matches, share: Array) -> None:
+def _fill(parts: _Sources, xyz: Floats, pair: _Pair, matches: Matches, share: Floats) -> None:
     """Add the points of one pair. xyz : (N, 3) mm at the step. share : (2,) of what is stated, that is noise."""
     noise = matches.sigma[1][:, pair.held] / np.sqrt(_BOTH) * share[:, None, None]
     usable = (matches.status[1, pair.held] == 0) & np.isfinite(noise).all(axis=(0, 2))

@@ -12,10 +12,12 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices
+
 _CELL_GROUPS = ("Vertices", "Lines", "Polygons", "Strips")
 
 
-def create(file: h5py.File, faces: NDArray[np.int64], points: int, steps: int) -> h5py.Group:
+def create(file: h5py.File, faces: Indices, points: int, steps: int) -> h5py.Group:
     """A new group for ``steps`` steps of constant triangles (M, 3); :func:`write_step` fills its arrays."""
     group = file.create_group("VTKHDF", track_order=True)
     group.attrs["Version"] = np.array([2, 0], dtype=np.int64)
@@ -47,7 +49,7 @@ def create(file: h5py.File, faces: NDArray[np.int64], points: int, steps: int) -
 def write_step(
     group: h5py.Group,
     step: int,
-    positions: NDArray[np.float64],
+    positions: Floats,
     point: Mapping[str, NDArray[np.generic]],
     cell: Mapping[str, NDArray[np.generic]],
 ) -> None:
@@ -73,7 +75,7 @@ def read_step(group: h5py.Group, place: str, name: str, step: int) -> NDArray[np
     return np.asarray(group[place][name][start : start + rows])
 
 
-def read_steps(group: h5py.Group, name: str, kind: str, steps: int) -> NDArray[np.float64] | None:
+def read_steps(group: h5py.Group, name: str, kind: str, steps: int) -> Floats | None:
     """An array of all steps, None where there is none: kind "point" (F, N), "vector" (F, N, 3), "face" (F, M, 2)."""
     places = [f"CellData/{name}{k}" for k in (1, 2)] if kind == "face" else [f"PointData/{name}"]
     if not all(place in group for place in places):

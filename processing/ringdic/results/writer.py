@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.results import vtkhdf
 from ringdic.results.fields import StepFields, available, compute_fields
 from ringdic.results.json_values import plain
@@ -26,7 +27,6 @@ from ringdic.strain.deformation import Deformation
 from ringdic.strain.rigid_motion import RigidMotion
 from ringdic.strain.window import strain_window
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 #: Arrays kept for every step as they are; the other fields follow from them and from the positions.
@@ -89,7 +89,7 @@ class Written:
     motion : back onto the reference. matches : of the step alone.
     """
 
-    positions: Array
+    positions: Floats
     point: dict[str, NDArray[Any]]
     face: dict[str, NDArray[Any]]
     extent: Extent
@@ -191,5 +191,5 @@ class ResultsWriter:
             group.create_dataset(name, shape=(len(self._names), *values.shape[1:]), dtype=values.dtype)
 
 
-def _kept(arrays: dict[str, Array]) -> dict[str, NDArray[np.float32]]:
+def _kept(arrays: dict[str, Floats]) -> dict[str, NDArray[np.float32]]:
     return {name: values.astype(np.float32) for name, values in arrays.items() if name in _KEPT}

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Mask
 from ringdic.errors import InputError
 
 # What OpenCV finds wrong with a file is said in a sentence that names the file; its own lines do not.
@@ -69,7 +70,7 @@ def _weighed(image: NDArray) -> NDArray:
     return total
 
 
-def read_mask(path: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
+def read_mask(path: Path, shape: tuple[int, int]) -> Mask:
     """The region of interest (height, width), true where the mask image is not black.
 
     InputError if the size differs from ``shape`` or nothing is marked.

@@ -13,10 +13,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.strain import families as strain
 from ringdic.strain import kernels
 
-Array = NDArray[np.float64]
 _I = np.eye(3)
 
 
@@ -45,95 +45,95 @@ class Deformation:
     Other families of strain follow from the stretches and directions: :mod:`ringdic.strain.families`.
     """
 
-    F: Array
-    E: Array
-    J: Array
-    lambda1: Array
-    lambda2: Array
-    E1: Array
-    E2: Array
-    direction1_reference: Array
-    direction2_reference: Array
-    direction1_current: Array
-    direction2_current: Array
-    directors_reference: Array
-    directors_current: Array
-    area: Array
-    isotropy: Array
+    F: Floats
+    E: Floats
+    J: Floats
+    lambda1: Floats
+    lambda2: Floats
+    E1: Floats
+    E2: Floats
+    direction1_reference: Floats
+    direction2_reference: Floats
+    direction1_current: Floats
+    direction2_current: Floats
+    directors_reference: Floats
+    directors_current: Floats
+    area: Floats
+    isotropy: Floats
 
     def __post_init__(self) -> None:
         if self.F.shape[-2:] != (3, 3) or self.E.shape != self.F.shape or self.J.shape != self.F.shape[:-2]:
             raise ValueError("deformation fields of different shapes")
 
     @cached_property
-    def e(self) -> Array:
+    def e(self) -> Floats:
         """Euler-Almansi strain."""
         out = np.empty_like(self.F)
         kernels.euler_almansi(_matrices(self.directors_reference), _matrices(self.directors_current), _matrices(out))
         return out
 
     @property
-    def e1(self) -> Array:
+    def e1(self) -> Floats:
         """The smaller principal value of e."""
         return self.E1 / (1.0 + 2.0 * self.E1)  # e = ½ (1 - λ⁻²), monotonic in E
 
     @property
-    def e2(self) -> Array:
+    def e2(self) -> Floats:
         """The larger principal value of e."""
         return self.E2 / (1.0 + 2.0 * self.E2)
 
     @property
-    def E_magnitude(self) -> Array:
+    def E_magnitude(self) -> Floats:
         """Frobenius norm of E."""
         return _norm(self.E)
 
     @property
-    def e_magnitude(self) -> Array:
+    def e_magnitude(self) -> Floats:
         """Frobenius norm of e."""
         return _norm(self.e)
 
     @property
-    def E_equivalent(self) -> Array:
+    def E_equivalent(self) -> Floats:
         """√(⅔ dev:dev) of E."""
         return _equivalent(self.E)
 
     @property
-    def e_equivalent(self) -> Array:
+    def e_equivalent(self) -> Floats:
         """√(⅔ dev:dev) of e."""
         return _equivalent(self.e)
 
     @property
-    def E_shear(self) -> Array:
+    def E_shear(self) -> Floats:
         """Largest in-plane shear strain of E."""
         return strain.shear(self.E1, self.E2)
 
     @property
-    def e_shear(self) -> Array:
+    def e_shear(self) -> Floats:
         """Largest in-plane shear strain of e."""
         return strain.shear(self.e1, self.e2)
 
     @property
-    def shear_direction_reference(self) -> Array:
+    def shear_direction_reference(self) -> Floats:
         """The two lines of largest shear in the reference configuration."""
         return _diagonals(self.direction1_reference, self.direction2_reference)
 
     @property
-    def shear_direction_current(self) -> Array:
+    def shear_direction_current(self) -> Floats:
         """The two lines of largest shear in the current configuration."""
         return _diagonals(self.direction1_current, self.direction2_current)
 
     @property
-    def normal_reference(self) -> Array:
+    def normal_reference(self) -> Floats:
         """Unit normals of the reference configuration."""
         return self.directors_reference[..., 2, :]
 
     @property
-    def normal_current(self) -> Array:
+    def normal_current(self) -> Floats:
         """Unit normals of the current configuration."""
         return self.directors_current[..., 2, :]
 
 
-def deformation(reference: Array, current: Array, faces: NDArray[np.int_]) -> Deformation:
+def deformation(reference: Floats, current: Floats, faces: NDArray[np.int_]) -> Deformation:
     """Every field of the triangles ``faces`` between two configurations.
 
     Parameters
@@ -148,7 +148,7 @@ def deformation(reference: Array, current: Array, faces: NDArray[np.int_]) -> De
     return of_directors(D, d, area, isotropy(current, faces))
 
 
-def of_directors(D: Array, d: Array, area: Array, isotropy: Array) -> Deformation:
+def of_directors(D: Floats, d: Floats, area: Floats, isotropy: Floats) -> Deformation:
     """The same from directors (..., M, 3, 3), rows D1 D2 in the tangent plane and D3 the unit normal, before and after.
 
     area : (M,) mm². isotropy : (..., M).
@@ -170,7 +170,7 @@ def of_directors(D: Array, d: Array, area: Array, isotropy: Array) -> Deformatio
     )  # fmt: skip
 
 
-def directors(vertices: Array, faces: NDArray[np.int_]) -> tuple[Array, Array]:
+def directors(vertices: Floats, faces: NDArray[np.int_]) -> tuple[Floats, Floats]:
     """Directors (..., M, 3, 3), rows D1 D2 D3 (eq. 12), and areas (..., M) mm², of vertices (..., N, 3) mm."""
     vertices, faces = _steps(vertices), np.ascontiguousarray(faces)
     D, area = np.empty((*vertices.shape[:-2], len(faces), 3, 3)), np.empty((*vertices.shape[:-2], len(faces)))
@@ -180,7 +180,7 @@ def directors(vertices: Array, faces: NDArray[np.int_]) -> tuple[Array, Array]:
     return D, area
 
 
-def isotropy(vertices: Array, faces: NDArray[np.int_]) -> Array:
+def isotropy(vertices: Floats, faces: NDArray[np.int_]) -> Floats:
     """Shape of triangles, (..., M), 1 equilateral … 0 degenerate: ``2 σ2/(σ2 + σ3)`` of ``X Xᵀ/3`` about centroids."""
     vertices, faces = _steps(vertices), np.ascontiguousarray(faces)
     out = np.empty((*vertices.shape[:-2], len(faces)))
@@ -188,24 +188,24 @@ def isotropy(vertices: Array, faces: NDArray[np.int_]) -> Array:
     return out
 
 
-def _steps(vertices: Array) -> Array:
+def _steps(vertices: Floats) -> Floats:
     return np.ascontiguousarray(vertices, dtype=float)
 
 
-def _matrices(tensors: Array) -> Array:
+def _matrices(tensors: Floats) -> Floats:
     """Contiguous tensors (..., 3, 3) in one row, (n, 3, 3), without a copy."""
     return tensors.reshape(-1, 3, 3)
 
 
-def _norm(T: Array) -> Array:
+def _norm(T: Floats) -> Floats:
     return np.sqrt(np.einsum("...ij,...ij->...", T, T))
 
 
-def _equivalent(T: Array) -> Array:
+def _equivalent(T: Floats) -> Floats:
     deviator = T - np.einsum("...ii->...", T)[..., None, None] / 3.0 * _I
     return np.sqrt(2.0 / 3.0) * _norm(deviator)
 
 
-def _diagonals(first: Array, second: Array) -> Array:
+def _diagonals(first: Floats, second: Floats) -> Floats:
     """The two unit lines half-way between two perpendicular unit directions, stacked on the last axis but one."""
     return np.stack([first + second, second - first], axis=-2) / np.sqrt(2.0)

@@ -5,28 +5,27 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ringdic.arrays import Floats
 
 
 @dataclass(frozen=True)
 class RigidMotion:
     """``x -> R x + t``. R : (3, 3) proper rotation; t : (3,) mm."""
 
-    R: Array
-    t: Array
+    R: Floats
+    t: Floats
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "R", np.asarray(self.R, dtype=float).reshape(3, 3))
         object.__setattr__(self, "t", np.asarray(self.t, dtype=float).reshape(3))
 
-    def apply(self, xyz: Array) -> Array:
+    def apply(self, xyz: Floats) -> Floats:
         """Moved points, (..., 3) mm."""
         x, y, z = np.moveaxis(np.asarray(xyz, dtype=float), -1, 0)  # a product with so small a matrix is slower
         return np.stack([x * a + y * b + z * c + t for (a, b, c), t in zip(self.R, self.t, strict=True)], axis=-1)
 
-    def rotate(self, directions: Array) -> Array:
+    def rotate(self, directions: Floats) -> Floats:
         """Turned directions, (..., 3); the translation does not act on them."""
         return np.asarray(directions, dtype=float) @ self.R.T
 
@@ -39,7 +38,7 @@ class RigidMotion:
         return float(np.arctan2(sine, 0.5 * (np.trace(self.R) - 1.0)))
 
 
-def kabsch(source: Array, destination: Array, weights: Array | None = None) -> RigidMotion:
+def kabsch(source: Floats, destination: Floats, weights: Floats | None = None) -> RigidMotion:
     """The rigid motion that takes ``source`` to ``destination`` with the least sum of squared distances.
 
     Parameters
@@ -64,7 +63,7 @@ def kabsch(source: Array, destination: Array, weights: Array | None = None) -> R
     return RigidMotion(R, q_mean - R @ p_mean)
 
 
-def motion_to_reference(reference: Array, current: Array, weights: Array | None = None) -> RigidMotion:
+def motion_to_reference(reference: Floats, current: Floats, weights: Floats | None = None) -> RigidMotion:
     """The motion that takes the current configuration back onto the reference; identity if too few points remain.
 
     reference, current : (n, 3) mm. ``motion.apply(current) - reference`` is the displacement without rigid motion.

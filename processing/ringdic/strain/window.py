@@ -23,13 +23,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.mesh import geodesic
 from ringdic.mesh.mesh import Mesh
 from ringdic.strain.deformation import Deformation, directors, isotropy, of_directors
-
-Array = NDArray[np.float64]
 
 _FEWEST = 4  # points of a window; three determine the plane and say nothing of its fit
 _SLENDER = 0.02  # smallest ratio of the second moments along and across: below it, the points lie on a line
@@ -52,11 +50,11 @@ class StrainWindow:
             raise ValueError(f"windows of shape {self.members.shape} do not go with the mesh")
 
     @property
-    def points(self) -> NDArray[np.int64]:
+    def points(self) -> Indices:
         """Number of vertices in each window, (M,)."""
         return np.diff(self.members.indptr).astype(np.int64)
 
-    def deformation(self, current: Array, reference: Array | None = None) -> Deformation:
+    def deformation(self, current: Floats, reference: Floats | None = None) -> Deformation:
         """Every deformation field of one step over the windows, one for each triangle.
 
         current, reference : (N, 3) mm, NaN where lost; the reference is the mesh's own unless given. A vertex that is
@@ -67,7 +65,7 @@ class StrainWindow:
         reference = self.mesh.vertices if reference is None else np.asarray(reference, dtype=float)
         faces = self.mesh.faces
         own, area = directors(self.mesh.vertices, faces)
-        whole: NDArray[np.bool_] = np.asarray(np.isfinite(np.hstack([current, reference])).all(axis=1))
+        whole: Mask = np.asarray(np.isfinite(np.hstack([current, reference])).all(axis=1))
         middle = np.mean(self.mesh.vertices[whole], axis=0) if whole.any() else np.zeros(3)
         X = np.where(whole[:, None], self.mesh.vertices - middle, 0.0)  # the mesh's coordinates serve both fits
         a1 = own[:, 0] / np.linalg.norm(own[:, 0], axis=1, keepdims=True)
@@ -78,7 +76,7 @@ class StrainWindow:
         inverse = np.full_like(S, np.nan)
         inverse[usable] = np.linalg.inv(S[usable])
 
-        def fitted(positions: Array) -> Array:
+        def fitted(positions: Floats) -> Floats:
             """Directors of the fitted plane (M, 3, 3): rows d1 d2 along the tangents, d3 the normal."""
             Y = np.where(whole[:, None], positions - X, 0.0)  # the rest beside the reference: few digits are lost
             cross = self._cross_moments(X, Y, count, mean) + moment
@@ -92,7 +90,7 @@ class StrainWindow:
                 area, isotropy(current, faces),
             )  # fmt: skip
 
-    def _moments(self, whole: NDArray[np.bool_], X: Array) -> tuple[Array, Array, Array]:
+    def _moments(self, whole: Mask, X: Floats) -> tuple[Floats, Floats, Floats]:
         """Number (M,), mean (M, 3) and second central moment (M, 3, 3) of the points of each window, sums over them."""
         count = self.members @ whole.astype(float)
         safe = np.maximum(count, 1.0)[:, None]
@@ -100,7 +98,7 @@ class StrainWindow:
         second = (self.members @ _outer(X, X)).reshape(-1, 3, 3)
         return count, mean, second - count[:, None, None] * mean[:, :, None] * mean[:, None, :]
 
-    def _cross_moments(self, X: Array, Y: Array, count: Array, mean: Array) -> Array:
+    def _cross_moments(self, X: Floats, Y: Floats, count: Floats, mean: Floats) -> Floats:
         """Sums over each window of ``(X - mean) ⊗ Y``, (M, 3, 3)."""
         second = (self.members @ _outer(X, Y)).reshape(-1, 3, 3)
         return np.asarray(second - mean[:, :, None] * (self.members @ Y)[:, None, :])
@@ -150,11 +148,11 @@ class Gauge:
         return (self.points_across - 1.0) * self.step + self.subset
 
 
-def _outer(X: Array, Y: Array) -> Array:
+def _outer(X: Floats, Y: Floats) -> Floats:
     return (X[:, :, None] * Y[:, None, :]).reshape(len(X), 9)
 
 
-def _spans_plane(S: Array) -> NDArray[np.bool_]:
+def _spans_plane(S: Floats) -> Mask:
     """Whether points with second moments S (M, 2, 2) are spread in both directions."""
     trace, determinant = S[:, 0, 0] + S[:, 1, 1], S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] * S[:, 1, 0]
     with np.errstate(invalid="ignore", divide="ignore"):

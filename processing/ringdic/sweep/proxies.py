@@ -9,20 +9,18 @@ from __future__ import annotations
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.correlation import Row
 from ringdic.geometry import lens
 from ringdic.geometry.camera import Camera
-
-Array = NDArray[np.float64]
 
 _APART = 4  # radii from one that is followed exactly to the next
 _AROUND = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=float)
 _NO_LENS = np.zeros(5)
 
 
-def on_cylinder(camera: Camera, px: Array, radii: Array) -> Array:
+def on_cylinder(camera: Camera, px: Floats, radii: Floats) -> Floats:
     """Nearer intersections (n, K, 3) mm of lines of sight through px (n, 2) with cylinders about z; NaN if none.
 
     radii : mm, (K,), or (n, K), each line's own.
@@ -39,10 +37,10 @@ def on_cylinder(camera: Camera, px: Array, radii: Array) -> Array:
 def stereo_hypotheses(
     first: Camera,
     second: Camera,
-    px: Array,
-    radii: Array,
+    px: Floats,
+    radii: Floats,
     half_width: float,
-    between: tuple[Array, Array] | None = None,
+    between: tuple[Floats, Floats] | None = None,
 ) -> Row:
     """Warps from positions px (n, 2) of the first image into the second, for proxies of the given radii (K,) mm.
 
@@ -109,7 +107,7 @@ def _follow(origin, rays, px, radii, low, high, P, K, distortion, size, half_wid
                 warps[i, k, 5] = (seen[3, 1] - seen[4, 1]) / (2 * half_width) - 1
 
 
-def sweep_radii(radius: float, reach: float, spacing: float) -> Array:
+def sweep_radii(radius: float, reach: float, spacing: float) -> Floats:
     """Radii (K,) mm of the sweep: ± reach about a radius in steps near ``spacing``, all positive."""
     count = max(3, 2 * round(reach / spacing) + 1)
     radii = np.linspace(radius - reach, radius + reach, count)

@@ -16,17 +16,15 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Mask
 from ringdic.geometry.camera import Camera
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class Lattice:
     """Positions on a regular lattice over an image. ``xy`` (rows, columns, 2) px, ``spacing`` px."""
 
-    xy: Array
+    xy: Floats
     spacing: int
 
 
@@ -38,7 +36,7 @@ def lattice(size: tuple[int, int], spacing: int, margin: int) -> Lattice:
     return Lattice(np.stack(np.meshgrid(x, y), axis=-1), spacing)
 
 
-def coherent(radius: Array, convincing: Mask, tolerance: float, least: int = 0) -> Mask:
+def coherent(radius: Floats, convincing: Mask, tolerance: float, least: int = 0) -> Mask:
     """Lattice positions whose radius (rows, columns) mm agrees with the convincing ones around it.
 
     At least three of the 8 neighbours must be convincing, and the radius must lie within ``tolerance`` mm of their
@@ -66,7 +64,7 @@ def coherent(radius: Array, convincing: Mask, tolerance: float, least: int = 0) 
     return np.asarray(np.append(False, kept)[labels])
 
 
-def contrast(image: NDArray[np.generic], xy: Array, half_width: int) -> Array:
+def contrast(image: NDArray[np.generic], xy: Floats, half_width: int) -> Floats:
     """Root mean square of the grey level's gradient in a square about each position (..., 2) of an image. (...).
 
     By Sobel's differences, of what of the square lies inside the image.
@@ -100,7 +98,7 @@ def _contrast(image, xy, half_width, out):  # type: ignore[no-untyped-def]
         out[k] = math.sqrt(total / count) / 8.0 if count else 0.0
 
 
-def lattice_normals(xyz: Array) -> Array:
+def lattice_normals(xyz: Floats) -> Floats:
     """Outward unit normals (rows, columns, 3) of a lattice of points (rows, columns, 3), NaN where unknown.
 
     Differences reach over two neighbours where they exist; outward is away from the z axis.
@@ -115,7 +113,7 @@ def lattice_normals(xyz: Array) -> Array:
     return normals
 
 
-def well_seen(xyz: Array, cameras: tuple[Camera, Camera], limit_deg: float) -> Mask:
+def well_seen(xyz: Floats, cameras: tuple[Camera, Camera], limit_deg: float) -> Mask:
     """Lattice positions that both cameras see under less than ``limit_deg``. (rows, columns)."""
     normals = lattice_normals(xyz)
     limit = np.cos(np.radians(limit_deg))
@@ -141,7 +139,7 @@ def paint(points: Lattice, good: Mask, size: tuple[int, int]) -> Mask:
     return region
 
 
-def _difference(xyz: Array, axis: int) -> Array:
+def _difference(xyz: Floats, axis: int) -> Floats:
     """Central difference along a lattice axis, one-sided where a neighbour is missing."""
     forward = np.full_like(xyz, np.nan)
     backward = np.full_like(xyz, np.nan)

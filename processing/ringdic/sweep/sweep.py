@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Image, Mask
 from ringdic.correlation import CorrelationSettings, Current, search_row
 from ringdic.correlation.start_field import lattice_spacing
 from ringdic.geometry.camera import Camera
@@ -26,10 +26,6 @@ _LEAST_CONTRAST = 0.3
 _BEYOND = 3.0  # mm, past the radii of positions nearby; farther off no position is believed
 #: Subset radii from one position of the sweep to the next, to a multiple of the grid's step.
 SWEEP_RADII = 1.5
-
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8] | NDArray[np.uint16]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -56,13 +52,13 @@ class Sweep:
     """
 
     points: Lattice
-    px: Array
-    warps: Array
-    xyz: Array
+    px: Floats
+    warps: Floats
+    xyz: Floats
     good: Mask
 
 
-def radii_of(cameras: tuple[Camera, Camera], search: Search) -> Array:
+def radii_of(cameras: tuple[Camera, Camera], search: Search) -> Floats:
     """Radii (K,) mm of the sweep, so close that the match moves by 1.5 px from one to the next."""
     first, second = cameras
     towards = first.centre[:2] + second.centre[:2]
@@ -79,7 +75,7 @@ def sweep(
     image: Image,
     current: Current,
     mask: Mask | None,
-    radii: Array,
+    radii: Floats,
     search: Search,
     settings: CorrelationSettings,
     least: int = 0,
@@ -98,7 +94,7 @@ def sweep(
     hit[drawn] = np.isfinite(on_cylinder(first, px[drawn], radii[-1:])).all(axis=(1, 2))
     warps, which, believed = np.full((len(px), 6), np.nan), np.zeros(len(px), np.int64), np.zeros(len(px), bool)
 
-    def look(wanted: Mask, between: tuple[Array, Array] | None = None) -> None:
+    def look(wanted: Mask, between: tuple[Floats, Floats] | None = None) -> None:
         at = np.flatnonzero(wanted)
         within = None if between is None else (between[0][at], between[1][at])
         row = stereo_hypotheses(first, second, px[at], radii, settings.radius, within)
@@ -129,7 +125,7 @@ def _few(shape: tuple[int, ...]) -> Mask:
     return few
 
 
-def _near(radius: Array) -> tuple[Mask, tuple[Array, Array]]:
+def _near(radius: Floats) -> tuple[Mask, tuple[Floats, Floats]]:
     """Positions (n,) of a lattice no farther than two from one whose radius (rows, columns) mm is known, and between
     which radii (n,) theirs is looked for: as far beyond those about them as those differ, and a little more."""
     reach, known = np.ones((5, 5), np.uint8), np.isfinite(radius)
@@ -139,7 +135,7 @@ def _near(radius: Array) -> tuple[Mask, tuple[Array, Array]]:
     return high > 0.0, (low - beyond, high + beyond)
 
 
-def convincing(search: Search, zncc: Array, second_best: Array) -> Mask:
+def convincing(search: Search, zncc: Floats, second_best: Floats) -> Mask:
     """Matches (n,) of a sweep that look alike enough, and more so than any other place on the line."""
     with np.errstate(invalid="ignore"):
         return np.asarray((zncc > search.zncc_min) & (second_best < 0.9 * zncc))

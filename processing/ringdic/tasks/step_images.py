@@ -5,15 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ringdic.arrays import Image
 from ringdic.errors import InputError
 from ringdic.geometry.camera import Camera
 from ringdic.session.folder import Capture, Session
 from ringdic.tasks import file_digest, kept
-
-Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 def step_image(path: Path, camera: Camera) -> Image:

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Mask
 from ringdic.calibration.parameters import PER_CAMERA, Parameters, projection_jacobians
 from ringdic.geometry.camera import Camera
 from ringdic.strain.deformation import Deformation
 from ringdic.uncertainty.strain import stretch_slopes
 
-Array = NDArray[np.float64]
 Shares = NDArray[np.float32]
 
 _BLOCK = 4096  # points or triangles at a time, which bounds the memory
@@ -33,7 +33,7 @@ class CameraCovariance:
     """
 
     ids: tuple[str, ...]
-    parameters: Array
+    parameters: Floats
 
     def __post_init__(self) -> None:
         size = PER_CAMERA * len(self.ids)
@@ -41,7 +41,7 @@ class CameraCovariance:
             raise ValueError("a covariance of cameras has sixteen parameters a camera")
 
     @property
-    def root(self) -> Array:
+    def root(self) -> Floats:
         """R with R Rᵀ the covariance; parameters that were held have none."""
         values, vectors = np.linalg.eigh(self.parameters)
         return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
@@ -49,10 +49,10 @@ class CameraCovariance:
 
 def shares(
     cameras: Sequence[Camera],
-    xyz: Array,
-    gain: Array,
+    xyz: Floats,
+    gain: Floats,
     known: CameraCovariance,
-    followed: tuple[Array, Shares] | None = None,
+    followed: tuple[Floats, Shares] | None = None,
 ) -> Shares:
     """How points move with the independent errors of the cameras, (n, 3, S) mm; NaN where a point has no gain.
 
@@ -69,7 +69,7 @@ def shares(
         raise ValueError(f"no covariance of camera {', '.join(missing)}; it took no part in the adjustment")
     root = known.root.astype(np.float32)
     out = np.full((len(xyz), 3, len(root)), np.nan, dtype=np.float32)
-    seen: NDArray[np.bool_] = np.asarray(gain.any(axis=(2, 3)) & np.isfinite(xyz).all(axis=1))
+    seen: Mask = np.asarray(gain.any(axis=(2, 3)) & np.isfinite(xyz).all(axis=1))
     for first in range(0, len(xyz), _BLOCK):
         part = slice(first, first + _BLOCK)
         moved = np.zeros((len(xyz[part]), 3, len(root)), dtype=np.float32)
@@ -92,14 +92,14 @@ def shares(
     return out
 
 
-def sigma_of(share: Shares) -> Array:
+def sigma_of(share: Shares) -> Floats:
     """Standard deviations (...) of quantities with shares (..., S)."""
     return np.asarray(np.sqrt(np.einsum("...s,...s->...", share, share)), dtype=float)
 
 
 def stretch_sigma_by_cameras(
-    found: Deformation, reference: Array, faces: NDArray[np.int_], at_first: Shares, now: Shares
-) -> Array:
+    found: Deformation, reference: Floats, faces: NDArray[np.int_], at_first: Shares, now: Shares
+) -> Floats:
     """Standard deviations (M, 2) of λ1 and λ2 by those of the cameras.
 
     found : deformation of the step. reference : (N, 3) mm. faces : (M, 3). at_first, now : shares (N, 3, S) of the

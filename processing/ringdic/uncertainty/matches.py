@@ -11,11 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.uncertainty.texture import Texture
-
-Array = NDArray[np.float64]
 
 # The interpolation of the current image smooths its noise: the mean of the squared response of the quintic spline over
 # all fractions of a pixel and frequencies, in two directions.
@@ -37,10 +35,10 @@ class MatchParts:
     the reference. Either image has its part in it, which no one pair can tell.
     """
 
-    reference: Array
-    current: Array
-    systematic: Array
-    reference_systematic: Array
+    reference: Floats
+    current: Floats
+    systematic: Floats
+    reference_systematic: Floats
 
     def __post_init__(self) -> None:
         shapes = {values.shape for values in vars(self).values()}
@@ -49,11 +47,11 @@ class MatchParts:
 
 
 def match_parts(
-    sigma: Array,
-    c_ls: Array,
+    sigma: Floats,
+    c_ls: Floats,
     textures: tuple[Texture, Texture],
     noise: tuple[float, float],
-    gradient: Array | None = None,
+    gradient: Floats | None = None,
 ) -> MatchParts:
     """Part the standard deviations that a correlation states from its residuals.
 

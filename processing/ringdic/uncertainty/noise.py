@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float64]
+from ringdic.arrays import Floats
+
+Image = NDArray[np.uint8] | NDArray[np.uint16] | Floats
 
 _QUANTISED = 1.0 / 12.0  # grey levels², the variance of rounding to whole ones
 # Differences of differences in x and y: blind to whatever is a plane, a ridge or an edge along either axis.
@@ -61,7 +62,7 @@ def rest_noise(images: Sequence[Image]) -> float:
     return max(float(stack.var(axis=0, ddof=1).mean()), _QUANTISED)
 
 
-def camera_noise(flat: float, c_ls: Array, contrast: Array) -> float:
+def camera_noise(flat: float, c_ls: Floats, contrast: Floats) -> float:
     """Variance of one camera's noise from its reference image and from how well its own images agree.
 
     flat : of the reference image by ``flat_noise``. c_ls : (F, n) of matches in time, NaN where lost; contrast : (n,)

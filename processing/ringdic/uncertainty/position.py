@@ -17,16 +17,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices
 from ringdic.geometry import kernels
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.triangulation import LinearSystem
 
-Array = NDArray[np.float64]
 
-
-def position_gain(cameras: Sequence[Camera], xyz: Array, sigma: Array) -> Array:
+def position_gain(cameras: Sequence[Camera], xyz: Floats, sigma: Floats) -> Floats:
     """``A_c``: how points move with each pixel of each camera, mm a px. (C, n, 3, 2), zero where one takes no part.
 
     xyz : (n, 3) mm, as ``triangulate_weighted`` found them with sigma : (C, n, 2) px, NaN for a camera that took no
@@ -42,7 +40,7 @@ def position_gain(cameras: Sequence[Camera], xyz: Array, sigma: Array) -> Array:
     return gain
 
 
-def covariance(gain: Array, sigma: Array) -> Array:
+def covariance(gain: Floats, sigma: Floats) -> Floats:
     """``Σ A_c diag(σ_c²) A_cᵀ`` (n, 3, 3) mm², of a gain (C, n, 3, 2) and independent errors (C, n, 2) px.
 
     NaN where fewer than two cameras take part.
@@ -51,7 +49,7 @@ def covariance(gain: Array, sigma: Array) -> Array:
     return np.asarray(found)
 
 
-def along_surface(cameras: Sequence[Camera], reference: NDArray[np.int64], xyz: Array, normals: Array) -> Array:
+def along_surface(cameras: Sequence[Camera], reference: Indices, xyz: Floats, normals: Floats) -> Floats:
     """``B = ∂X/∂p``: how the point of the surface that a pixel shows moves with that pixel, mm a px. (n, 3, 2).
 
     reference : (n,) index of the camera. xyz, normals : (n, 3). The inverse of the projection, restricted to the
@@ -68,7 +66,7 @@ def along_surface(cameras: Sequence[Camera], reference: NDArray[np.int64], xyz: 
     return out
 
 
-def reference_covariance(gain: Array, sigma: Array, reference: NDArray[np.int64], label: Array) -> Array:
+def reference_covariance(gain: Floats, sigma: Floats, reference: Indices, label: Floats) -> Floats:
     """Covariance (n, 3, 3) mm² of reference positions named by a pixel of their reference camera, over repeated noise.
 
     gain : (C, n, 3, 2). sigma : (C, n, 2) px, of the noise of each image alone. reference : (n,). label : (n, 3, 2) of
@@ -80,8 +78,8 @@ def reference_covariance(gain: Array, sigma: Array, reference: NDArray[np.int64]
 
 
 def step_covariance(
-    gains: tuple[Array, Array], sigma: Array, tracked: tuple[Array, Array], reference: NDArray[np.int64], label: Array
-) -> Array:
+    gains: tuple[Floats, Floats], sigma: Floats, tracked: tuple[Floats, Floats], reference: Indices, label: Floats
+) -> Floats:
     """Covariance (n, 3, 3) mm² of the same points at a later step.
 
     gains : (C, n, 3, 2), of the reference and of the step. sigma : (C, n, 2) px, as for the reference. tracked :
@@ -109,7 +107,7 @@ def step_covariance(
     return total
 
 
-def position_sigma(cameras: Sequence[Camera], px: Array, sigma: Array) -> Array:
+def position_sigma(cameras: Sequence[Camera], px: Floats, sigma: Floats) -> Floats:
     """Standard deviations of linearly triangulated points from those of their pixels, taken as independent.
 
     Parameters
@@ -125,7 +123,7 @@ def position_sigma(cameras: Sequence[Camera], px: Array, sigma: Array) -> Array:
     return linear_sigma(cameras, LinearSystem.of(cameras, px), sigma)
 
 
-def linear_sigma(cameras: Sequence[Camera], system: LinearSystem, sigma: Array) -> Array:
+def linear_sigma(cameras: Sequence[Camera], system: LinearSystem, sigma: Floats) -> Floats:
     """The same of points whose equations are there already; sigma (C, n, 2) px.
 
     The linear solution minimises ``|A(px) X - b(px)|²``; for consistent pixels its change is ``dX = -(AᵀA)⁻¹ Aᵀ dr``

@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ringdic.arrays import Floats
 from ringdic.strain import kernels
 from ringdic.strain.deformation import Deformation, directors
 
-Array = NDArray[np.float64]
 Faces = NDArray[np.int_]
 
 # Slopes are not spread evenly over a subset, and its gradient is found with its place: both make neighbours a little
@@ -22,7 +22,7 @@ Faces = NDArray[np.int_]
 _UNEVEN = 1.15
 
 
-def overlap(distance: Array, radius: float, order: int = 1) -> Array:
+def overlap(distance: Floats, radius: float, order: int = 1) -> Floats:
     """Correlation of the errors that white noise gives two subsets at a distance, px, of one image. (...).
 
     First order: the place is the mean over the disc, and two means have in common what the discs do. Second order: the
@@ -36,7 +36,7 @@ def overlap(distance: Array, radius: float, order: int = 1) -> Array:
     return np.asarray(np.interp(h, grid, values))
 
 
-def corners_alike(px: Array, faces: Faces, radius: float, order: int = 1) -> Array:
+def corners_alike(px: Floats, faces: Faces, radius: float, order: int = 1) -> Floats:
     """Correlations (C, M, 3) of the errors of corners 0 and 1, 1 and 2, 2 and 0 of each triangle; 0 where not seen.
 
     px : (C, N, 2) where each camera saw the points in its reference image. faces : (M, 3). radius, order : of subsets.
@@ -51,12 +51,12 @@ def corners_alike(px: Array, faces: Faces, radius: float, order: int = 1) -> Arr
 
 def stretch_sigma(
     found: Deformation,
-    reference: Array,
+    reference: Floats,
     faces: Faces,
-    gain: Array,
-    alike: Array,
-    sigma: Array,
-) -> Array:
+    gain: Floats,
+    alike: Floats,
+    sigma: Floats,
+) -> Floats:
     """Standard deviations (M, 2) of λ1 and λ2 of one step from the noise of its images.
 
     Parameters
@@ -75,8 +75,8 @@ def stretch_sigma(
 
 
 def stretch_slopes(
-    found: Deformation, reference: Array, faces: Faces, current_only: bool = False
-) -> tuple[Array, Array]:
+    found: Deformation, reference: Floats, faces: Faces, current_only: bool = False
+) -> tuple[Floats, Floats]:
     """How λ1 and λ2 move with the current positions of the corners, and, turned about, with the reference ones.
 
     (2, M, 3, 3) each: stretch, triangle, corner, component. ``δλ = Σ_k g_k · δx_k - Σ_k h_k · δX_k`` with
@@ -90,7 +90,7 @@ def stretch_slopes(
     return current, before
 
 
-def _curved() -> tuple[Array, Array]:
+def _curved() -> tuple[Floats, Floats]:
     """Correlation of the weight 4 - 6 ρ² on a disc with itself, at distances 0 … 1 diameters."""
     n = 40
     axis = (np.arange(2 * n + 1) - n) / n

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float64]
+from ringdic.arrays import Floats, Indices, Mask
+
+Image = NDArray[np.uint8] | NDArray[np.uint16] | Floats
 
 # Central differences of sixth order: right to 1 % up to a period of 5 px.
 _SLOPE = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0], dtype=np.float32) / np.float32(60.0)
@@ -26,24 +27,24 @@ class Texture:
     slopes are alike all over the subset, the more the fewer the edges that hold them all.
     """
 
-    contrast: Array
-    slopes: Array
-    peaked: Array
+    contrast: Floats
+    slopes: Floats
+    peaked: Floats
 
     def __post_init__(self) -> None:
         n = len(self.contrast)
         if self.slopes.shape != (n, 3) or self.peaked.shape != (n,):
             raise ValueError("texture has a contrast, three mean products of slopes and their peak a point")
 
-    def part(self, index: NDArray[np.int64]) -> Texture:
+    def part(self, index: Indices) -> Texture:
         """The texture of some of the points."""
         return Texture(self.contrast[index], self.slopes[index], self.peaked[index])
 
-    def clean(self, noise: float) -> Array:
+    def clean(self, noise: float) -> Floats:
         """Mean squares of fx and fy, (n, 2), without those that noise of this variance adds."""
         return np.asarray(self.slopes[:, [0, 2]] - noise * SLOPE_GAIN)
 
-    def spread(self, noise: float) -> Array:
+    def spread(self, noise: float) -> Floats:
         """Diagonal of the inverse of the mean of ∇f ∇fᵀ without the noise's, (n, 2) px² a squared grey level.
 
         NaN where the pattern does not tell its place in some direction.
@@ -66,13 +67,11 @@ class TextureMap:
     stride: int
     shape: tuple[int, int]
 
-    def at(self, px: Array) -> Texture:
+    def at(self, px: Floats) -> Texture:
         """The texture about px (n, 2), to the nearest place of the map; NaN outside the image."""
         px = np.asarray(px, dtype=float)
         with np.errstate(invalid="ignore"):
-            inside: NDArray[np.bool_] = np.asarray(
-                ((px > -0.5) & (px < (self.shape[1] - 0.5, self.shape[0] - 0.5))).all(axis=1)
-            )
+            inside: Mask = np.asarray(((px > -0.5) & (px < (self.shape[1] - 0.5, self.shape[0] - 0.5))).all(axis=1))
         last = np.array(self.values.shape[1::-1]) - 1
         at = np.minimum(np.rint(np.where(inside[:, None], px, 0.0) / self.stride).astype(np.int64), last)
         found = np.where(inside[:, None], self.values[at[:, 1], at[:, 0]].astype(float), np.nan)

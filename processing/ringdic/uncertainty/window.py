@@ -17,13 +17,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices
 from ringdic.mesh.mesh import Mesh
 from ringdic.strain.deformation import Deformation, directors
 from ringdic.strain.window import StrainWindow
-
-Array = NDArray[np.float64]
 
 _BLOCK = 10_000  # windows at a time, which bounds the memory
 
@@ -36,11 +34,11 @@ class WindowScatter:
     ``S⁻¹ K S⁻¹`` in them; NaN where a window spans no plane.
     """
 
-    faces: NDArray[np.int64]
-    tangents: Array
-    gain: Array
+    faces: Indices
+    tangents: Floats
+    gain: Floats
 
-    def stretch_sigma(self, found: Deformation, sigma: Array) -> Array:
+    def stretch_sigma(self, found: Deformation, sigma: Floats) -> Floats:
         """Standard deviations (M, 2) of λ1 and λ2 over the windows at one step; NaN where not measured.
 
         found : the deformation over the windows. sigma : (N, 3) mm, of the displacements, by noise.
@@ -54,7 +52,7 @@ class WindowScatter:
             return np.asarray(np.sqrt(gain * np.einsum("mki,mi->mk", after**2, variance)))
 
 
-def window_scatter(window: StrainWindow, alike: Callable[[Array], Array], reach: float) -> WindowScatter:
+def window_scatter(window: StrainWindow, alike: Callable[[Floats], Floats], reach: float) -> WindowScatter:
     """The scatter of a mesh's windows.
 
     alike : correlation of the errors of two points at a distance, mm. reach : mm, beyond which it is 0.
@@ -77,7 +75,7 @@ def window_scatter(window: StrainWindow, alike: Callable[[Array], Array], reach:
     return WindowScatter(mesh.faces, tangents, gain)
 
 
-def _coordinates(members: scipy.sparse.csr_matrix, vertices: Array, tangents: Array) -> list[scipy.sparse.csr_matrix]:
+def _coordinates(members: scipy.sparse.csr_matrix, vertices: Floats, tangents: Floats) -> list[scipy.sparse.csr_matrix]:
     """Both tangential coordinates of the points of each window about their mean, as sparse (m, N)."""
     row = np.repeat(np.arange(members.shape[0]), np.diff(members.indptr))
     count = np.maximum(np.diff(members.indptr), 1)
@@ -89,7 +87,7 @@ def _coordinates(members: scipy.sparse.csr_matrix, vertices: Array, tangents: Ar
     return found
 
 
-def _correlation(mesh: Mesh, alike: Callable[[Array], Array], reach: float) -> scipy.sparse.csr_matrix:
+def _correlation(mesh: Mesh, alike: Callable[[Floats], Floats], reach: float) -> scipy.sparse.csr_matrix:
     """Correlations (N, N), sparse, of the errors of all points of a mesh."""
     N = len(mesh.vertices)
     finite = np.flatnonzero(np.isfinite(mesh.vertices).all(axis=1))
@@ -99,5 +97,5 @@ def _correlation(mesh: Mesh, alike: Callable[[Array], Array], reach: float) -> s
     return scipy.sparse.csr_matrix(upper + upper.T + scipy.sparse.identity(N, format="csr"))
 
 
-def _row_sums(a: scipy.sparse.csr_matrix, b: scipy.sparse.csr_matrix) -> Array:
+def _row_sums(a: scipy.sparse.csr_matrix, b: scipy.sparse.csr_matrix) -> Floats:
     return np.asarray(a.multiply(b).sum(axis=1), dtype=float).ravel()

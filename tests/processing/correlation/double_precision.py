@@ -14,9 +14,6 @@ import math
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 GOOD, NO_CONVERGENCE, OUTSIDE, NO_TEXTURE = 0, 2, 5, 6
 N_PARAMETERS = 12

@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from ringdic.arrays import Floats
 from ringdic.results.results import read_results
 from ringdic_node.virtual_rig.scenes import Limb
 
 from ringdic_controller.studies.truth import errors, face_middles
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,7 @@ def compare_with_truth(results_file: Path, limb: Limb) -> list[Figure]:
     return figures
 
 
-def _figure(quantity: str, step: str, true: str, error: Array, unit: str) -> Figure:
+def _figure(quantity: str, step: str, true: str, error: Floats, unit: str) -> Figure:
     known = error[np.isfinite(error)]
     return Figure(
         quantity,
@@ -79,6 +77,6 @@ def _figure(quantity: str, step: str, true: str, error: Array, unit: str) -> Fig
     )
 
 
-def _span(values: Array, unit: str = "") -> str:
+def _span(values: Floats, unit: str = "") -> str:
     digits = 2 if unit else 3
     return f"{values.min():.{digits}f} … {values.max():.{digits}f}"

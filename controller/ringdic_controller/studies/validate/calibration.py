@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from ringdic.arrays import Floats
 from ringdic.calibration.bundle import centroid_shift
 from ringdic.calibration.camera_calibration import CameraCalibration
 from ringdic.calibration.dots import find_dots
@@ -23,8 +23,6 @@ from ringdic_node.virtual_rig.lens import VirtualCamera
 from ringdic_controller.studies.validate.figures import Figure, Findings
 from ringdic_controller.studies.validate.scenery import STAGE
 from ringdic_controller.studies.validate.shapes import fitted_cylinder
-
-Array = NDArray[np.float64]
 
 # Table 1 of Solav et al. 2018: over the twelve cameras.
 _TABLE_1 = (
@@ -117,7 +115,7 @@ class ExactRays:
     """Exact pixels of points on a perfect cylinder, in the pairs of cameras that see them under 60°."""
 
     pairs: tuple[tuple[str, str], ...]
-    px: tuple[Array, ...]
+    px: tuple[Floats, ...]
 
     @classmethod
     def of(cls, true: Mapping[str, Camera], pairs: tuple[tuple[str, str], ...], radius: float = 57.0) -> ExactRays:
@@ -137,7 +135,7 @@ class ExactRays:
         return fitted_cylinder(np.concatenate(points)).diameter - 114.0
 
 
-def _inner(cameras: Mapping[str, Camera]) -> Array:
+def _inner(cameras: Mapping[str, Camera]) -> Floats:
     """fx fy s cx cy k1 k2 p1 p2 k3 of every camera that has a lens. (C, 10)."""
     lenses = [camera.intrinsics for camera in cameras.values() if camera.intrinsics is not None]
     return np.array([[L.K[0, 0], L.K[1, 1], L.K[0, 1], L.K[0, 2], L.K[1, 2], *L.distortion] for L in lenses])
@@ -159,7 +157,7 @@ def _moved_dots(calibration: CameraCalibration, rig: Rig, image: Path) -> DotObs
 
 def _stage_points(
     ring: Ring, rig: Rig, pair: tuple[str, str], moved: Mapping[str, DotObservations]
-) -> tuple[Array, Array]:
+) -> tuple[Floats, Floats]:
     """The dots that a pair sees before and after the motion. Two of (n, 3) mm."""
     calibrations = [ring.cameras[id_] for id_ in pair]
     observed = [each.dots for each in calibrations] + [moved[id_] for id_ in pair]

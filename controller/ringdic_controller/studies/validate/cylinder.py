@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from ringdic.arrays import Floats
 from ringdic.geometry.camera import Camera
 from ringdic.results.results import Results
 from ringdic_node.virtual_rig.scenes import Cylinder
@@ -17,8 +17,6 @@ from ringdic_controller.studies.validate.calibration import ExactRays
 from ringdic_controller.studies.validate.figures import BETTER, PAPER, Figure, Findings
 from ringdic_controller.studies.validate.shapes import fitted_cylinder
 from ringdic_controller.studies.validate.tracks import Tracks, mismatch
-
-Array = NDArray[np.float64]
 
 TRUE = 114.0  # mm
 ALL, PAIRS = "all views", "pairs"
@@ -37,7 +35,7 @@ class Run:
         """Of results as they were read."""
         return cls(results, {camera.id: camera for camera in results.cameras}, Tracks.of(results))
 
-    def cloud(self, pairs: tuple[tuple[str, str], ...], step: int | None = None) -> Array:
+    def cloud(self, pairs: tuple[tuple[str, str], ...], step: int | None = None) -> Floats:
         """What every pair alone has, one after the other. (P, N, 3) mm. step : see ``Tracks.of_pair``."""
         return np.stack([self.tracks.of_pair(self.cameras, pair, step) for pair in pairs])
 
@@ -72,9 +70,9 @@ def figure_7a(runs: Mapping[str, Run], pairs: tuple[tuple[str, str], ...]) -> Fi
 class _Steps:
     """Errors of each step: mean and std (F - 1, 3) mm; strain (F - 1, 2), median and 95th percentile of |E|."""
 
-    mean: Array
-    std: Array
-    strain: Array
+    mean: Floats
+    std: Floats
+    strain: Floats
 
 
 def figure_7b(runs: Mapping[str, Run], surface: Cylinder, pairs: tuple[tuple[str, str], ...]) -> Findings:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from ringdic.arrays import Floats, Mask
 from ringdic.correlation.status import Status
 from ringdic.geometry.outliers import Lost
 from ringdic.mesh.mesh import Mesh
@@ -18,8 +18,6 @@ from ringdic_node.virtual_rig.scenes import Specimen
 
 from ringdic_controller.studies.truth import Errors, SurfaceGrid, errors
 from ringdic_controller.studies.validate.figures import Figure, Findings
-
-Array = NDArray[np.float64]
 
 _WRONG = 1.0  # mm
 _HOLE = 5.0  # mm²
@@ -40,7 +38,7 @@ class LimbRun:
         return cls(results, steps, errors(results, scenes[0].surface, steps))
 
     @property
-    def displacement(self) -> Array:
+    def displacement(self) -> Floats:
         """Length of the error of every displacement. (F, N) mm, NaN where lost."""
         return np.asarray(np.linalg.norm(self.errors.displacement, axis=2))
 
@@ -50,7 +48,7 @@ class LimbRun:
         off = np.abs(self.errors.distance) > _WRONG
         return int((off | (self.displacement > _WRONG).any(axis=0)).sum())
 
-    def covered(self, grid: SurfaceGrid, step: int) -> NDArray[np.bool_]:
+    def covered(self, grid: SurfaceGrid, step: int) -> Mask:
         """Cells of the grid under triangles measured at a step."""
         measured = np.isfinite(self.results.vertices[step]).all(axis=1)
         faces = self.results.faces
@@ -112,7 +110,7 @@ def spoilt(
     area, known = grids[0].area, seen.sum(axis=0) >= 2
     hit, blind = known & (seen & ~unspoilt).any(axis=0), known & (unspoilt.sum(axis=0) < 2)
     lost: dict[str, float] = {}
-    gone: dict[str, NDArray[np.bool_]] = {}
+    gone: dict[str, Mask] = {}
     reasons = []
     for way, run in runs.items():
         last = clean[way].steps.index(run.steps[-1])
@@ -168,5 +166,5 @@ def _reasons(results: Results) -> str:
     return ", ".join(f"{count:,} {names.get(code, code)}" for code, count in counts.most_common()) or "none lost"
 
 
-def _rms(values: Array) -> float:
+def _rms(values: Floats) -> float:
     return float(np.sqrt(np.nanmean(values**2)))

@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Picture
-from numpy.typing import NDArray
+from ringdic.arrays import Floats
 
 from ringdic_controller.studies.validate.figures import BETTER, PAPER, Findings
-
-Array = NDArray[np.float64]
 
 _COLOURS = {PAPER: "#c4581d", BETTER: "#1d6ec4"}
 _PARAMETERS = ("fx, px", "fy, px", "skew, px", "cx, px", "cy, px", "k1", "k2", "p1", "p2", "k3")
@@ -134,7 +132,7 @@ def _ways(curves: Mapping[str, Any]) -> list[str]:
     return [way for way in _COLOURS if way in curves]
 
 
-def _histogram(axes: Axes, values: Mapping[str, Array]) -> None:
+def _histogram(axes: Axes, values: Mapping[str, Floats]) -> None:
     finite = {way: each[np.isfinite(each)] for way, each in values.items()}
     low = min(float(np.percentile(each, 0.5)) for each in finite.values())
     high = max(float(np.percentile(each, 99.5)) for each in finite.values())

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from ringdic.arrays import Floats
 from scipy.optimize import least_squares
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -17,15 +15,15 @@ class FittedCylinder:
 
     diameter: float
     spread: float
-    radial: Array
+    radial: Floats
 
 
-def fitted_cylinder(points: Array, radius: float = 57.0) -> FittedCylinder:
+def fitted_cylinder(points: Floats, radius: float = 57.0) -> FittedCylinder:
     """The least-squares cylinder of points (n, 3) mm about an axis near z; a point that is NaN takes no part."""
     points = points[np.isfinite(points).all(axis=1)]
     middle = 0.5 * (points[:, 2].min() + points[:, 2].max())
 
-    def misfit(q: Array) -> Array:
+    def misfit(q: Floats) -> Floats:
         axis = np.array([q[2], q[3], 1.0]) / np.sqrt(q[2] ** 2 + q[3] ** 2 + 1.0)
         offset = points - [q[0], q[1], middle]
         return np.asarray(np.linalg.norm(offset - np.outer(offset @ axis, axis), axis=1) - q[4])

@@ -6,14 +6,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from ringdic.arrays import Floats
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.triangulation import triangulate
 from ringdic.results.results import Results
 from scipy.interpolate import CloughTocher2DInterpolator
 from scipy.spatial import cKDTree
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -25,8 +23,8 @@ class Tracks:
     """
 
     cameras: tuple[str, ...]
-    px: Array
-    reference: Array
+    px: Floats
+    reference: Floats
 
     @classmethod
     def of(cls, results: Results) -> Tracks:
@@ -48,11 +46,11 @@ class Tracks:
             offset += len(matches.xy)
         return cls(ids, px, reference)
 
-    def reconstruct(self, cameras: Mapping[str, Camera]) -> Array:
+    def reconstruct(self, cameras: Mapping[str, Camera]) -> Floats:
         """The reference as other cameras would have it, from all views alike. (N, 3) mm."""
         return triangulate([cameras[id_] for id_ in self.cameras], self.reference)
 
-    def of_pair(self, cameras: Mapping[str, Camera], pair: tuple[str, str], step: int | None = None) -> Array:
+    def of_pair(self, cameras: Mapping[str, Camera], pair: tuple[str, str], step: int | None = None) -> Floats:
         """The points as a pair alone has them. (N, 3) mm, NaN where one of its cameras has no view.
 
         step : as tracked in time; None is the reference as matched between the cameras.
@@ -69,7 +67,7 @@ class Tracks:
                 yield pair, following[pair[1]]
 
 
-def mismatch(tracks: Tracks, cameras: Mapping[str, Camera], pairs: tuple[tuple[str, str], ...]) -> Array:
+def mismatch(tracks: Tracks, cameras: Mapping[str, Camera], pairs: tuple[tuple[str, str], ...]) -> Floats:
     """Distances between the same surface from two pairs that share a camera, (n,) mm (Fig. 7a).
 
     Where the pairs have vertices in common these are compared; where they do not, one pair's surface is carried to
@@ -92,7 +90,7 @@ def mismatch(tracks: Tracks, cameras: Mapping[str, Camera], pairs: tuple[tuple[s
     return np.concatenate(distances) if distances else np.zeros(0)
 
 
-def _gap(source: Array, wanted: Array) -> Array:
+def _gap(source: Floats, wanted: Floats) -> Floats:
     """Distance of points from the nearest of others, in units of these points' usual spacing."""
     tree = cKDTree(source)
     spacing = float(np.median(tree.query(source[:2000], k=2)[0][:, 1]))

@@ -6,11 +6,9 @@ import zlib
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic_node.virtual_rig.arrays import Floats
 from ringdic_node.virtual_rig.lens import VirtualCamera
-
-Array = NDArray[np.float64]
 
 SQUARES = (15, 20)
 SQUARE = 10.0  # mm
@@ -27,7 +25,7 @@ class Board:
     index: int
     seed: int = 0
 
-    def pose(self, camera: VirtualCamera) -> tuple[Array, Array]:
+    def pose(self, camera: VirtualCamera) -> tuple[Floats, Floats]:
         """R (3, 3) and t (3,) mm from the board's frame to the camera's.
 
         The board's frame has its origin at the corner of the squares, x across, y along, both as the squares run.
@@ -58,14 +56,14 @@ class Board:
         raise RuntimeError(f"no pose of the board fits the image of {camera.id}")
 
     @staticmethod
-    def rim() -> Array:
+    def rim() -> Floats:
         """Points round the rim of the squares, a tenth of a square outside, (n, 3) mm."""
         w, h, out = SQUARES[0] * SQUARE, SQUARES[1] * SQUARE, 0.1 * SQUARE
         across, along = np.linspace(-out, w + out, 9), np.linspace(-out, h + out, 9)
         points = [(x, y, 0.0) for x in across for y in (-out, h + out)]
         return np.array(points + [(x, y, 0.0) for x in (-out, w + out) for y in along])
 
-    def corners(self, camera: VirtualCamera) -> Array:
+    def corners(self, camera: VirtualCamera) -> Floats:
         """True inner corners in the image, (266, 2) px, across first."""
         y, x = np.mgrid[1 : SQUARES[1], 1 : SQUARES[0]] * SQUARE
         R, t = self.pose(camera)
@@ -73,7 +71,7 @@ class Board:
         return camera.project_local(xyz @ R.T + t)
 
 
-def _rotation(about_x: float, about_y: float, about_z: float) -> Array:
+def _rotation(about_x: float, about_y: float, about_z: float) -> Floats:
     """Rotation by angles in degrees about x, then y, then z."""
     a, b, c = np.radians([about_x, about_y, about_z])
     X = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])

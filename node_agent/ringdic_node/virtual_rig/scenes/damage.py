@@ -8,11 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic_node.virtual_rig.arrays import Floats, Mask
 from ringdic_node.virtual_rig.texture import RADIUS
-
-Array = NDArray[np.float64]
 
 GLARE_PEAK = 3.0  # radiance of a lamp's reflection; 1 saturates
 GLARE_WIDTH = 0.03  # rad, standard deviation of the lobe about the mirror's direction
@@ -47,7 +45,7 @@ class Damage:
     lamps: tuple[tuple[float, float, float], ...] = ()
     bars: tuple[Bar, ...] = ()
 
-    def arrays(self) -> tuple[Array, Array, Array]:
+    def arrays(self) -> tuple[Floats, Floats, Floats]:
         """Patches (k, 4) as arc, z and half axes; lamps (m, 3); bars (b, 7) as start, end, radius. All mm."""
         patches = [
             (each.theta % (2 * np.pi) * RADIUS, each.z, each.half_arc, each.half_height) for each in self.patches
@@ -59,7 +57,7 @@ class Damage:
             np.array(bars, dtype=float).reshape(-1, 7),
         )
 
-    def worn(self, theta: Array, z: Array) -> NDArray[np.bool_]:
+    def worn(self, theta: Floats, z: Floats) -> Mask:
         """Which material points (n,) have lost their speckles."""
         off = np.zeros(np.shape(theta), dtype=bool)
         for patch in self.patches:
@@ -67,7 +65,7 @@ class Damage:
             off |= (RADIUS * arc / patch.half_arc) ** 2 + ((z - patch.z) / patch.half_height) ** 2 < 1.0
         return off
 
-    def spoilt(self, centre: Array, xyz: Array, normals: Array) -> NDArray[np.bool_]:
+    def spoilt(self, centre: Floats, xyz: Floats, normals: Floats) -> Mask:
         """Which points a camera sees behind a bar or in a reflection.
 
         centre : (3,) of the camera; xyz : (n, 3) points of the surface, mm; normals : (n, 3) of unit length, outwards.
@@ -90,7 +88,7 @@ class Damage:
         return np.asarray(hidden | (glare > _GLARING))
 
 
-def _gap(centre: Array, xyz: Array, start: Array, end: Array) -> Array:
+def _gap(centre: Floats, xyz: Floats, start: Floats, end: Floats) -> Floats:
     """Least distance of each line of sight, from the centre to a point (n, 3), from a segment. (n,) mm."""
     d, e = xyz - centre, end - start
     w = centre - start

@@ -9,32 +9,30 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ringdic_node.virtual_rig import body
+from ringdic_node.virtual_rig.arrays import Floats
 from ringdic_node.virtual_rig.scenes.damage import Damage
 from ringdic_node.virtual_rig.texture import RADIUS
-
-Array = NDArray[np.float64]
 
 
 class _Surface(ABC):
     """What every body of material points can be asked. theta in rad, z in mm, of any one shape."""
 
     @abstractmethod
-    def parameters(self, step: int) -> Array:
+    def parameters(self, step: int) -> Floats:
         """Parameters of the surface at a step."""
 
-    def position(self, theta: Array, z: Array, step: int) -> Array:
+    def position(self, theta: Floats, z: Floats, step: int) -> Floats:
         """Positions (..., 3) mm of material points at a step."""
         return self._all(theta, z, step)[..., :3]
 
-    def tangents(self, theta: Array, z: Array, step: int) -> Array:
+    def tangents(self, theta: Floats, z: Floats, step: int) -> Floats:
         """Derivatives of the position by theta and by z, (..., 2, 3)."""
         every = self._all(theta, z, step)
         return every[..., 3:].reshape(*every.shape[:-1], 2, 3)
 
-    def stretches(self, theta: Array, z: Array, step: int) -> tuple[Array, Array]:
+    def stretches(self, theta: Floats, z: Floats, step: int) -> tuple[Floats, Floats]:
         """Principal stretches λ1 ≤ λ2 (...) from the reference to a step: roots of det(g - λ² G) = 0."""
         before, after = self.tangents(theta, z, 0), self.tangents(theta, z, step)
         G = np.einsum("...ai,...bi->...ab", before, before)
@@ -44,13 +42,13 @@ class _Surface(ABC):
         root = np.sqrt(np.maximum(half**2 - np.linalg.det(mixed), 0.0))
         return np.sqrt(half - root), np.sqrt(half + root)
 
-    def material_coordinates(self, xyz: Array, step: int = 0) -> tuple[Array, Array, Array]:
+    def material_coordinates(self, xyz: Floats, step: int = 0) -> tuple[Floats, Floats, Floats]:
         """theta, z and signed distance (outside positive, mm) of the surface points nearest to xyz (n, 3) mm."""
         out = np.empty((len(xyz), 3))
         body.nearest(np.ascontiguousarray(xyz, dtype=np.float64), self.parameters(step), out)
         return out[:, 0], out[:, 1], out[:, 2]
 
-    def _all(self, theta: Array, z: Array, step: int) -> Array:
+    def _all(self, theta: Floats, z: Floats, step: int) -> Floats:
         theta, z = np.broadcast_arrays(np.asarray(theta, dtype=float), np.asarray(z, dtype=float))
         out = np.empty((theta.size, 9))
         body.points(theta.ravel(), z.ravel(), self.parameters(step), out)
@@ -63,7 +61,7 @@ class Cylinder(_Surface):
 
     per_step: tuple[float, float, float] = (0.1, 0.0, 0.0)
 
-    def parameters(self, step: int) -> Array:
+    def parameters(self, step: int) -> Floats:
         return np.array([body.CYLINDER, RADIUS, *(step * np.array(self.per_step)), 0.0])
 
 
@@ -73,7 +71,7 @@ class Limb(_Surface):
 
     load_per_step: float = 0.2
 
-    def parameters(self, step: int) -> Array:
+    def parameters(self, step: int) -> Floats:
         return np.array([body.LIMB, RADIUS, 0.0, 0.0, 0.0, step * self.load_per_step])
 
 
@@ -91,6 +89,6 @@ class Specimen:
         """Heights between which the body is speckled, mm of the reference."""
         return (5.0, 245.0) if isinstance(self.surface, Limb) else (12.0, 238.0)
 
-    def body(self) -> Array:
+    def body(self) -> Floats:
         """Parameters of the surface."""
         return self.surface.parameters(self.step)

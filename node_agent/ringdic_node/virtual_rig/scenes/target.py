@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic_node.virtual_rig.arrays import Floats
 from ringdic_node.virtual_rig.body import CYLINDER
 from ringdic_node.virtual_rig.texture import RADIUS
-
-Array = NDArray[np.float64]
 
 COLUMNS, ROWS = 30, 20
 _LARGEST = 0.5  # mm of print error: a dot stays in its own cell of the print
@@ -32,16 +30,16 @@ class Target:
         if not 0.0 <= self.print_error <= 0.2:
             raise ValueError(f"a print error must lie between 0 and 0.2 mm, not {self.print_error}")
 
-    def body(self) -> Array:
+    def body(self) -> Floats:
         """Parameters of the surface."""
         return np.array([CYLINDER, RADIUS, *self.offset, 0.0])
 
-    def prints(self) -> Array:
+    def prints(self) -> Floats:
         """By how much each dot is off its place along arc and axis, (20 rows, 30 columns, 2) mm."""
         drawn = np.random.default_rng([self.seed, 3012]).standard_normal((ROWS, COLUMNS, 2))
         return np.clip(self.print_error * drawn, -_LARGEST, _LARGEST)
 
-    def dots(self) -> Array:
+    def dots(self) -> Floats:
         """Centres of the dots (20 rows, 30 columns, 3) mm."""
         prints = self.prints()
         theta = (np.arange(COLUMNS) * 12.0 + prints[..., 0]) / RADIUS

@@ -5,20 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.mesh.mesh import Mesh, half_edges
 from ringdic.mesh.topology import Border, Kind, borders
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 _LONGEST = 150  # vertices of a border that is filled
 _THIN = 0.1  # height over longest edge of triangles that are made only where there is no other way
 _FACING = 0.5  # least cosine between a hole's own normal and those of the surface round it
 
 
-def fill(mesh: Mesh, area: float, bridge: float, seam: NDArray[np.bool_], seam_area: float) -> Indices:
+def fill(mesh: Mesh, area: float, bridge: float, seam: Mask, seam_area: float) -> Indices:
     """Triangles (K, 3) that close holes, turned as the surface is.
 
     area : mm², of the largest hole that is closed; seam_area : of the largest that touches the seam, (N,) vertices.
@@ -79,7 +76,7 @@ def _edges_of(faces: Indices) -> set[tuple[int, int]]:
     return {(int(min(e)), int(max(e))) for e in faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)}
 
 
-def _forbidden(outline: Indices, known: set[tuple[int, int]]) -> NDArray[np.bool_]:
+def _forbidden(outline: Indices, known: set[tuple[int, int]]) -> Mask:
     """Diagonals (n, n) of an outline that are edges of the mesh already."""
     n = len(outline)
     barred = np.zeros((n, n), bool)
@@ -91,9 +88,7 @@ def _forbidden(outline: Indices, known: set[tuple[int, int]]) -> NDArray[np.bool
     return barred
 
 
-def polygon(
-    points: Array, normal: Array, bridge: float, barred: NDArray[np.bool_], thinnest: float = 0.0
-) -> Indices | None:
+def polygon(points: Floats, normal: Floats, bridge: float, barred: Mask, thinnest: float = 0.0) -> Indices | None:
     """Triangles (n - 2, 3) of a polygon (n, 3) mm counter-clockwise about a normal, or None.
 
     thinnest : least height of a triangle over its longest edge.

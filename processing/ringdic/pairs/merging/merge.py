@@ -8,17 +8,14 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.mesh.mesh import Mesh
 from ringdic.mesh.topology import neighbours, pieces, without_pinches
 from ringdic.pairs.merging.fill import fill
 from ringdic.pairs.merging.mismatch import Mismatch, mismatches
 from ringdic.pairs.merging.overlap import MEASURES, badness, closer_than, cover, peel, regrow
 from ringdic.pairs.merging.stitch import stitch
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 #: The weights of each heuristic; what "combined" weighs can be given.
 HEURISTICS: Mapping[str, Mapping[str, float]] = MappingProxyType(
@@ -37,9 +34,9 @@ class Sheet:
     NaN for a vertex that was lost at some step: where another sheet measured the place, its triangles go first.
     """
 
-    vertices: Array
+    vertices: Floats
     faces: Indices
-    correlation: Array
+    correlation: Floats
 
     def __post_init__(self) -> None:
         N = len(self.vertices)
@@ -122,7 +119,7 @@ def merge(
         return Merged(faces, pair, np.unique(faces), np.flatnonzero(~kept), added, apart.result())
 
 
-def _together(sheets: Sequence[Sheet]) -> tuple[Mesh, Indices, Array]:
+def _together(sheets: Sequence[Sheet]) -> tuple[Mesh, Indices, Floats]:
     """All sheets as one mesh, each triangle's sheet (M,) and worst correlation (M,), NaN if lost."""
     offsets = np.cumsum([0, *(len(sheet.vertices) for sheet in sheets)])
     faces = [sheet.faces + offset for sheet, offset in zip(sheets, offsets, strict=False)]
@@ -144,11 +141,13 @@ class _Overlap:
 
     over: Indices
     beside: Indices
-    lost: NDArray[np.bool_]
-    bad: Array
+    lost: Mask
+    bad: Floats
 
     @classmethod
-    def of(cls, mesh: Mesh, owner: Indices, correlation: Array, weights: Mapping[str, float], reach: float) -> _Overlap:
+    def of(
+        cls, mesh: Mesh, owner: Indices, correlation: Floats, weights: Mapping[str, float], reach: float
+    ) -> _Overlap:
         """Of triangles whose surface (M,) and correlation (M,) are given; reach : mm. Works on all cores."""
         covered, lost, beside = cover(mesh, owner, reach), np.isnan(correlation), neighbours(mesh.faces)
         bad = badness(mesh, beside, owner, covered, np.where(lost, 0.0, correlation), weights)
@@ -156,7 +155,7 @@ class _Overlap:
         return cls(np.stack([covered.own, covered.other], axis=1), beside, lost, bad)
 
 
-def _without_overlap(mesh: Mesh, owner: Indices, overlap: _Overlap, gap: float, reach: float) -> NDArray[np.bool_]:
+def _without_overlap(mesh: Mesh, owner: Indices, overlap: _Overlap, gap: float, reach: float) -> Mask:
     """Triangles (M,) left when no place is covered twice and the gap, mm, is kept; reach : mm."""
     over, beside, lost, bad = overlap.over, overlap.beside, overlap.lost, overlap.bad
     # First what covers one another's middles, then, of the little that is left, what overlaps or is too close at all.
@@ -174,12 +173,12 @@ def _without_overlap(mesh: Mesh, owner: Indices, overlap: _Overlap, gap: float, 
     return _tidy(mesh, left)
 
 
-def _close(mesh: Mesh, owner: Indices, which: NDArray[np.bool_], gap: float, reach: float) -> Indices:
+def _close(mesh: Mesh, owner: Indices, which: Mask, gap: float, reach: float) -> Indices:
     at = np.flatnonzero(which)
     return at[closer_than(Mesh(mesh.vertices, mesh.faces[at]), owner[at], gap, reach)]
 
 
-def _tidy(mesh: Mesh, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _tidy(mesh: Mesh, kept: Mask) -> Mask:
     """Triangles (M,) left without pieces of a few triangles and without fans that touch in a point only."""
     at = np.flatnonzero(kept)
     while True:

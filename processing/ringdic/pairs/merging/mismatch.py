@@ -11,22 +11,20 @@ from typing import Protocol
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.mesh.adjacency import alike
 from ringdic.mesh.mesh import Mesh, half_edges
 from ringdic.mesh.projection import Projector
-
-Array = NDArray[np.float64]
 
 
 class Surface(Protocol):
     """Vertices (N, 3) mm and faces (M, 3), normals outwards."""
 
     @property
-    def vertices(self) -> Array: ...
+    def vertices(self) -> Floats: ...
     @property
-    def faces(self) -> NDArray[np.int64]: ...
+    def faces(self) -> Indices: ...
 
 
 @dataclass(frozen=True)
@@ -78,9 +76,9 @@ class Curved:
         self._projector = Projector(mesh, reach)
         on_border = np.zeros(len(mesh.vertices), bool)
         on_border[half[alone]] = True
-        self._inner: NDArray[np.bool_] = ~np.asarray(on_border[mesh.faces].any(axis=1))
+        self._inner: Mask = ~np.asarray(on_border[mesh.faces].any(axis=1))
 
-    def outside(self, other: Curved) -> Array:
+    def outside(self, other: Curved) -> Floats:
         """How far the vertices (N,) of another surface lie outside this one, along its normal, mm.
 
         NaN for a vertex over no triangle, or over one at the border, whose normals are one-sided.
@@ -145,7 +143,7 @@ def _averaged(normals, half, before):  # type: ignore[no-untyped-def]
     return total
 
 
-def _summary(first: int, second: int, signed: Array) -> Mismatch:
+def _summary(first: int, second: int, signed: Floats) -> Mismatch:
     length = np.abs(signed)
     return Mismatch(
         first=first,

@@ -14,16 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.mesh.mesh import Mesh
 from ringdic.mesh.nearest import among_alike, cubes
 from ringdic.mesh.projection import Projector, sized
 from ringdic.pairs.merging import kernels
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 #: What the combination weighs, each relative to its median over the overlaps.
 MEASURES = ("correlation", "distance", "orientation", "margin")
@@ -43,8 +39,8 @@ class Cover:
 
     own: Indices
     other: Indices
-    height: Array
-    angle: Array
+    height: Floats
+    angle: Floats
 
 
 def cover(mesh: Mesh, owner: Indices, reach: float) -> Cover:
@@ -55,7 +51,7 @@ def cover(mesh: Mesh, owner: Indices, reach: float) -> Cover:
     def projector(part: Indices) -> Projector:
         return Projector(Mesh(mesh.vertices, mesh.faces[part]), reach, _SAME_SIDE)
 
-    def over(k: int) -> list[tuple[Indices, Indices, Array]]:
+    def over(k: int) -> list[tuple[Indices, Indices, Floats]]:
         """What the other surfaces cover of surface k."""
         part, found = parts[k], []
         for j, surface in enumerate(surfaces):
@@ -99,8 +95,8 @@ def closer_than(mesh: Mesh, owner: Indices, gap: float, reach: float) -> Indices
 
 
 def badness(
-    mesh: Mesh, beside: Indices, owner: Indices, covered: Cover, correlation: Array, weights: Mapping[str, float]
-) -> Array:
+    mesh: Mesh, beside: Indices, owner: Indices, covered: Cover, correlation: Floats, weights: Mapping[str, float]
+) -> Floats:
     """How bad each triangle is, (M,), in medians over the overlaps: the weighted sum of the measures.
 
     beside : (M, 3), of ``neighbours``. owner : (M,) surface of each triangle. correlation : (M,) its C_LS.
@@ -130,7 +126,7 @@ def badness(
     return total
 
 
-def _from_border(mesh: Mesh, owner: Indices) -> Array:
+def _from_border(mesh: Mesh, owner: Indices) -> Floats:
     """Distance of each triangle from the border of its own surface, (M,) mm; 0 for a closed surface."""
     centroids, distance = mesh.centroids, np.zeros(len(mesh.faces))
 
@@ -145,7 +141,7 @@ def _from_border(mesh: Mesh, owner: Indices) -> Array:
     return distance
 
 
-def peel(beside: Indices, alive: Mask, competing: Indices, bad: Array) -> Mask:
+def peel(beside: Indices, alive: Mask, competing: Indices, bad: Floats) -> Mask:
     """Triangles (M,) left when, worst first, border triangles that compete with others left are removed.
 
     beside : (M, 3), of ``neighbours``. alive : (M,) to begin with. competing : (P, 2). bad : (M,).
@@ -160,7 +156,7 @@ def peel(beside: Indices, alive: Mask, competing: Indices, bad: Array) -> Mask:
     return kept
 
 
-def regrow(beside: Indices, alive: Mask, candidate: Mask, competing: Indices, bad: Array) -> Mask:
+def regrow(beside: Indices, alive: Mask, candidate: Mask, competing: Indices, bad: Floats) -> Mask:
     """Triangles (M,) there when those that compete with none left are put back, beside what is left of their surface.
 
     beside : (M, 3), of ``neighbours``. candidate : (M,) that may come back. competing : (P, 2) among those alive and

@@ -11,14 +11,11 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ringdic.arrays import Floats, Indices
 from ringdic.mesh.mesh import Mesh
 from ringdic.mesh.nearest import cubes
 from ringdic.pairs.merging.stars import stars
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 _SAME_SIDE = 0.2  # least cosine between the normals of vertices of one side of the body
 THINNEST = 0.1  # least height of a new triangle over its longest edge: thinner ones have no direction and no strain
@@ -51,7 +48,7 @@ def stitch(mesh: Mesh, group: Indices, bridge: float) -> Indices:
     return used[_consistent(triangles[votes == 3][agreed], at, edges)]
 
 
-def _consistent(candidates: Indices, at: Array, edges: Indices) -> Indices:
+def _consistent(candidates: Indices, at: Floats, edges: Indices) -> Indices:
     """Of triangles (K, 3), those that fit to the border edges and to one another, the ones with short edges first."""
     corners = at[candidates]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1, initial=0.0)
