@@ -104,7 +104,7 @@ class FetchAsked:
 
 
 @dataclass(frozen=True)
-class Tick:
+class AgentTick:
     """Time has passed."""
 
 
@@ -119,7 +119,7 @@ Event = (
     | Acknowledged
     | InventoryAsked
     | FetchAsked
-    | Tick
+    | AgentTick
 )
 
 
@@ -266,7 +266,7 @@ class Agent:
                 return [Answer(event.question, self.inventory())]
             case FetchAsked():
                 return self._fetch(event)
-            case Tick():
+            case AgentTick():
                 return self._due(now)
 
     def inventory(self) -> Inventory:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from ringdic_node.cameras.camera import CameraError, Shot
 from ringdic_node.clock import SystemClock, clock_offset
-from ringdic_node.config import ConfigError, NodeConfig, make_camera, read_config
+from ringdic_node.config import ConfigError, NodeConfig, make_camera, read_node_config
 from ringdic_node.spool import Spool
 
 DEFAULT_CONFIG = Path("/etc/ringdic/node.toml")
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         stream=sys.stderr,
     )
     try:
-        config = read_config(options.config)
+        config = read_node_config(options.config)
         if options.command == "run":
             return _run(config)
         if options.command == "check":

@@ -24,7 +24,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from ringdic_node.cameras.camera import Camera
+from ringdic_node.cameras.camera import NodeCamera
 from ringdic_node.clock import Clock
 from ringdic_node.wire import WireError, checked_name
 
@@ -88,7 +88,7 @@ class NodeConfig:
                 raise ConfigError(f"[{self.camera}] {name} cannot be {value!r}")
 
 
-def read_config(path: Path) -> NodeConfig:
+def read_node_config(path: Path) -> NodeConfig:
     """The configuration in the TOML file `path`; raises ConfigError."""
     path = Path(path)
     try:
@@ -134,7 +134,7 @@ def _parse(table: dict[str, Any], folder: Path) -> NodeConfig:
     )
 
 
-def make_camera(config: NodeConfig, clock: Clock) -> Camera:
+def make_camera(config: NodeConfig, clock: Clock) -> NodeCamera:
     """The camera that the configuration names; imported only here, so that a node loads no other."""
     settings = dict(config.camera_settings)
     if config.camera == "pattern":
@@ -146,9 +146,9 @@ def make_camera(config: NodeConfig, clock: Clock) -> Camera:
 
         return PlaybackCamera(clock, **settings)
     if config.camera == "virtual":
-        from ringdic_node.cameras.virtual import VirtualCamera
+        from ringdic_node.cameras.virtual import VirtualNodeCamera
 
-        return VirtualCamera(config.id, clock, **settings)
+        return VirtualNodeCamera(config.id, clock, **settings)
     from ringdic_node.cameras.pi import PiCamera
 
     return PiCamera(clock, **settings)

@@ -18,11 +18,11 @@ import numpy.typing as npt
 
 from ringdic_node import agent as steps
 from ringdic_node.agent import Agent
-from ringdic_node.cameras.camera import Camera, CameraError, Frame, Shot
+from ringdic_node.cameras.camera import CameraError, Frame, NodeCamera, Shot
 from ringdic_node.clock import Clock, clock_offset
 from ringdic_node.config import NodeConfig
 from ringdic_node.link import NodeLink
-from ringdic_node.spool import Spool, SpoolError, digest
+from ringdic_node.spool import Spool, SpoolError, image_digest
 from ringdic_node.wire import (
     Ack,
     Arm,
@@ -30,7 +30,7 @@ from ringdic_node.wire import (
     Fetch,
     Keys,
     Manifest,
-    Status,
+    NodeStatus,
     Trigger,
     WireError,
     decode_as,
@@ -49,7 +49,7 @@ class ServiceError(RuntimeError):
 class NodeService:
     """One node: agent, camera, spool and link joined."""
 
-    def __init__(self, config: NodeConfig, camera: Camera, spool: Spool, clock: Clock) -> None:
+    def __init__(self, config: NodeConfig, camera: NodeCamera, spool: Spool, clock: Clock) -> None:
         self.config = config
         self._camera = camera
         self._spool = spool
@@ -99,7 +99,7 @@ class NodeService:
             try:
                 event = self._events.get(timeout=0.1)
             except queue.Empty:
-                event = steps.Tick()
+                event = steps.AgentTick()
             if isinstance(event, steps.Event):
                 for action in self._agent.handle(event, self._clock.now()):
                     self._perform(action)
@@ -114,8 +114,8 @@ class NodeService:
                 if not worker.is_alive():
                     raise ServiceError(f"the node's {worker.name} thread has died; its traceback is above")
 
-    def _status(self) -> Status:
-        return Status(
+    def _status(self) -> NodeStatus:
+        return NodeStatus(
             node=self.config.id,
             state=self._agent.state,
             armed=self._agent.armed,
@@ -250,7 +250,7 @@ class NodeService:
 
 def make_manifest(node: str, trigger: Trigger, frame: Frame, parts: tuple[bytes, bytes]) -> Manifest:
     """The manifest of a frame written as `parts`."""
-    sha256, length = digest(parts)
+    sha256, length = image_digest(parts)
     return Manifest(
         node=node,
         key=trigger.key,

@@ -174,7 +174,7 @@ class Spool:
             raise SpoolError(f"{path.name} cannot be written to the spool: {error}") from error
 
 
-def digest(parts: Sequence[bytes | memoryview]) -> tuple[str, int]:
+def image_digest(parts: Sequence[bytes | memoryview]) -> tuple[str, int]:
     """SHA-256 in hexadecimal and length of the joined parts."""
     sha, length = hashlib.sha256(), 0
     for part in parts:

@@ -293,7 +293,7 @@ class Ack(_Message):
 
 
 @dataclass(frozen=True)
-class Status(_Message):
+class NodeStatus(_Message):
     """The node's state, sent at an interval and on change. `time_ns` is the node's clock when it was sent."""
 
     TYPE: ClassVar[str] = "status"
@@ -316,9 +316,10 @@ class Status(_Message):
         _require_table("versions", self.versions)
 
 
-Message = Arm | ArmReply | Trigger | TriggerReply | Manifest | Failure | Inventory | Fetch | Ack | Status
+Message = Arm | ArmReply | Trigger | TriggerReply | Manifest | Failure | Inventory | Fetch | Ack | NodeStatus
 _TYPES: dict[str, type[Any]] = {
-    cls.TYPE: cls for cls in (Arm, ArmReply, Trigger, TriggerReply, Manifest, Failure, Inventory, Fetch, Ack, Status)
+    cls.TYPE: cls
+    for cls in (Arm, ArmReply, Trigger, TriggerReply, Manifest, Failure, Inventory, Fetch, Ack, NodeStatus)
 }
 # What a field holds, where JSON alone does not say: nested records and sequences of them.
 _NESTED: dict[tuple[str, str], type[Any]] = {

@@ -16,7 +16,7 @@ from ringdic.geometry.camera import Camera
 from ringdic.results.results import Results
 from ringdic.results.series import part
 from ringdic.results.writer import write_results
-from ringdic.session.folder import new_live, new_run, read_session
+from ringdic.session.folder import new_live, new_run, open_session
 
 AROUND, ALONG = 60, 16
 LOST = (400, 401, 402)
@@ -67,7 +67,7 @@ def process(session: Path, step: str | None, seconds: float) -> dict:
         line = {"stage": "correlate", "done": k / 10, "rate": "1000 points/s", "left_s": 1.0, "message": f"part {k}"}
         _say(line)
         time.sleep(seconds / 10)
-    steps = tuple(capture.id for capture in read_session(session).of_kind("specimen"))
+    steps = tuple(capture.id for capture in open_session(session).of_kind("specimen"))
     if step is not None:
         with new_live(session, step) as folder:
             whole, at = tube(steps), sorted({0, steps.index(step)})

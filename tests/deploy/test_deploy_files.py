@@ -19,9 +19,9 @@ import pytest
 import typer.main
 import zenoh
 from ringdic_controller.cli.app import app
-from ringdic_controller.service.config import read_config as read_controller_config
+from ringdic_controller.service.config import read_controller_config
 from ringdic_node.cli import _parser as node_parser
-from ringdic_node.config import read_config as read_node_config
+from ringdic_node.config import read_node_config
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 NODE = REPOSITORY / "deploy" / "node"

@@ -8,6 +8,7 @@ import pytest
 from ringdic_node.agent import (
     Acknowledged,
     Agent,
+    AgentTick,
     Answer,
     AnswerImage,
     ArmAsked,
@@ -24,7 +25,6 @@ from ringdic_node.agent import (
     Report,
     Sent,
     TakeFrame,
-    Tick,
     Triggered,
 )
 from ringdic_node.clock import Instant
@@ -130,15 +130,15 @@ def test_a_lost_frame_is_reported_remembered_and_needs_a_new_lock():
 def test_a_spooled_frame_is_published_ever_less_often_until_acknowledged():
     agent = capturing_agent()
     assert agent.handle(FrameSpooled(MANIFEST), at(1)) == [Publish(MANIFEST)]
-    assert agent.handle(Tick(), at(50)) == [], "one sending at a time"
+    assert agent.handle(AgentTick(), at(50)) == [], "one sending at a time"
     agent.handle(Sent(KEY), at(50))
-    assert agent.handle(Tick(), at(54.9)) == []
-    assert agent.handle(Tick(), at(55)) == [Publish(MANIFEST)]
+    assert agent.handle(AgentTick(), at(54.9)) == []
+    assert agent.handle(AgentTick(), at(55)) == [Publish(MANIFEST)]
     agent.handle(Sent(KEY), at(55))
-    assert agent.handle(Tick(), at(64.9)) == []
-    assert agent.handle(Tick(), at(65)) == [Publish(MANIFEST)]
+    assert agent.handle(AgentTick(), at(64.9)) == []
+    assert agent.handle(AgentTick(), at(65)) == [Publish(MANIFEST)]
     assert agent.handle(Acknowledged(Ack("n", KEY, ONE)), at(66)) == [Free(KEY, ONE)]
-    assert agent.handle(Tick(), at(999)) == []
+    assert agent.handle(AgentTick(), at(999)) == []
     assert agent.spooled == 0
 
 
@@ -159,7 +159,7 @@ def test_an_image_unknown_to_the_controller_is_kept_but_not_sent_again():
     agent.handle(FrameSpooled(MANIFEST), at(1))
     agent.handle(Sent(KEY), at(1))
     assert agent.handle(Acknowledged(Ack("n", KEY, ONE, "unknown")), at(2)) == []
-    assert agent.handle(Tick(), at(1000)) == []
+    assert agent.handle(AgentTick(), at(1000)) == []
     assert agent.inventory().manifests == (MANIFEST,)
     assert agent.handle(FetchAsked(KEY, 5), at(1001)) == [AnswerImage(5, MANIFEST)]
 
@@ -167,7 +167,7 @@ def test_an_image_unknown_to_the_controller_is_kept_but_not_sent_again():
 def test_a_restarted_node_delivers_its_spool_and_does_not_retake_what_it_delivered():
     other = CaptureKey("s", "0002-board", 102 * SECOND)
     agent = Agent("n", NOW, spooled=[MANIFEST], freed=[other])
-    assert agent.handle(Tick(), NOW) == [Publish(MANIFEST)]
+    assert agent.handle(AgentTick(), NOW) == [Publish(MANIFEST)]
     for key in (KEY, other):
         (answer,) = agent.handle(Triggered(Trigger(key, "board"), 1), NOW)
         assert answer.message.verdict == "accepted"

@@ -14,7 +14,7 @@ from ringdic_node.cameras.pattern import PatternCamera
 from ringdic_node.cameras.playback import PlaybackCamera
 from ringdic_node.cli import main
 from ringdic_node.clock import SystemClock, parse_tracking
-from ringdic_node.config import ConfigError, make_camera, read_config
+from ringdic_node.config import ConfigError, make_camera, read_node_config
 
 SOUND = """
 rig = "ring"
@@ -36,7 +36,7 @@ def config(tmp_path):
 
 
 def test_the_spool_lies_beside_the_configuration(config, tmp_path):
-    assert read_config(config).spool == tmp_path / "spool"
+    assert read_node_config(config).spool == tmp_path / "spool"
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_the_spool_lies_beside_the_configuration(config, tmp_path):
 def test_a_bad_configuration_is_refused_with_file_and_key(config, old, new, told, capsys):
     config.write_text(SOUND.replace(old, new))
     with pytest.raises(ConfigError, match=told) as caught:
-        read_config(config)
+        read_node_config(config)
     assert str(config) in str(caught.value)
     assert main(["check", "--config", str(config)]) == 2
     assert re.search(told, capsys.readouterr().err)
@@ -140,7 +140,7 @@ def test_a_played_back_image_is_the_file_byte_for_byte(config, tmp_path, deepest
     content = f"P5\n8 6\n{deepest}\n".encode() + plane.tobytes()
     (tmp_path / "plane.pgm").write_bytes(content)
     config.write_text(SOUND.split("camera =")[0] + 'camera = "playback"\n[playback]\nimage = "plane.pgm"\n')
-    camera = make_camera(read_config(config), SystemClock())
+    camera = make_camera(read_node_config(config), SystemClock())
     assert b"".join(camera.capture(Shot(0, "static", 0)).pgm()) == content
 
 

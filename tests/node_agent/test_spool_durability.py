@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 
 import pytest
-from ringdic_node.spool import Spool, SpoolError, digest
+from ringdic_node.spool import Spool, SpoolError, image_digest
 from ringdic_node.wire import CaptureKey, Manifest
 
 PARTS = (b"P5\n3 2\n255\n", b"abcdef")
 
 
 def manifest_of(capture: str = "0001-board", parts=PARTS) -> Manifest:
-    sha256, length = digest(parts)
+    sha256, length = image_digest(parts)
     return Manifest("n", CaptureKey("s", capture, 5), "board", sha256, length, 3, 2, 6)
 
 
@@ -71,7 +71,7 @@ def test_a_power_cut_at_any_step_leaves_all_or_nothing(tmp_path, monkeypatch, st
     if finished:
         assert held
     for manifest in held:
-        assert digest([again.read(manifest.key)]) == (manifest.sha256, manifest.bytes)
+        assert image_digest([again.read(manifest.key)]) == (manifest.sha256, manifest.bytes)
     committed = len(held)
     assert len([p for p in tmp_path.iterdir() if p.name != ".claim"]) == 2 * committed, "nothing half-written is left"
 

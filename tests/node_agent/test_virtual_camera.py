@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from ringdic_node.cameras.camera import CameraError, Shot
-from ringdic_node.cameras.virtual import VirtualCamera
+from ringdic_node.cameras.virtual import VirtualNodeCamera
 from ringdic_node.clock import SystemClock
 
 pytest.importorskip("numba", reason="the simulated rig needs the extra 'virtual'")
 
 
-def camera(name: str = "cam_02", **settings) -> VirtualCamera:
-    return VirtualCamera(name, SystemClock(), **{"scale": 0.05, "seed": 3, **settings})
+def camera(name: str = "cam_02", **settings) -> VirtualNodeCamera:
+    return VirtualNodeCamera(name, SystemClock(), **{"scale": 0.05, "seed": 3, **settings})
 
 
 def test_the_commanded_scene_is_rendered_for_this_camera():

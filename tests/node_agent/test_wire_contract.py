@@ -19,7 +19,7 @@ from ringdic_node.wire import (
     Inventory,
     Keys,
     Manifest,
-    Status,
+    NodeStatus,
     Trigger,
     TriggerReply,
     WireError,
@@ -65,7 +65,7 @@ messages = st.one_of(
     ),
     st.builds(Fetch, keys),
     st.builds(Ack, names, keys, hashes, st.sampled_from(["archived", "unknown"])),
-    st.builds(Status, names, st.sampled_from(["idle", "armed"]), st.booleans(), counts, counts, counts),
+    st.builds(NodeStatus, names, st.sampled_from(["idle", "armed"]), st.booleans(), counts, counts, counts),
 )
 
 KEY = CaptureKey("s", "0001-board", 17)

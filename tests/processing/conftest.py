@@ -5,8 +5,8 @@ from pathlib import Path
 
 import cv2
 import pytest
-from ringdic.calibration.rig import calibrate_ring
-from ringdic.session.folder import read_session
+from ringdic.calibration.calibrated_rig import calibrate_rig
+from ringdic.session.folder import open_session
 from ringdic.settings import CalibrationGroup
 from ringdic.tasks import kept
 from ringdic_controller.archive.importing import import_folder
@@ -32,7 +32,7 @@ def two_cameras(tmp_path_factory: pytest.TempPathFactory) -> Path:
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             assert cv2.imwrite(str(source / name), render(camera, scene(kind, number), number))
     import_folder(source, folder / "session")
-    calibrate_ring(read_session(folder / "session"), CalibrationGroup())
+    calibrate_rig(open_session(folder / "session"), CalibrationGroup())
     return folder / "session"
 
 

@@ -14,7 +14,7 @@ from ringdic.session.rig import parse_rig
 from ringdic_controller.studies.demo.comparison import compare_with_truth
 from ringdic_controller.studies.demo.rig import Setting, check_alive, running_controller, running_nodes
 from ringdic_controller.studies.demo.run import settings_for
-from ringdic_node.virtual_rig.render import warm_up
+from ringdic_node.virtual_rig.render import load_renderer
 from ringdic_node.virtual_rig.rig import VirtualRig, paper_rig
 from ringdic_node.virtual_rig.scenes import Limb
 
@@ -31,7 +31,7 @@ def rig(tmp_path: Path) -> Iterator[tuple[str, Setting]]:
     setting = Setting(tmp_path, cameras=12, scale=SCALE)
     pair = VirtualRig(paper_rig(12, SCALE, setting.seed).cameras[:2])
     ids = [camera.id for camera in pair.cameras]
-    warm_up()
+    load_renderer()
     with (
         running_controller(tmp_path, pair.rig_toml(), settings_for(SCALE)) as running,
         running_nodes(tmp_path, parse_rig(pair.rig_toml()).name, setting.node_tables(ids), running.endpoint) as nodes,

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ringdic.errors import InputError
-from ringdic.session.folder import read_session
+from ringdic.session.folder import open_session
 from ringdic_controller.archive.writer import Archive, SessionWriter, verify
 from ringdic_controller.rig.capture import MS, SECOND, Timing
 from ringdic_controller.rig.link import RigLink
@@ -171,7 +171,7 @@ def test_a_node_killed_in_the_middle_of_a_capture(twelve: Ring, tmp_path: Path, 
         assert rig.wait_for_nodes(30) == []
         again = rig.capture(session, "specimen")
         assert {e["status"] for e in again["cameras"].values()} == {"ok"}
-    read = read_session(session.path)
+    read = open_session(session.path)
     assert [len(capture.images) for capture in read.captures] == [12, 11, 12]
 
 

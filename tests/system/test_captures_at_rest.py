@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 from ringdic.report.hardware import camera_facts
-from ringdic.results.evaluation import Evaluated, evaluated
+from ringdic.results.evaluation import EvaluatedResults, evaluated
 from ringdic.results.results import read_results
-from ringdic.session.folder import newest_results, read_session
+from ringdic.session.folder import newest_results, open_session
 from ringdic.strain.rigid_motion import motion_to_reference
 from ringdic_node.virtual_rig.render import radiance
 from ringdic_node.virtual_rig.rig import paper_rig
-from ringdic_node.virtual_rig.scenes import Cylinder, Specimen, Target
+from ringdic_node.virtual_rig.scenes import Cylinder, Specimen, TargetScene
 from ringdic_node.virtual_rig.sensor import FULL_WELL, READ_NOISE, expose
 
 SWOLLEN, WINDOW, AT_REST = 1.02, 20.0, 3
@@ -59,7 +59,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (src / f"{camera.id}.json").write_text(json.dumps(lens))
         light = [radiance(camera, Specimen(Swelling(), step)) for step in (0, 1)]
         shots = {
-            f"target/{camera.id}.png": radiance(camera, Target()),
+            f"target/{camera.id}.png": radiance(camera, TargetScene()),
             f"specimen/{camera.id}/0.png": light[0],
             f"specimen/{camera.id}/1.png": light[1],
             **{f"static/{camera.id}/{n}.png": light[0] for n in range(AT_REST)},
@@ -80,7 +80,7 @@ def session(request, folder: Path, ringdic: Callable, tmp_path_factory: pytest.T
 
 
 @pytest.fixture(scope="module")
-def seen(session: Path) -> Evaluated:
+def seen(session: Path) -> EvaluatedResults:
     return evaluated(newest_results(session))
 
 
@@ -119,7 +119,7 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
 
 
-def test_the_noise_floor_is_that_of_the_noise(seen: Evaluated, figures) -> None:
+def test_the_noise_floor_is_that_of_the_noise(seen: EvaluatedResults, figures) -> None:
     floor = seen.results.summary["noise_floor"]
     assert floor["captures"] == AT_REST
     assert len(seen.steps) == 2, "captures at rest are no steps"
@@ -145,10 +145,12 @@ def known_noise(folder: Path, camera: str) -> tuple[float, float]:
     return float(np.sqrt(variance.mean())), float(np.sqrt(variance.mean() / slope))
 
 
-def test_the_noise_floor_is_what_electrons_make_of_it(session: Path, seen: Evaluated, folder: Path, figures) -> None:
+def test_the_noise_floor_is_what_electrons_make_of_it(
+    session: Path, seen: EvaluatedResults, folder: Path, figures
+) -> None:
     camera = seen.results.cameras[1]
     noise, height = known_noise(folder, camera.id)
-    (facts,) = (each for each in camera_facts(read_session(session), seen.results) if each.camera == camera.id)
+    (facts,) = (each for each in camera_facts(open_session(session), seen.results) if each.camera == camera.id)
     assert facts.at_rest
     figures("swelling cylinder: image noise, from electrons, grey levels", f"{facts.noise:.2f}, {noise:.2f}", "± 15 %")
     assert facts.noise == pytest.approx(noise, rel=0.15)
@@ -164,7 +166,9 @@ def test_the_noise_floor_is_what_electrons_make_of_it(session: Path, seen: Evalu
     assert 0.9 * wanted < found < 2.0 * wanted
 
 
-def test_the_window_is_true_on_homogeneous_strain_and_as_much_smoother_as_it_says(seen: Evaluated, figures) -> None:
+def test_the_window_is_true_on_homogeneous_strain_and_as_much_smoother_as_it_says(
+    seen: EvaluatedResults, figures
+) -> None:
     fields = seen.step(1).face
     way = seen.results.summary["calibration"]["method"]
     for name, truth in (("lambda1", 1.0), ("lambda2", SWOLLEN)):
@@ -180,7 +184,7 @@ def test_the_window_is_true_on_homogeneous_strain_and_as_much_smoother_as_it_say
         assert stated < 0.6
 
 
-def test_the_radius_is_as_far_off_as_the_calibration_says(seen: Evaluated, figures) -> None:
+def test_the_radius_is_as_far_off_as_the_calibration_says(seen: EvaluatedResults, figures) -> None:
     uncertainty, results = seen.results.summary["uncertainty"], seen.results
     if results.summary["calibration"]["method"] == "dlt":
         assert uncertainty["calibration"] == {"position_mm": None, "displacement_mm": None, "stretch": None}
@@ -228,7 +232,9 @@ class Tables(HTMLParser):
             self.cells[self._table][-1][-1] += data
 
 
-def test_the_report_tells_floor_and_uncertainty(session: Path, seen: Evaluated, ringdic: Callable, tmp_path) -> None:
+def test_the_report_tells_floor_and_uncertainty(
+    session: Path, seen: EvaluatedResults, ringdic: Callable, tmp_path
+) -> None:
     done = ringdic("report", session, "--out", tmp_path / "report.html", "--json")
     assert json.loads(done.stdout) == {"written": str(tmp_path / "report.html")}
     page = Tables((tmp_path / "report.html").read_text(encoding="utf-8"))
@@ -245,7 +251,7 @@ def test_the_report_tells_floor_and_uncertainty(session: Path, seen: Evaluated, 
     assert ("Each camera was calibrated alone" in page.text) is not bundle
 
 
-def test_the_overlay_colours_the_photograph(session: Path, seen: Evaluated, ringdic: Callable, tmp_path) -> None:
+def test_the_overlay_colours_the_photograph(session: Path, seen: EvaluatedResults, ringdic: Callable, tmp_path) -> None:
     done = ringdic("overlay", session, "--field", "lambda2", "--out", tmp_path, "--no-bar", "--json")
     paths = [Path(path) for path in json.loads(done.stdout)["written"]]
     assert len(paths) == 3
@@ -256,7 +262,7 @@ def test_the_overlay_colours_the_photograph(session: Path, seen: Evaluated, ring
         assert 0.05 < coloured.mean() < 0.6, "the body is coloured, the room is not"
 
 
-def test_the_film_has_a_picture_a_step(session: Path, seen: Evaluated, ringdic: Callable, tmp_path) -> None:
+def test_the_film_has_a_picture_a_step(session: Path, seen: EvaluatedResults, ringdic: Callable, tmp_path) -> None:
     camera = seen.results.cameras[1].id
     ringdic("animate", session, "--out", tmp_path / "turn.gif", "--azimuth", 30, "--size", 200)
     with Image.open(tmp_path / "turn.gif") as film:

@@ -17,7 +17,7 @@ from ringdic.cli.console import narrated, show_table
 from ringdic.cli.options import AsJson, Reference, Run, Session, SethHill, Window, WithoutRigidMotion
 from ringdic.errors import InputError, RingdicError
 from ringdic.progress import Progress
-from ringdic.session.folder import read_session
+from ringdic.session.folder import open_session
 
 from ringdic_controller.studies.bench.command import bench
 
@@ -59,10 +59,10 @@ def controller(
     config: Annotated[Path | None, typer.Option(help="The controller's configuration (TOML).")] = None,
 ) -> None:
     """Run the controller: router, archive, jobs and the page."""
-    from ringdic_controller.service.config import read_config
+    from ringdic_controller.service.config import read_controller_config
     from ringdic_controller.service.service import run_controller
 
-    run_controller(read_config(config), on_ready=typer.echo)
+    run_controller(read_controller_config(config), on_ready=typer.echo)
 
 
 @app.command(name="import")
@@ -100,7 +100,7 @@ def process(
         from ringdic.jobs.cluster import ClusterExecutor
 
         executor = ClusterExecutor(cluster)
-        session = read_session(session.resolve()).path  # the workers' working folders are others
+        session = open_session(session.resolve()).path  # the workers' working folders are others
     with narrated() as report:
         if executor is not None:
             report(Progress("prepare", 0.0, f"asking the workers of {cluster}"))

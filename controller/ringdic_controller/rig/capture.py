@@ -97,7 +97,7 @@ class NodeBack:
 
 
 @dataclass(frozen=True)
-class Tick:
+class RoundTick:
     """Time has passed."""
 
 
@@ -110,7 +110,7 @@ Event = (
     | InventoryAnswered
     | NodeGone
     | NodeBack
-    | Tick
+    | RoundTick
 )
 
 
@@ -151,7 +151,7 @@ class NoteOutcome:
     """A camera's outcome changed: tell whoever watches."""
 
     camera: str
-    outcome: Outcome
+    outcome: CameraOutcome
 
 
 @dataclass(frozen=True)
@@ -161,14 +161,14 @@ class RefuseRound:
 
 @dataclass(frozen=True)
 class CloseCapture:
-    outcomes: dict[str, Outcome]
+    outcomes: dict[str, CameraOutcome]
 
 
 Action = SendArm | OpenCapture | SendTrigger | AskInventory | FetchImage | NoteOutcome | RefuseRound | CloseCapture
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CameraOutcome:
     """How one camera stands: pending, ok or failed, with the reason in words."""
 
     status: str = "pending"
@@ -211,7 +211,7 @@ class CaptureRound:
         self.timing = timing
         self.state = "arming"
         self.key: CaptureKey | None = None
-        self.outcomes = {camera: Outcome() for camera in self.cameras}
+        self.outcomes = {camera: CameraOutcome() for camera in self.cameras}
         self._override = override
         self._arm_deadline = now + timing.arm
         self._next_send = now
@@ -248,7 +248,7 @@ class CaptureRound:
                 actions += self._note_verdict(event.reply)
             case ImageArchived():
                 if self._expects(event.manifest.node, event.manifest.key):
-                    actions += self._settle(event.manifest.node, Outcome("ok"))
+                    actions += self._settle(event.manifest.node, CameraOutcome("ok"))
             case FailureReported():
                 actions += self._note_failure(event.failure)
             case InventoryAnswered():
@@ -257,7 +257,7 @@ class CaptureRound:
                 self._gone.setdefault(event.camera, now)
             case NodeBack():
                 self._gone.pop(event.camera, None)
-            case Tick():
+            case RoundTick():
                 pass
         return actions + self._advance(now)
 
@@ -300,7 +300,7 @@ class CaptureRound:
         self.state = "opening"
         notes: list[Action] = []
         for camera, reason in reasons.items():
-            notes += self._settle(camera, Outcome("failed", reason))
+            notes += self._settle(camera, CameraOutcome("failed", reason))
         return [*notes, OpenCapture(self._moment(now), reasons)]
 
     def _why_not_armed(self, camera: str) -> str:
@@ -338,7 +338,7 @@ class CaptureRound:
         if known is None or known.verdict == "not armed":
             self._verdicts[reply.node] = reply
         if reply.verdict == "late":
-            return self._settle(reply.node, Outcome("failed", reply.reason or "the trigger came too late"))
+            return self._settle(reply.node, CameraOutcome("failed", reply.reason or "the trigger came too late"))
         return []
 
     def _advance_triggering(self, now: int) -> list[Action]:
@@ -361,7 +361,7 @@ class CaptureRound:
     def _note_failure(self, failure: Failure) -> list[Action]:
         if not self._expects(failure.node, failure.key):
             return []
-        return self._settle(failure.node, Outcome("failed", failure.reason))
+        return self._settle(failure.node, CameraOutcome("failed", failure.reason))
 
     def _note_inventory(self, inventory: Inventory, now: int) -> list[Action]:
         key, camera = self.key, inventory.node
@@ -375,7 +375,7 @@ class CaptureRound:
                 return self._note_failure(failure)
         # Asked after the moment, so a trigger still on its way will be judged late by the node.
         if inventory.capturing != key and now > key.fire_at_ns + self.timing.pull_after:
-            return self._settle(camera, Outcome("failed", self._why_missing(camera)))
+            return self._settle(camera, CameraOutcome("failed", self._why_missing(camera)))
         return []
 
     def _why_missing(self, camera: str) -> str:
@@ -397,7 +397,7 @@ class CaptureRound:
             return [AskInventory(tuple(c for c in pending if c not in gone))]
         actions: list[Action] = []
         for camera in pending:
-            actions += self._settle(camera, Outcome("failed", self._why_unfinished(camera)))
+            actions += self._settle(camera, CameraOutcome("failed", self._why_unfinished(camera)))
         self.state = "closed"
         return [*actions, CloseCapture(dict(self.outcomes))]
 
@@ -410,7 +410,7 @@ class CaptureRound:
             return "the node did not answer the trigger and no image arrived by the deadline"
         return f"no image arrived within {self.timing.collect / SECOND:g} s of the planned moment"
 
-    def _settle(self, camera: str, outcome: Outcome) -> list[Action]:
+    def _settle(self, camera: str, outcome: CameraOutcome) -> list[Action]:
         """Set the outcome; an archived image is never overruled by a report of failure."""
         known = self.outcomes[camera]
         if known == outcome or known.status == "ok":

@@ -29,7 +29,7 @@ from ringdic_node.wire import (
     Inventory,
     Keys,
     Manifest,
-    Status,
+    NodeStatus,
     Trigger,
     TriggerReply,
     WireError,
@@ -59,7 +59,7 @@ class _Node:
     """What is known of one camera's node."""
 
     alive: bool = False
-    status: Status | None = None
+    status: NodeStatus | None = None
     seen_ns: int = 0
     offset_ms: float | None = None
     quickest_ns: int = 0
@@ -215,10 +215,10 @@ class RigLink:
             return
         if isinstance(message, Failure):
             self._note_failure(message)
-        elif isinstance(message, Status):
+        elif isinstance(message, NodeStatus):
             self._note_status(message)
 
-    def _note_status(self, status: Status) -> None:
+    def _note_status(self, status: NodeStatus) -> None:
         with self._lock:
             node = self._nodes.get(status.node)
             if node is None:
@@ -287,7 +287,7 @@ class RigLink:
     def _reconcile_node(self, camera: str) -> None:
         """Ask one node for its status and its inventory; fetch what the archive lacks."""
         sent = time.time_ns()
-        for status in self._answers(camera, "status", Status):
+        for status in self._answers(camera, "status", NodeStatus):
             received = time.time_ns()
             with self._lock:
                 self._nodes[camera].note_offset(received - sent, status.time_ns - (sent + received) // 2)

@@ -63,7 +63,7 @@ def run_round(
     machine = CaptureRound(cameras, timing, wall_ns(), absent=absent, override=override)
     performer = _Performer(nodes, events, session, kind, tuple(cameras), timing, tolerance_ns, settings, on_event)
     performer.tell_waiting("arming")
-    event: steps.Event = steps.Tick()
+    event: steps.Event = steps.RoundTick()
     while True:
         for action in machine.handle(event, wall_ns()):
             performer.perform(action)
@@ -72,7 +72,7 @@ def run_round(
         try:
             event = events.get(timeout=HEARTBEAT)
         except queue.Empty:
-            event = steps.Tick()
+            event = steps.RoundTick()
     return performer.record()
 
 

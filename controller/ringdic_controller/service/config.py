@@ -48,7 +48,7 @@ class ControllerConfig:
             raise InputError(f"[zenoh] endpoint '{self.endpoint}' is not of the form tcp/ADDRESS:PORT")
 
 
-def read_config(path: Path | None) -> ControllerConfig:
+def read_controller_config(path: Path | None) -> ControllerConfig:
     """The configuration of a TOML file, the defaults without one; relative paths are taken from the file's folder.
 
     Raises InputError, naming the file and the key at fault.

@@ -65,7 +65,7 @@ def open_desk(
         desk.close()
 
 
-def serve(desk: Desk, config: ControllerConfig, on_ready: Callable[[str], None] | None = None) -> None:
+def serve_page(desk: Desk, config: ControllerConfig, on_ready: Callable[[str], None] | None = None) -> None:
     """Serve the page and the HTTP interface until SIGINT or SIGTERM; ``on_ready`` is told the address.
 
     Raises InputError if the port is taken.
@@ -86,7 +86,7 @@ def serve(desk: Desk, config: ControllerConfig, on_ready: Callable[[str], None] 
 def run_controller(config: ControllerConfig, on_ready: Callable[[str], None] | None = None) -> None:
     """Run the controller until it is told to end. Without a rig it shows the archive's sessions."""
     with open_desk(config) as desk:
-        serve(desk, config, on_ready)
+        serve_page(desk, config, on_ready)
 
 
 def free_endpoint(config: ControllerConfig) -> ControllerConfig:

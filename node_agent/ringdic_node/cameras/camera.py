@@ -78,7 +78,7 @@ class Frame:
         return header, np.ascontiguousarray(plane).tobytes()
 
 
-class Camera(Protocol):
+class NodeCamera(Protocol):
     """A source of frames. Used from one thread."""
 
     def lock(self, settings: Mapping[str, Any]) -> Lock:

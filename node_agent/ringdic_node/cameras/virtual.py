@@ -16,7 +16,7 @@ from ringdic_node.cameras.camera import CameraError, Frame, Lock, Shot, check_se
 from ringdic_node.clock import Clock, sleep_until
 
 
-class VirtualCamera:
+class VirtualNodeCamera:
     """One camera of the rig with the paper's geometry. Importing the renderer needs the extra `virtual`.
 
     Parameters
@@ -44,11 +44,11 @@ class VirtualCamera:
         offset_us: float = 20.0,
     ) -> None:
         try:
-            from ringdic_node.virtual_rig.render import warm_up
+            from ringdic_node.virtual_rig.render import load_renderer
             from ringdic_node.virtual_rig.rig import paper_rig
 
             ring = {lens.id: lens for lens in paper_rig(cameras=cameras, scale=scale, seed=seed).cameras}
-            warm_up(specimen)
+            load_renderer(specimen)
         except ImportError as error:
             raise CameraError(
                 f"the simulated rig cannot be loaded ({error}); install the extra: pip install 'ringdic[virtual]'"

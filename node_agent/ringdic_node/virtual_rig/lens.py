@@ -24,7 +24,7 @@ def distort(x, y, lens):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def ideal(u, v, lens, x, y):  # type: ignore[no-untyped-def]
+def ideal_of_pixel(u, v, lens, x, y):  # type: ignore[no-untyped-def]
     """Pixel to ideal normalised coordinates x, y by Newton's method from a start, and their derivatives by the pixel.
 
     Returns x, y, dx/du, dx/dv, dy/du, dy/dv.

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from ringdic_node.virtual_rig.arrays import Radiance
 from ringdic_node.virtual_rig.body import CYLINDER, approach, point
-from ringdic_node.virtual_rig.lens import VirtualCamera, ideal
+from ringdic_node.virtual_rig.lens import VirtualCamera, ideal_of_pixel
 from ringdic_node.virtual_rig.rig import paper_rig
-from ringdic_node.virtual_rig.scenes import Board, Scene, Specimen, Target
+from ringdic_node.virtual_rig.scenes import BoardScene, Scene, Specimen, TargetScene
 from ringdic_node.virtual_rig.scenes import scene as make_scene
 from ringdic_node.virtual_rig.scenes.board import MARGIN, SQUARE, SQUARES
 from ringdic_node.virtual_rig.scenes.damage import BAR, GLARE_PEAK, GLARE_WIDTH, Damage
@@ -45,7 +45,7 @@ def render(camera: VirtualCamera, scene: Scene, seed: int = 0) -> NDArray[np.uin
     return expose(radiance(camera, scene), seed)
 
 
-def warm_up(specimen: str = "limb") -> None:
+def load_renderer(specimen: str = "limb") -> None:
     """Load, or compile and cache, everything that rendering needs, by rendering each kind of scene very small."""
     small = paper_rig(cameras=12, scale=0.05).cameras[0]
     for kind in ("board", "target", "specimen"):
@@ -55,11 +55,11 @@ def warm_up(specimen: str = "limb") -> None:
 def radiance(camera: VirtualCamera, scene: Scene) -> Radiance:
     """The noise-free image (height, width) of a scene behind the lens, in linear light."""
     out = np.zeros((camera.height, camera.width), np.float32)
-    if isinstance(scene, Board):
+    if isinstance(scene, BoardScene):
         R, t = scene.pose(camera)
         _board_kernel(camera.lens, camera.R, camera.centre, R, t, out)
         return blurred(out)
-    if isinstance(scene, Target):
+    if isinstance(scene, TargetScene):
         look = np.array([_PRINT_DOTS, 0.0, 0.0, 0.0, _TARGET_TOP, _widest(scene)])
         prints, damage, seed = scene.prints(), Damage(), 0
     else:
@@ -67,7 +67,7 @@ def radiance(camera: VirtualCamera, scene: Scene) -> Radiance:
         prints, damage, seed = np.zeros((1, 1, 2)), scene.damage, scene.seed
     marks = (prints, *damage.arrays())
     _body_kernel(camera.lens, camera.R, camera.centre, scene.body(), look, seed, marks, out)
-    return blurred(out) if isinstance(scene, Target) else out
+    return blurred(out) if isinstance(scene, TargetScene) else out
 
 
 def _extent(scene: Specimen) -> tuple[float, float]:
@@ -75,9 +75,9 @@ def _extent(scene: Specimen) -> tuple[float, float]:
     return (0.0, _TARGET_TOP) if scene.body()[0] == CYLINDER else (-120.0, 420.0)
 
 
-def _widest(scene: Specimen | Target) -> float:
+def _widest(scene: Specimen | TargetScene) -> float:
     """Radius about the z axis beyond which there is neither body nor base at the heights that cameras see, mm."""
-    if isinstance(scene, Target) or scene.body()[0] == CYLINDER:
+    if isinstance(scene, TargetScene) or scene.body()[0] == CYLINDER:
         return _BASE_RADIUS + math.hypot(*scene.body()[2:4])
     theta, z = np.meshgrid(np.linspace(0.0, 2.0 * math.pi, 73), np.linspace(-120.0, 370.0, 50))
     xyz = scene.surface.position(theta, z, scene.step)
@@ -312,7 +312,7 @@ def _render_body(lens, R, o, p, look, seed, marks, out):  # type: ignore[no-unty
         near = False
         x, y = first_x, first_y  # the first pixel of the row above is a good start
         for u in range(width):
-            x, y, xu, xv, yu, yv = ideal(u, v, lens, x, y)
+            x, y, xu, xv, yu, yv = ideal_of_pixel(u, v, lens, x, y)
             if u == 0:
                 first_x, first_y = x, y
             _to_world(R, x, y, straight)
@@ -424,7 +424,7 @@ def _render_board(lens, R, o, Rb, tb, out):  # type: ignore[no-untyped-def]
     for v in range(height):
         x, y = first_x, first_y
         for u in range(width):
-            x, y, xu, xv, yu, yv = ideal(u, v, lens, x, y)
+            x, y, xu, xv, yu, yv = ideal_of_pixel(u, v, lens, x, y)
             if u == 0:
                 first_x, first_y = x, y
             total, outside = _board_sample(x, y, o, R, d, Rb, tb, SAMPLES * per_x, SAMPLES * per_y)

@@ -18,10 +18,10 @@ def expose(radiance: NDArray[np.float32], seed: int) -> NDArray[np.uint8]:
     noise = np.random.default_rng([seed, 4500]).standard_normal(light.shape, dtype=np.float32)
     electrons = np.minimum(light, 1.0) * np.float32(FULL_WELL)
     electrons += noise * np.sqrt(np.maximum(electrons, 0.0) + np.float32(READ_NOISE**2))
-    return np.rint(255.0 * encode(np.clip(electrons / np.float32(FULL_WELL), 0.0, 1.0))).astype(np.uint8)
+    return np.rint(255.0 * quantise(np.clip(electrons / np.float32(FULL_WELL), 0.0, 1.0))).astype(np.uint8)
 
 
-def encode(linear: NDArray[np.float32]) -> NDArray[np.float32]:
+def quantise(linear: NDArray[np.float32]) -> NDArray[np.float32]:
     """sRGB coding of linear light 0 … 1 (IEC 61966-2-1)."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 

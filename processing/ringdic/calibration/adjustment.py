@@ -18,7 +18,7 @@ import scipy
 from ringdic.arrays import Floats, Indices, Mask
 from ringdic.calibration.parameters import PER_CAMERA
 from ringdic.calibration.patch import (
-    Sheet,
+    PrintedSheet,
     Views,
     by_sheet,
     patch_jacobians,
@@ -42,7 +42,7 @@ class State:
     inner: Floats
     rotation: Floats
     translation: Floats
-    sheet: Sheet
+    sheet: PrintedSheet
     offsets: Floats
 
     def moved(self, step: Floats, dots: Floats) -> State:
@@ -54,7 +54,7 @@ class State:
             self.inner + cameras[:, :10],
             turns @ self.rotation,
             self.translation + cameras[:, 13:],
-            Sheet(self.sheet.radius + radius, self.sheet.pitch + pitch, self.sheet.tilt + tilt),
+            PrintedSheet(self.sheet.radius + radius, self.sheet.pitch + pitch, self.sheet.tilt + tilt),
             self.offsets + dots if len(dots) else self.offsets,
         )
 
@@ -255,7 +255,7 @@ def _beforehand(problem: Problem, state: State, scales: Scales) -> tuple[Floats,
 
 
 def _sheet_gap(problem: Problem, state: State) -> Floats:
-    nominal, sheet = Sheet.nominal(problem.target), state.sheet
+    nominal, sheet = PrintedSheet.nominal(problem.target), state.sheet
     return np.array([sheet.radius - nominal.radius, sheet.pitch - nominal.pitch, sheet.tilt])
 
 

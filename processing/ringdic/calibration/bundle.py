@@ -18,7 +18,7 @@ from ringdic.arrays import Floats, Indices, Mask
 from ringdic.calibration.adjustment import Problem, Solution, State, adjust
 from ringdic.calibration.camera_calibration import CameraCalibration
 from ringdic.calibration.parameters import PER_CAMERA, Parameters
-from ringdic.calibration.patch import Sheet, Views, project_centres, project_patches, sheet_points, wrapped
+from ringdic.calibration.patch import PrintedSheet, Views, project_centres, project_patches, sheet_points, wrapped
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.session.rig import Target
@@ -69,7 +69,7 @@ class BundleFit:
 
     cameras: tuple[str, ...]
     covariance: Floats
-    sheet: Sheet
+    sheet: PrintedSheet
     px_sigma: float
     print_sigma: float
     rows: Indices
@@ -151,7 +151,7 @@ class BundleFit:
         return cls(
             tuple(values["cameras"]),
             np.array(values["covariance"], dtype=float),
-            Sheet(*(float(value) for value in values["sheet"])),
+            PrintedSheet(*(float(value) for value in values["sheet"])),
             float(values["px_sigma"]),
             float(values["print_sigma"]),
             np.array(values["rows"], dtype=np.intp),
@@ -212,7 +212,7 @@ def centroid_shift(
     rows: Indices,
     columns: Indices,
     *,
-    sheet: Sheet | None = None,
+    sheet: PrintedSheet | None = None,
     rotation: Floats | None = None,
     translation: Floats | None = None,
 ) -> Floats:
@@ -223,7 +223,7 @@ def centroid_shift(
     rows, columns : (n,), from 1. sheet : as adjusted, else the nominal one.
     rotation : (3, 3) and translation : (3,) mm, of the target in the world; none leaves it in place.
     """
-    sheet = sheet or Sheet.nominal(target)
+    sheet = sheet or PrintedSheet.nominal(target)
     state = Parameters.of(camera)
     R, t = state.rotation, state.translation
     t = t if translation is None else t + R @ np.asarray(translation, dtype=float)
@@ -264,7 +264,7 @@ def _problem(given: list[CameraCalibration], target: Target, prior: TargetPrior)
         inner,
         np.array([each.rotation for each in poses]),
         np.array([each.translation for each in poses]),
-        Sheet.nominal(target),
+        PrintedSheet.nominal(target),
         np.zeros((len(names), 2)),
     )
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from ringdic.arrays import Floats, Mask
 from ringdic.calibration.coverage import coverage, residual_distortion
-from ringdic.calibration.lens_model import Choice, LensModel, choose, independent, possible
+from ringdic.calibration.lens_model import LensModel, LensModelChoice, choose, independent, possible
 from ringdic.calibration.parameters import lens_jacobians
 from ringdic.errors import ComputationError, InputError
 from ringdic.geometry.camera import Intrinsics
@@ -194,7 +194,7 @@ def calibrate_intrinsics(
     )
 
 
-def _words(choice: Choice) -> tuple[str, str]:
+def _words(choice: LensModelChoice) -> tuple[str, str]:
     return str(choice.model), choice.reason
 
 

@@ -68,7 +68,7 @@ def read_labels(image: NDArray[np.generic], dots: DotObservations, target: Targe
     return labels
 
 
-def printed(labels: Labels) -> bool:
+def has_labels(labels: Labels) -> bool:
     """Whether something is printed there that differs from column to column."""
     if len(labels) < 3:
         return False

@@ -65,7 +65,7 @@ def possible(radial: int | None, tangential: bool, skew: bool, fewest: bool) -> 
 
 
 @dataclass(frozen=True)
-class Choice:
+class LensModelChoice:
     """The model taken and why, as words for the operator."""
 
     model: LensModel
@@ -91,7 +91,7 @@ def independent(residuals: Floats, board_xy: Floats) -> float:
 
 def choose(
     models: list[LensModel], fit: Callable[[LensModel], tuple[float, float]], N: float, limit: float, fewest: bool
-) -> Choice:
+) -> LensModelChoice:
     """The first model that is determined, or of all determined ones that of the smallest criterion.
 
     models : to choose from, the largest first. fit : of a model, the mean square residual a component, px², and the
@@ -99,7 +99,7 @@ def choose(
     determined. fewest : compare all.
     """
     if len(models) == 1:
-        return Choice(models[0], "as set")
+        return LensModelChoice(models[0], "as set")
     scores: list[tuple[float, LensModel]] = []
     unsure = ""
     for model in models:
@@ -109,9 +109,9 @@ def choose(
         elif fewest:
             scores.append((N * math.log(max(square, 1e-18)) + 2 * int(model.free.sum()), model))
         else:
-            return Choice(model, f"the most terms that the views determine{unsure}")
+            return LensModelChoice(model, f"the most terms that the views determine{unsure}")
     scores.sort(key=lambda each: each[0])
     if len(scores) == 1:
-        return Choice(scores[0][1], f"the most terms that the views determine{unsure}")
+        return LensModelChoice(scores[0][1], f"the most terms that the views determine{unsure}")
     (best, model), (second, other) = scores[:2]
-    return Choice(model, f"information criterion {second - best:.1f} below that of {other}{unsure}")
+    return LensModelChoice(model, f"information criterion {second - best:.1f} below that of {other}{unsure}")

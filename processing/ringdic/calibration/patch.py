@@ -23,7 +23,7 @@ _STEP = 1e-40
 
 
 @dataclass(frozen=True)
-class Sheet:
+class PrintedSheet:
     """The printed sheet as it lies round the cylinder.
 
     radius : of the surface, mm. pitch : of the columns along the arc, mm. tilt : by which the sheet is turned in the
@@ -35,7 +35,7 @@ class Sheet:
     tilt: float = 0.0
 
     @classmethod
-    def nominal(cls, target: Target) -> Sheet:
+    def nominal(cls, target: Target) -> PrintedSheet:
         """The sheet as the rig describes it."""
         return cls(target.radius_mm, target.column_spacing_mm)
 
@@ -44,7 +44,7 @@ class Sheet:
         return 2 * np.pi * self.radius - (target.columns - 1) * self.pitch
 
 
-def sheet_points(target: Target, sheet: Sheet, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Floats:
+def sheet_points(target: Target, sheet: PrintedSheet, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Floats:
     """Arc and height of dots' centres on the sheet, without print errors. rows, columns : (n,), from 1. (n, 2) mm."""
     arc, height = _nominal(target, rows, columns)
     s = arc * (sheet.pitch / target.column_spacing_mm) - sheet.tilt * (height - _middle(target)[1])

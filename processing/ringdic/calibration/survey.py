@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.calibration.dots import Dots
-from ringdic.calibration.labels import Labels, common_part, printed, read_labels, same_numbers
+from ringdic.calibration.labels import Labels, common_part, has_labels, read_labels, same_numbers
 from ringdic.calibration.target import identify, possible_azimuths
 from ringdic.errors import InputError
 from ringdic.session.rig import RigCamera, Target
@@ -77,8 +77,8 @@ def sight(image: NDArray[np.generic], dots: Dots, camera: RigCamera, target: Tar
     except InputError:
         return Sight(camera, (), {})  # whoever calibrates this camera says why
     labels = read_labels(image, observed, target) if observed.rows.max() == target.rows else {}
-    if not printed(labels):
-        upside_down = observed.rows.min() == 1 and printed(read_labels(image, observed, target, below=True))
+    if not has_labels(labels):
+        upside_down = observed.rows.min() == 1 and has_labels(read_labels(image, observed, target, below=True))
         if upside_down:
             other = (camera.rotation_deg + 180.0) % 360.0
             raise InputError(

@@ -172,7 +172,7 @@ def _cut(z: float | None, theta: float | None, plane: str | None) -> Cut:
 
 
 def _region(box: str | None, sphere: str | None, patch: str | None, faces: str | None) -> Region:
-    from ringdic.measure.region import Ball, Box, Everything, Listed, Patch
+    from ringdic.measure.region import AngularPatch, Ball, Box, Everything, Listed
 
     if sum(choice is not None for choice in (box, sphere, patch, faces)) > 1:
         raise InputError("name one region: --box, --sphere, --patch or --faces")
@@ -184,7 +184,7 @@ def _region(box: str | None, sphere: str | None, patch: str | None, faces: str |
         return Ball((a, b, c), radius)
     if patch is not None:
         begin, end, low, high = _numbers("--patch", patch, 4)
-        return Patch((math.radians(begin), math.radians(end)), (low, high))
+        return AngularPatch((math.radians(begin), math.radians(end)), (low, high))
     if faces is not None:
         try:
             return Listed(tuple(int(index) for index in faces.split(",")))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from ringdic.results.evaluation import Evaluated
+    from ringdic.results.evaluation import EvaluatedResults
 
 Session = Annotated[Path, typer.Argument(help="The session folder.")]
 Run = Annotated[int | None, typer.Option(help="Number of the processing run; the newest unless given.")]
@@ -26,7 +26,7 @@ def results_of(
     without_rigid_motion: bool = False,
     window: float | None = None,
     exponent: float | None = None,
-) -> Evaluated:
+) -> EvaluatedResults:
     """The results of a run as the options evaluate them. Raises InputError for a run that is not there."""
     from ringdic.results.evaluation import Evaluation, evaluated
     from ringdic.session.folder import newest_results

@@ -16,7 +16,7 @@ from ringdic.progress import Progress
 
 if TYPE_CHECKING:
     from ringdic.pictures.scale import Scale
-    from ringdic.results.evaluation import Evaluated
+    from ringdic.results.evaluation import EvaluatedResults
     from ringdic.session.folder import Session as Captured
 
 FieldName = Annotated[str, typer.Option("--field", help="Field that gives the colours.")]
@@ -59,12 +59,12 @@ def overlay(
 
     from ringdic.pictures.overlay import overlay as laid_over
     from ringdic.pictures.overlay import photograph, with_bar
-    from ringdic.session.folder import read_session
+    from ringdic.session.folder import open_session
 
     seen = results_of(session, run, reference, without_rigid_motion, window)
     scale = _scale(seen, field, limits)
     number = _step(seen, step)
-    captured = read_session(session)
+    captured = open_session(session)
     name = seen.steps[number]
     cameras = camera or _photographed(captured, name, seen)
     out.mkdir(parents=True, exist_ok=True)
@@ -96,14 +96,14 @@ def animate(
     """A field over all steps as GIF or MP4: on one camera's photographs, or on the body seen from a side."""
     from ringdic.pictures.animation import overlay_frames, surface_frames, write_animation
     from ringdic.pictures.views import mean_azimuth
-    from ringdic.session.folder import read_session
+    from ringdic.session.folder import open_session
 
     if camera is not None and azimuth is not None:
         raise InputError("--camera shows its photographs, --azimuth the body without them; give one of them")
     seen = results_of(session, run, reference, without_rigid_motion, window)
     scale = _scale(seen, field, limits)
     if camera is not None:
-        frames = overlay_frames(seen, read_session(session), camera, scale, size, opacity)
+        frames = overlay_frames(seen, open_session(session), camera, scale, size, opacity)
     else:
         front = mean_azimuth(seen.results.mesh) if azimuth is None else math.radians(azimuth)
         frames = surface_frames(seen, scale, front, size)
@@ -111,7 +111,7 @@ def animate(
     _told([out], as_json)
 
 
-def _scale(seen: Evaluated, field: str, limits: str | None) -> Scale:
+def _scale(seen: EvaluatedResults, field: str, limits: str | None) -> Scale:
     from ringdic.pictures.scale import scale_of
 
     return scale_of(seen, field, None if limits is None else _two(limits))
@@ -125,7 +125,7 @@ def _two(text: str) -> tuple[float, float]:
     return low, high
 
 
-def _step(seen: Evaluated, step: int | None) -> int:
+def _step(seen: EvaluatedResults, step: int | None) -> int:
     count = len(seen.steps)
     if step is None:
         return count - 1
@@ -134,7 +134,7 @@ def _step(seen: Evaluated, step: int | None) -> int:
     return step
 
 
-def _photographed(session: Captured, capture_id: str, seen: Evaluated) -> list[str]:
+def _photographed(session: Captured, capture_id: str, seen: EvaluatedResults) -> list[str]:
     """Cameras of the run that have an image in a capture."""
     images = {id_ for capture in session.captures if capture.id == capture_id for id_ in capture.images}
     return [camera.id for camera in seen.results.cameras if camera.id in images]

@@ -13,7 +13,7 @@ them. The room knows images, masks and points only: no camera, no calibration, n
 ``command``      the same for two files
 """
 
-from ringdic.correlation.correlate import Correlation, correlate, in_order, refine_alone
+from ringdic.correlation.correlate import Correlation, correlate_points, refine_alone, start_order
 from ringdic.correlation.grid import grid
 from ringdic.correlation.hypotheses import Row, search_hypotheses, search_row
 from ringdic.correlation.prepared import Current, Reference, prepare_current, prepare_reference
@@ -28,13 +28,13 @@ __all__ = [
     "Reference",
     "Row",
     "Status",
-    "correlate",
+    "correlate_points",
     "grid",
-    "in_order",
     "prepare_current",
     "prepare_reference",
     "reference_bytes",
     "refine_alone",
     "search_hypotheses",
     "search_row",
+    "start_order",
 ]

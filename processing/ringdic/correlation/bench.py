@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Mask
-from ringdic.correlation.correlate import Correlation, correlate, load_kernels, on_threads
+from ringdic.correlation.correlate import Correlation, correlate_points, load_kernels, on_threads
 from ringdic.correlation.grid import grid
 from ringdic.correlation.machine import Machine, demand, measure_machine
 from ringdic.correlation.prepared import prepare_current, prepare_reference
@@ -170,7 +170,7 @@ def _measure(
     for _ in range(repeats):
         began = time.perf_counter()
         prepared = prepare_reference(reference, mask, settings), prepare_current(current, None, settings)
-        results.append(correlate(*prepared, xy, settings, threads=threads))
+        results.append(correlate_points(*prepared, xy, settings, threads=threads))
         wholes.append(time.perf_counter() - began)
     start, n = _start_off(results[0]), len(xy)
     with on_threads(threads):
@@ -234,7 +234,7 @@ def _stereo(
     for _ in range(3):
         prepared = prepare_reference(reference, mask, settings), prepare_current(current, None, settings)
         began, worked = time.perf_counter(), time.process_time()
-        result = correlate(*prepared, xy, settings)
+        result = correlate_points(*prepared, xy, settings)
         seconds.append(time.perf_counter() - began)
         cpu.append(time.process_time() - worked)
     start, kernel = _start_off(result), []
@@ -259,7 +259,7 @@ def _difference(reference: Image, current: Image, mask: Mask, xy: Floats, step: 
         settings = CorrelationSettings(20, step, 1, interpolation=interpolation, tolerance=tolerance)
         prepared = prepare_reference(reference, mask, settings), prepare_current(current, None, settings)
         if start is None:
-            start = _start_off(correlate(*prepared, xy, settings))
+            start = _start_off(correlate_points(*prepared, xy, settings))
         status, _, _, _, parameters = refine(*prepared, xy, start, settings)
         found.append(np.where((status == Status.GOOD)[:, None], parameters[:, [0, 6]], np.nan))
     return float(np.nanmax(np.abs(found[1] - found[0])))
@@ -290,7 +290,9 @@ def _peak_memory(
 
 
 def _peak_of_pair(reference: Image, current: Image, mask: Mask, xy: Floats, settings: CorrelationSettings) -> float:
-    correlate(prepare_reference(reference, mask, settings), prepare_current(current, None, settings), xy, settings)
+    correlate_points(
+        prepare_reference(reference, mask, settings), prepare_current(current, None, settings), xy, settings
+    )
     status = Path("/proc/self/status")
     if status.is_file():  # a child's rusage on Linux would begin with its parent's size
         peak = next(line for line in status.read_text(encoding="ascii").splitlines() if line.startswith("VmHWM"))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Mask
-from ringdic.correlation.correlate import Correlation, correlate, load_kernels, usable_threads
+from ringdic.correlation.correlate import Correlation, correlate_points, load_kernels, usable_threads
 from ringdic.correlation.grid import grid
 from ringdic.correlation.prepared import prepare_current, prepare_reference
 from ringdic.correlation.propagation import Progress
@@ -62,7 +62,7 @@ def correlate_files(
         )
     prepared = prepare_reference(ref, region, settings), prepare_current(cur, None, settings)
     preparing = time.perf_counter() - began
-    result = correlate(*prepared, xy, settings, threads=threads, progress=progress)
+    result = correlate_points(*prepared, xy, settings, threads=threads, progress=progress)
     if not result.good.any():
         raise ComputationError(
             f"{current}: none of the {len(xy)} points of {reference} was found in it; "

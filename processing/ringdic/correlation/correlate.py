@@ -17,7 +17,7 @@ from ringdic.correlation import kernels
 from ringdic.correlation.features import feature_starts
 from ringdic.correlation.hypotheses import search_hypotheses
 from ringdic.correlation.prepared import Current, Reference, prepare_current, prepare_reference
-from ringdic.correlation.propagation import Field, Progress
+from ringdic.correlation.propagation import Progress, Propagation
 from ringdic.correlation.seeds import flow_starts, search_starts, spread
 from ringdic.correlation.settings import CorrelationSettings
 from ringdic.correlation.status import Status
@@ -70,7 +70,7 @@ class Correlation:
         return self.status == Status.GOOD
 
 
-def correlate(
+def correlate_points(
     reference: Reference,
     current: Current,
     xy: Floats,
@@ -96,7 +96,7 @@ def correlate(
         began = time.perf_counter()
         assert reference.slopes  # computed when first asked for
         seconds = {"prepare": time.perf_counter() - began, "start": 0.0, "refine": 0.0}
-        points = Field(reference, current, xy, settings, progress)
+        points = Propagation(reference, current, xy, settings, progress)
         if start is None:
             _match_automatically(points, seconds)
         else:
@@ -115,7 +115,7 @@ def refine_alone(
     """
     xy = _checked(reference, current, xy, settings)
     load_kernels()
-    points = Field(reference, current, xy, settings, region=current, bare=np.zeros(len(xy), bool), alone=True)
+    points = Propagation(reference, current, xy, settings, region=current, bare=np.zeros(len(xy), bool), alone=True)
     given = np.flatnonzero(np.isfinite(start).all(axis=1))
     began = time.perf_counter()
     if len(given):
@@ -143,10 +143,10 @@ def load_kernels() -> None:
     settings = CorrelationSettings(radius=6, step=6)
     xy = np.stack(np.meshgrid(np.arange(16.0, 48.0, 6.0), np.arange(16.0, 48.0, 6.0)), axis=-1).reshape(-1, 2)
     reference, current = prepare_reference(image, None, settings), prepare_current(image, None, settings)
-    _match_automatically(Field(reference, current, xy, settings), {"prepare": 0.0, "start": 0.0, "refine": 0.0})
+    _match_automatically(Propagation(reference, current, xy, settings), {"prepare": 0.0, "start": 0.0, "refine": 0.0})
 
 
-def _match_automatically(points: Field, seconds: dict[str, float]) -> None:
+def _match_automatically(points: Propagation, seconds: dict[str, float]) -> None:
     """Seeds by one method after the other until nearly every point is matched, each carried on by propagation.
 
     A method most of whose seeds hold suits the pair and is used at once. The few seeds that an unsuitable one gets
@@ -179,19 +179,19 @@ def _match_automatically(points: Field, seconds: dict[str, float]) -> None:
             _carry_on(points, seconds)
 
 
-def _open(points: Field) -> Indices:
+def _open(points: Propagation) -> Indices:
     return np.flatnonzero(~points.good & (points.status != Status.NO_TEXTURE))
 
 
-def _worth(points: Field) -> int:
+def _worth(points: Propagation) -> int:
     """The number of points with texture enough to be matched."""
     return int((points.status != Status.NO_TEXTURE).sum())
 
 
-def _try_seeds(points: Field, seeds: Indices, start: Floats) -> Field:
+def _try_seeds(points: Propagation, seeds: Indices, start: Floats) -> Propagation:
     """The seeds (k,) refined from start values (k, 12), apart from the other points, where they look alike at all."""
     bare = points.status[seeds] == Status.NO_TEXTURE
-    trial = Field(points.reference, points.current, points.xy[seeds], points.settings, bare=np.asarray(bare))
+    trial = Propagation(points.reference, points.current, points.xy[seeds], points.settings, bare=np.asarray(bare))
     known = np.asarray(np.isfinite(start).all(axis=1))
     warps = np.where(known[:, None], start, np.nan)[:, None, _COLUMNS[:6]]
     _, alike, _ = search_hypotheses(points.reference, points.current, trial.xy, warps, points.settings.radius)
@@ -202,7 +202,7 @@ def _try_seeds(points: Field, seeds: Indices, start: Floats) -> Field:
     return trial
 
 
-def _match_from(points: Field, start: Floats, seconds: dict[str, float], follow: bool) -> None:
+def _match_from(points: Propagation, start: Floats, seconds: dict[str, float], follow: bool) -> None:
     began = time.perf_counter()
     given = np.flatnonzero(np.isfinite(start).all(axis=1))
     if not len(given):
@@ -213,7 +213,7 @@ def _match_from(points: Field, start: Floats, seconds: dict[str, float], follow:
 
 
 def _carry_on(
-    points: Field, seconds: dict[str, float], index: Indices | None = None, start: Floats | None = None
+    points: Propagation, seconds: dict[str, float], index: Indices | None = None, start: Floats | None = None
 ) -> None:
     """All points from their own start values where given, then from neighbour to neighbour, and the judgement."""
     began = time.perf_counter()
@@ -239,12 +239,12 @@ def _parameters(start: Floats, n: int) -> Floats:
     return out
 
 
-def in_order(parameters: Floats) -> Floats:
+def start_order(parameters: Floats) -> Floats:
     """Parameters (n, 12) of the kernels in the order in which start values are given. (n, 12)."""
     return np.asarray(parameters[:, _COLUMNS])
 
 
-def _result(points: Field, seconds: dict[str, float]) -> Correlation:
+def _result(points: Propagation, seconds: dict[str, float]) -> Correlation:
     p = points.parameters.copy()
     p[~points.good] = np.nan
     return Correlation(

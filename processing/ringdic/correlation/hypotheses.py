@@ -40,7 +40,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Found:
+class BestWarps:
     """The best of the warps tried at each of n points.
 
     warps : (n, 6), NaN where none stays inside the current image. zncc : (n,), then -1. second_peak : (n,), the best
@@ -78,7 +78,7 @@ def search_hypotheses(
 
 def search_row(
     image: NDArray, current: Current, xy: Floats, row: Row, radius: int, *, least: float = -1.0, separation: float = 4.0
-) -> Found:
+) -> BestWarps:
     """The best warp of a row at each of n points xy (n, 2) px of an image, all pixels of which count.
 
     As :func:`search_hypotheses`. least : a ZNCC below which a match is of no use: points that the first trial shows to
@@ -98,9 +98,9 @@ def _search(
     stride: int,
     separation: float,
     least: float,
-) -> Found:
+) -> BestWarps:
     n = len(xy)
-    found = Found(np.full((n, 6), np.nan), np.full(n, -1.0), np.full(n, -1.0), np.zeros(n, np.int64))
+    found = BestWarps(np.full((n, 6), np.nan), np.full(n, -1.0), np.full(n, -1.0), np.zeros(n, np.int64))
     _best(
         image,
         mask,

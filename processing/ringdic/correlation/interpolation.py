@@ -19,7 +19,7 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from ringdic.correlation.lanes import LANES, WINDOW, floor, load, magnitude, number, picked, put, ramp, select, store
+from ringdic.correlation.lanes import LANES, WINDOW, absolute, floor, load, number, picked, put, ramp, select, store
 
 FAST = {"contract", "reassoc", "arcp", "nsz"}
 # What the pixels of a vector cross: nothing, a whole number along an axis or both; WIDE + n: n of them in y, any in x.
@@ -81,7 +81,7 @@ def _positive(t):  # type: ignore[no-untyped-def]
 @nb.njit(forceinline=True, fastmath=FAST)
 def _cubic_at(t):  # type: ignore[no-untyped-def]
     """Cubic B-spline at any distance t, times 6."""
-    a = magnitude(t)
+    a = absolute(t)
     one, two = _positive(_F(1) - a), _positive(_F(2) - a)
     return two * two * two - _F(4) * (one * one * one)
 
@@ -89,7 +89,7 @@ def _cubic_at(t):  # type: ignore[no-untyped-def]
 @nb.njit(forceinline=True, fastmath=FAST)
 def _quintic_at(t):  # type: ignore[no-untyped-def]
     """Quintic B-spline at any distance t, times 120."""
-    a = magnitude(t)
+    a = absolute(t)
     one, two, three = _positive(_F(1) - a), _positive(_F(2) - a), _positive(_F(3) - a)
     one2, two2, three2 = one * one, two * two, three * three
     return three2 * three2 * three - _F(6) * (two2 * two2 * two) + _F(15) * (one2 * one2 * one)

@@ -63,7 +63,7 @@ from ringdic.correlation.subset import (
     template,
     well_inside,
 )
-from ringdic.correlation.warps import cholesky, compose_inverse, compose_inverse_affine, solve, variance
+from ringdic.correlation.warps import cholesky, compose_inverse, compose_inverse_affine, solve_cholesky, variance
 
 GOOD, NO_CONVERGENCE, OUTSIDE, NO_TEXTURE = 0, 2, 5, 6
 N_PARAMETERS = 12
@@ -238,7 +238,7 @@ def _step(H, sums, sum_J, sum_fJ, mean_g, ratio, terms, b, d):  # type: ignore[n
         b[k] = ratio * (sums[4 + k] - mean_g * sum_J[k]) - sum_fJ[k]
         b[terms + k] = ratio * (sums[10 + k] - mean_g * sum_J[terms + k]) - sum_fJ[terms + k]
         d[k], d[6 + k] = b[k], b[terms + k]
-    solve(H, b, 2 * terms)
+    solve_cholesky(H, b, 2 * terms)
     gain = 0.0
     for k in range(terms):
         gain += d[k] * b[k] + d[6 + k] * b[terms + k]
@@ -435,7 +435,7 @@ def _scratch(rows, columns, kind):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, parallel=True)
-def refine(  # type: ignore[no-untyped-def]
+def refine_points(  # type: ignore[no-untyped-def]
     image, gx, gy, coef_ref, mask, origin_ref, coef, origin_cur, xy, order, parameters, known,
     radius, circle, terms, quintic, tolerance, max_iterations, texture, noise, follow,
     kept, known_subset, row_kept, status, zncc, iterations, sigma,

@@ -47,14 +47,14 @@ class Lanes(types.Type):
         self.dtype = dtype
 
 
-class Choice(types.Type):
+class LaneMask(types.Type):
     """LANES truth values."""
 
     def __init__(self) -> None:
         super().__init__("Choice")
 
 
-_CHOICE = Choice()
+_CHOICE = LaneMask()
 
 
 def _vector(dtype: types.Float) -> ir.VectorType:
@@ -67,9 +67,9 @@ class _LanesModel(models.PrimitiveModel):
         super().__init__(dmm, fe_type, _vector(fe_type.dtype))
 
 
-@register_model(Choice)
+@register_model(LaneMask)
 class _ChoiceModel(models.PrimitiveModel):
-    def __init__(self, dmm: Any, fe_type: Choice) -> None:
+    def __init__(self, dmm: Any, fe_type: LaneMask) -> None:
         super().__init__(dmm, fe_type, ir.VectorType(ir.IntType(1), LANES))
 
 
@@ -266,7 +266,7 @@ def floor(typingctx, value):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def magnitude(typingctx, value):  # type: ignore[no-untyped-def]
+def absolute(typingctx, value):  # type: ignore[no-untyped-def]
     """The absolute value, lane by lane."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]

@@ -19,7 +19,7 @@ _SCATTERS = 8.0
 _LEAST_ISLAND = 4
 
 
-def neighbours(xy: Floats, step: float) -> Indices:
+def point_neighbours(xy: Floats, step: float) -> Indices:
     """The up to eight nearest points within 1.6 steps of each point, nearest first, -1 where there is none. (n, 8)."""
     if len(xy) < 2:
         return np.full((len(xy), COUNT), -1, np.int64)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask
 from ringdic.correlation import kernels
-from ringdic.correlation.neighbours import COUNT, inconsistent, local_fit, neighbours, predicted
+from ringdic.correlation.neighbours import COUNT, inconsistent, local_fit, point_neighbours, predicted
 from ringdic.correlation.prepared import Current, Reference
 from ringdic.correlation.refinement import Subsets, refine, steep_along_rows, subsets_of
 from ringdic.correlation.settings import CorrelationSettings
@@ -35,7 +35,7 @@ _STRETCH = 4.0  # largest stretch and compression of a subset between two images
 
 
 @dataclass
-class Field:
+class Propagation:
     """The state of all points while they are being matched; arrays over n points.
 
     parameters (n, 12) as in ``kernels``; tried : (n, 8) bool, neighbours a start value was taken from;
@@ -72,7 +72,7 @@ class Field:
 
     def __post_init__(self) -> None:
         n = len(self.xy)
-        self.near = np.full((n, COUNT), -1) if self.alone else neighbours(self.xy, self.settings.step)
+        self.near = np.full((n, COUNT), -1) if self.alone else point_neighbours(self.xy, self.settings.step)
         self.parameters = np.full((n, kernels.N_PARAMETERS), np.nan)
         self.status = np.full(n, Status.NOT_REACHED, np.int64)
         self.zncc = np.full(n, np.nan)
@@ -162,7 +162,7 @@ class Field:
         at = self.xy[index[known]]
         return self.current.about_all(at, at + start[known][:, [0, 6]], self.xy, self.settings.radius)
 
-    def adopt(self, index: Indices, other: Field) -> None:
+    def adopt(self, index: Indices, other: Propagation) -> None:
         """Take over the good points of another field, whose points are ``index`` (k,) here, where still open."""
         take = other.good & ~self.good[index]
         to = index[take]

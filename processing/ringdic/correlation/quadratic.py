@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask
-from ringdic.correlation.warps import cholesky, solve
+from ringdic.correlation.warps import cholesky, solve_cholesky
 
 _LEAST = 10  # neighbours, itself included, that six coefficients are taken from
 _LEAST_SHARE = 0.3  # of the median sigma: no point weighs more than this lets it
@@ -221,11 +221,11 @@ def _fit(xy, first, members, window, weight, values, c, scatter):  # type: ignor
             continue
         for m in range(k):
             _right_side(xy, i, about, window, weight, values[m], c[i, m])
-            solve(M, c[i, m], 6)
+            solve_cholesky(M, c[i, m], 6)
         for p in range(6):
             e[:] = 0.0
             e[p] = 1.0
-            solve(M, e, 6)
+            solve_cholesky(M, e, 6)
             scatter[i, p] = math.sqrt(e[p])
 
 

@@ -108,7 +108,7 @@ def _refine(
     iterations = np.zeros(n, np.int64)
     between = bool(np.any(xy != np.rint(xy)))
     subsets, row = kept or (Subsets(0, settings.order), np.full(n, -1))
-    kernels.refine(
+    kernels.refine_points(
         reference.grey,
         *reference.slopes,
         reference.coef if between else np.zeros((1, 1), settings.precision),

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ringdic.arrays import Floats, Mask
-from ringdic.correlation import Correlation, CorrelationSettings, Current, Reference, correlate
+from ringdic.correlation import Correlation, CorrelationSettings, Current, Reference, correlate_points
 from ringdic.correlation.lattice_field import ALL, between_corners
 
 _FEWEST = 8  # matches of which an affine fit says where the others lie
@@ -35,14 +35,16 @@ def match_from_lattice(
     chosen = np.flatnonzero(on_lattice(xy, spacing))
     known = np.isfinite(start[chosen]).all(axis=1)
     if known.sum() < _FEWEST:
-        return correlate(reference, current, xy, settings, start=start)
+        return correlate_points(reference, current, xy, settings, start=start)
     at = xy[chosen[known]]
     part = current.about_all(at, at + start[chosen[known], :2], xy, settings.radius)
-    coarse = correlate(reference, part, xy[chosen], replace(settings, step=spacing), start=start[chosen], follow=True)
+    coarse = correlate_points(
+        reference, part, xy[chosen], replace(settings, step=spacing), start=start[chosen], follow=True
+    )
     dense = between(coarse, xy, spacing, settings.order)
     if not np.isfinite(dense).all(axis=1).any():
-        return correlate(reference, current, xy, settings, start=start)
-    found = correlate(reference, part, xy, settings, start=dense)
+        return correlate_points(reference, current, xy, settings, start=start)
+    found = correlate_points(reference, part, xy, settings, start=dense)
     for name in ("prepare", "start", "refine"):
         found.seconds[name] += coarse.seconds[name]
     return found

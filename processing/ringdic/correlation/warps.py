@@ -34,7 +34,7 @@ def cholesky(H, n):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def solve(L, b, n):  # type: ignore[no-untyped-def]
+def solve_cholesky(L, b, n):  # type: ignore[no-untyped-def]
     """x of L Lᵀ x = b, in place of b; L from ``cholesky``."""
     for i in range(_U(n)):
         total = b[i]

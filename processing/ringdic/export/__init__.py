@@ -30,10 +30,10 @@ from ringdic.export.matlab import export_mat
 from ringdic.export.surfaces import DEFAULT_COLOUR, export_glb, export_ply
 from ringdic.export.tables import export_csv
 from ringdic.export.vtk import export_vtkhdf, export_vtp
-from ringdic.results.evaluation import Evaluated, Evaluation, evaluated
+from ringdic.results.evaluation import EvaluatedResults, Evaluation, evaluated
 from ringdic.session.folder import newest_results
 
-_WRITERS: dict[str, Callable[[Evaluated, Path], None]] = {
+_WRITERS: dict[str, Callable[[EvaluatedResults, Path], None]] = {
     "npz": export_npz,
     "vtkhdf": export_vtkhdf,
     "vtp": export_vtp,
@@ -43,7 +43,7 @@ _WRITERS: dict[str, Callable[[Evaluated, Path], None]] = {
     "glb": export_glb,
 }
 _FOLDERS = ("vtp", "csv", "ply", "glb")
-_COLOURED: dict[str, Callable[[Evaluated, Path, str], None]] = {"ply": export_ply, "glb": export_glb}
+_COLOURED: dict[str, Callable[[EvaluatedResults, Path, str], None]] = {"ply": export_ply, "glb": export_glb}
 FORMATS = tuple(_WRITERS)
 
 __all__ = ["FORMATS", "Evaluation", "export"]

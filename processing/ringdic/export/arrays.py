@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from ringdic.results.evaluation import Evaluated
+from ringdic.results.evaluation import EvaluatedResults
 
 _SCALARS = ("lambda1", "lambda2", "J")
 
 
-def export_npz(seen: Evaluated, out: Path) -> None:
+def export_npz(seen: EvaluatedResults, out: Path) -> None:
     """Write ``vertices_ref`` (N, 3), ``vertices`` (F, N, 3), ``faces`` (M, 3), ``lambda1``, ``lambda2``, ``J`` (F, M),
     ``E`` (F, M, 3, 3), ``correlation`` (F, N), ``sigma_xyz`` (F, N, 3) and ``pair`` (M,).
 
@@ -26,7 +26,7 @@ def export_npz(seen: Evaluated, out: Path) -> None:
         np.savez(file, **arrays(seen))
 
 
-def arrays(seen: Evaluated) -> dict[str, Any]:
+def arrays(seen: EvaluatedResults) -> dict[str, Any]:
     """The arrays of the npz, in full precision."""
     results = seen.results
     F, M = len(results.steps), len(results.faces)

@@ -13,7 +13,7 @@ from scipy.io import savemat
 from ringdic.arrays import Floats
 from ringdic.errors import InputError
 from ringdic.export.arrays import arrays
-from ringdic.results.evaluation import Evaluated
+from ringdic.results.evaluation import EvaluatedResults
 from ringdic.strain.deformation import Deformation
 from ringdic.strain.rigid_motion import RigidMotion
 from ringdic.strain.window import StrainWindow
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 _LARGEST = 2**31 - 2**20  # bytes of one variable of a level 5 file
 
 
-def export_mat(seen: Evaluated, out: Path) -> None:
+def export_mat(seen: EvaluatedResults, out: Path) -> None:
     """Write a level 5 MAT file, indices from 1.
 
     ``DIC3DPPresults`` : the structure that MultiDIC's post-processing makes and its plots read: Points3D, Faces, Disp,
@@ -45,7 +45,7 @@ def export_mat(seen: Evaluated, out: Path) -> None:
         savemat(file, values, do_compression=True, oned_as="column")
 
 
-def post_processing(seen: Evaluated) -> dict[str, Any]:
+def post_processing(seen: EvaluatedResults) -> dict[str, Any]:
     """The structure DIC3DPPresults. Cells are object arrays (1, F)."""
     results = seen.results
     F = len(results.steps)
@@ -68,7 +68,7 @@ def post_processing(seen: Evaluated) -> dict[str, Any]:
     return structure
 
 
-def _surface(seen: Evaluated) -> dict[str, Any]:
+def _surface(seen: EvaluatedResults) -> dict[str, Any]:
     """Points, triangles, displacements and rigid motions."""
     results, F = seen.results, len(seen.steps)
     faces = results.faces
@@ -103,7 +103,7 @@ def _surface(seen: Evaluated) -> dict[str, Any]:
     }
 
 
-def _deform(seen: Evaluated, rigid_motion_removed: bool, window: StrainWindow | None) -> dict[str, Any]:
+def _deform(seen: EvaluatedResults, rigid_motion_removed: bool, window: StrainWindow | None) -> dict[str, Any]:
     how = seen.evaluation
     removed = rigid_motion_removed or how.rigid_motion_removed
     steps = [_named(seen.results.deformation(step, removed, how.previous, window)) for step in range(len(seen.steps))]
@@ -142,11 +142,11 @@ def _floats_a_face() -> int:
     return sum(values.size for values in _named(Deformation(**found)).values())
 
 
-def _before(seen: Evaluated, step: int) -> Floats:
+def _before(seen: EvaluatedResults, step: int) -> Floats:
     return seen.results.before(step, seen.evaluation.previous)
 
 
-def _motion(seen: Evaluated, step: int) -> RigidMotion:
+def _motion(seen: EvaluatedResults, step: int) -> RigidMotion:
     """The motion that takes the exported positions back; none is left where it has been removed already."""
     if seen.evaluation.rigid_motion_removed:
         return RigidMotion(np.eye(3), np.zeros(3))

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices
 from ringdic.results.colours import colours
-from ringdic.results.evaluation import Evaluated
+from ringdic.results.evaluation import EvaluatedResults
 from ringdic.results.fields import Field, StepFields
 
 _GLTF_FROM_WORLD = 1e-3 * np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 DEFAULT_COLOUR = "displacement"
 
 
-def export_ply(seen: Evaluated, out: Path, colour: str = DEFAULT_COLOUR) -> None:
+def export_ply(seen: EvaluatedResults, out: Path, colour: str = DEFAULT_COLOUR) -> None:
     """Write ``STEP.ply`` (binary, mm) for every step: every field as a property of its vertices or faces, and colours
     of one of them, one scale for all steps."""
     paint = _Paint(seen, colour)
@@ -34,7 +34,7 @@ def export_ply(seen: Evaluated, out: Path, colour: str = DEFAULT_COLOUR) -> None
         solid.export(out / f"{name}.ply", file_type="ply")
 
 
-def export_glb(seen: Evaluated, out: Path, colour: str = DEFAULT_COLOUR) -> None:
+def export_glb(seen: EvaluatedResults, out: Path, colour: str = DEFAULT_COLOUR) -> None:
     """Write ``STEP.glb`` for every step, coloured by a field, one scale for all steps.
 
     glTF's conventions: metres, y upwards (the target's z).
@@ -54,7 +54,7 @@ def _solid(vertices: Floats, faces: Indices, rgba: NDArray[np.uint8]) -> trimesh
 class _Paint:
     """Colours of the vertices by one field; a field of faces is averaged at each vertex over its triangles."""
 
-    def __init__(self, seen: Evaluated, name: str) -> None:
+    def __init__(self, seen: EvaluatedResults, name: str) -> None:
         self._entry: Field = seen.field(name)
         self._limits = seen.limits(name)
         self._faces = seen.results.faces

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.results.evaluation import Evaluated
+from ringdic.results.evaluation import EvaluatedResults
 
 
-def export_csv(seen: Evaluated, out: Path) -> None:
+def export_csv(seen: EvaluatedResults, out: Path) -> None:
     """Write ``STEP-points.csv`` and ``STEP-faces.csv`` for every step into the folder ``out``.
 
     The first line names the columns with their units; vertices count from 0; what was not measured is empty. The

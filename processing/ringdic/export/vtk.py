@@ -12,23 +12,23 @@ from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask
 from ringdic.results import vtkhdf
-from ringdic.results.evaluation import Evaluated
+from ringdic.results.evaluation import EvaluatedResults
 from ringdic.results.fields import StepFields
 
 _TYPES = {"f4": "Float32", "f8": "Float64", "u1": "UInt8", "i1": "Int8", "i8": "Int64"}
 Arrays = dict[str, NDArray[np.generic]]
 
 
-def export_vtkhdf(seen: Evaluated, out: Path) -> None:
+def export_vtkhdf(seen: EvaluatedResults, out: Path) -> None:
     """Write the moving surface with every field, and the vectors and tensors they come from."""
     with h5py.File(out, "w") as file:
-        group = vtkhdf.create(file, seen.results.faces, len(seen.results.vertices_ref), len(seen.steps))
+        group = vtkhdf.create_group(file, seen.results.faces, len(seen.results.vertices_ref), len(seen.steps))
         for step in range(len(seen.steps)):
             positions, point, cell = _step(seen, step)
             vtkhdf.write_step(group, step, positions, point, cell)
 
 
-def export_vtp(seen: Evaluated, out: Path) -> None:
+def export_vtp(seen: EvaluatedResults, out: Path) -> None:
     """Write ``STEP.vtp`` for every step and ``series.pvd``, which opens them as one series, into the folder ``out``."""
     for step, name in enumerate(seen.steps):
         positions, point, cell = _step(seen, step)
@@ -40,7 +40,7 @@ def export_vtp(seen: Evaluated, out: Path) -> None:
     _write(out / "series.pvd", series)
 
 
-def _step(seen: Evaluated, step: int) -> tuple[Floats, Arrays, Arrays]:
+def _step(seen: EvaluatedResults, step: int) -> tuple[Floats, Arrays, Arrays]:
     """Positions, all finite (a lost point stays at its reference), and the arrays of points and of faces."""
     current = seen.positions(step)
     measured: Mask = np.asarray(np.isfinite(current).all(axis=1))
@@ -53,7 +53,7 @@ def _step(seen: Evaluated, step: int) -> tuple[Floats, Arrays, Arrays]:
     return np.where(measured[:, None], current, seen.results.vertices_ref), point | flags, cell
 
 
-def _arrays(seen: Evaluated, fields: StepFields, location: str) -> Arrays:
+def _arrays(seen: EvaluatedResults, fields: StepFields, location: str) -> Arrays:
     """Vectors and tensors as they are; of the scalars, every field that is not a component or length of one."""
     arrays = fields.point if location == "point" else fields.face
     wide = {name: values for name, values in arrays.items() if values.ndim > 1}

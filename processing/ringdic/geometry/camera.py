@@ -54,7 +54,7 @@ class Intrinsics:
         (fx, s, cx), (_, fy, cy) = self.K[0], self.K[1]
         y_d = (px[..., 1] - cy) / fy
         target = np.stack([(px[..., 0] - cx - s * y_d) / fx, y_d], axis=-1)
-        xy = np.asarray(lens.ideal(_rows(target), self.distortion)).reshape(px.shape)
+        xy = np.asarray(lens.undistorted(_rows(target), self.distortion)).reshape(px.shape)
         return xy * np.array([fx, fy]) + np.array([cx, cy])
 
     def to_distorted(self, px: Floats) -> Floats:

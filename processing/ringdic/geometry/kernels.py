@@ -68,7 +68,7 @@ def normal_equations(P, px, normal, right, seen):  # type: ignore[no-untyped-def
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def solve(normal, right, which, xyz):  # type: ignore[no-untyped-def]
+def solve_normal_equations(normal, right, which, xyz):  # type: ignore[no-untyped-def]
     """xyz (n, 3) with ``normal xyz = right`` by the factors L D Lᵀ of (n, 3, 3); NaN but for ``which`` (n,)."""
     for n in range(len(normal)):
         if not which[n]:
@@ -161,7 +161,7 @@ def gain(slopes, sigma, out):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def covariance(gain, sigma):  # type: ignore[no-untyped-def]
+def fill_covariance(gain, sigma):  # type: ignore[no-untyped-def]
     """``Σ A_c diag(σ_c²) A_cᵀ`` (n, 3, 3) of gains (C, n, 3, 2), errors (C, n, 2); NaN for fewer than two cameras."""
     total = np.zeros((gain.shape[1], 3, 3))
     for n in range(gain.shape[1]):
@@ -183,7 +183,7 @@ def covariance(gain, sigma):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def midpoint_residuals(pairs, values, doubt, rows):  # type: ignore[no-untyped-def]
+def fill_midpoint_residuals(pairs, values, doubt, rows):  # type: ignore[no-untyped-def]
     """How far values (n, k) of some rows (r,) lie from the median of the middles of their pairs of neighbours, (r,).
 
     pairs (n, 4, 2): rows of opposite neighbours, -1 where there is none. doubt (n,): nobody is judged by a more

@@ -71,7 +71,7 @@ def pixel_slopes(px, K, c):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def ideal(target, c):  # type: ignore[no-untyped-def]
+def undistorted(target, c):  # type: ignore[no-untyped-def]
     """Distorted points (n, 2) to ideal points (n, 2), by Newton's method to round-off; NaN where it diverges."""
     out = np.empty_like(target)
     for i in range(len(target)):

@@ -14,7 +14,7 @@ _OPPOSITE = ((1, 0), (0, 1), (1, 1), (1, -1))
 _SIGMA_OF_MAD = 1.4826  # of a normal distribution
 
 
-class Lost(IntEnum):
+class LostPoint(IntEnum):
     """Why a matched point was dropped in space; continues the status codes of the correlation."""
 
     RESIDUAL = 16  # the lines of sight miss one another
@@ -42,10 +42,10 @@ def midpoint_residuals(xy: Floats, values: Floats, step: int, doubt: Floats | No
     neighbour. NaN where no pair is complete. Where a ``doubt`` (n,) is given, nobody is judged by a neighbour more
     doubtful than himself.
     """
-    return _residuals(neighbours(xy, step), values, doubt)
+    return _residuals(grid_neighbours(xy, step), values, doubt)
 
 
-def neighbours(xy: Floats, step: int) -> Indices:
+def grid_neighbours(xy: Floats, step: int) -> Indices:
     """The rows of up to four pairs of opposite neighbours on the grid, (n, 4, 2), -1 where there is none."""
     cells = np.round(xy / step).astype(int)
     cells -= cells.min(axis=0) - 1
@@ -59,7 +59,7 @@ def _residuals(pairs: Indices, values: Floats, doubt: Floats | None, rows: NDArr
     """The same of all points or of some rows (r,), by their neighbours."""
     doubt = np.zeros(len(values)) if doubt is None else doubt
     rows = np.arange(len(values)) if rows is None else rows
-    return np.asarray(kernels.midpoint_residuals(pairs, np.ascontiguousarray(values, dtype=float), doubt, rows))
+    return np.asarray(kernels.fill_midpoint_residuals(pairs, np.ascontiguousarray(values, dtype=float), doubt, rows))
 
 
 def surface_outliers(pairs: Indices, values: Floats, factor: float = 10.0, floor: float = 0.1) -> Mask:

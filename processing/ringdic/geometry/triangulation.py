@@ -85,7 +85,7 @@ class LinearSystem:
     def solution(self) -> Floats:
         """(n, 3) mm, NaN where it is not determined."""
         xyz = np.empty(self.normal.shape[:2])
-        kernels.solve(self.normal, self._summed[1], self.solvable, xyz)
+        kernels.solve_normal_equations(self.normal, self._summed[1], self.solvable, xyz)
         return xyz
 
 

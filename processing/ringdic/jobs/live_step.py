@@ -12,14 +12,14 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ringdic.calibration.rig import Ring, calibrate_ring
+from ringdic.calibration.calibrated_rig import CalibratedRig, calibrate_rig
 from ringdic.errors import InputError
-from ringdic.jobs.pipeline import track
+from ringdic.jobs.pipeline import match_session
 from ringdic.pairs.merging import Merged, merge
-from ringdic.pairs.surfaces import FollowedPair
+from ringdic.pairs.surfaces import PairSurface
 from ringdic.progress import Report, Stages, silent
 from ringdic.results.writer import write_series
-from ringdic.session.folder import Capture, Session, new_live, read_session
+from ringdic.session.folder import Capture, Session, new_live, open_session
 from ringdic.settings import CalibrationGroup, Settings
 from ringdic.tasks import Executor, digest, kept
 
@@ -38,16 +38,16 @@ def process_step(
     """
     began = time.monotonic()
     stages = Stages(_WEIGHTS, report)
-    session = read_session(path)
+    session = open_session(path)
     settings = settings.model_copy(update={"surface": settings.surface.model_copy(update={"method": "pairs"})})
     steps = _reference_and(session, capture_id)
 
-    def merging(pairs: Sequence[FollowedPair], heuristic: str) -> Merged:
+    def merging(pairs: Sequence[PairSurface], heuristic: str) -> Merged:
         sheets = [pair.sheet_at_reference for pair in pairs]
         key = digest("live surface", heuristic, [(each.vertices, each.faces, each.correlation) for each in sheets])
         return kept.get(key, lambda: merge(sheets, heuristic), _bytes)
 
-    tracked = track(session, settings, steps, stages, executor, _calibrated, merging)
+    tracked = match_session(session, settings, steps, stages, executor, _calibrated, merging)
     found = {"warnings": list(tracked.warnings), "seconds": round(time.monotonic() - began, 2)}
     stages.at("deform", 0.0)
     with new_live(path, capture_id) as folder:
@@ -56,13 +56,13 @@ def process_step(
     return session.path / "live" / capture_id
 
 
-def _calibrated(session: Session, settings: CalibrationGroup, told: Callable[[float, str], None]) -> Ring:
+def _calibrated(session: Session, settings: CalibrationGroup, told: Callable[[float, str], None]) -> CalibratedRig:
     """The ring as calibrated, kept in memory while its images and settings stay."""
     captures = [capture for capture in session.captures if capture.kind in ("board", "target")]
     rig = (session.path / "rig.toml").read_text(encoding="utf-8")
     records = json.dumps([(each.id, each.record) for each in captures])
     key = digest("live calibration", str(session.path), rig, settings, records)
-    return kept.get(key, lambda: calibrate_ring(session, settings, told), lambda _: _RING_BYTES)
+    return kept.get(key, lambda: calibrate_rig(session, settings, told), lambda _: _RING_BYTES)
 
 
 def _reference_and(session: Session, capture_id: str) -> tuple[Capture, ...]:

@@ -1,4 +1,4 @@
-"""The straight line from a session folder to results: calibrate, correlate, triangulate, deform, keep.
+"""The straight line from a session folder to results: calibrate, correlate_points, triangulate, deform, keep.
 
 This is the only place where the stages meet.
 """
@@ -14,22 +14,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ringdic.arrays import Floats
+from ringdic.calibration.calibrated_rig import CalibratedRig, calibrate_rig, control_points
 from ringdic.calibration.quality import ReconstructionError
-from ringdic.calibration.rig import Ring, calibrate_ring, control_points
 from ringdic.correlation import CorrelationSettings
 from ringdic.correlation.correlate import load_kernels
 from ringdic.errors import ComputationError, InputError
 from ringdic.jobs import summary
 from ringdic.pairs.reconstruction import pair_shape
-from ringdic.pairs.surfaces import FollowedPair, Merging, follow, merge_surfaces, pairs_surface
-from ringdic.pairs.tasks import PairJob, in_order, pair_jobs
+from ringdic.pairs.surfaces import Merging, PairSurface, merge_surfaces, pairs_surface, reconstruct_pair
+from ringdic.pairs.tasks import PairJob, ordered_tasks, pair_jobs
 from ringdic.progress import Report, Stages, silent
 from ringdic.results import noise_floor
 from ringdic.results.results import Results
-from ringdic.results.series import InMemory, Series, Shelf, joined
-from ringdic.results.uncertainty import Stated, camera_covariance
-from ringdic.results.writer import ResultsWriter, Written, in_turn
-from ringdic.session.folder import Capture, Session, new_run, read_session
+from ringdic.results.series import InMemory, Series, StepCache, join_steps
+from ringdic.results.uncertainty import StepUncertainty, camera_covariance
+from ringdic.results.writer import ResultsWriter, StepRecord, in_turn
+from ringdic.session.folder import Capture, Session, new_run, open_session
 from ringdic.settings import CalibrationGroup, Settings
 from ringdic.sweep.sweep import Search
 from ringdic.tasks import Executor, LocalExecutor, Ran, Task, tidy, work_folder
@@ -37,7 +37,7 @@ from ringdic.tasks import Executor, LocalExecutor, Ran, Task, tidy, work_folder
 if TYPE_CHECKING:
     from ringdic.multiview.surface import RingSurface
 
-Calibrate = Callable[[Session, CalibrationGroup, Callable[[float, str], None]], Ring]
+Calibrate = Callable[[Session, CalibrationGroup, Callable[[float, str], None]], CalibratedRig]
 
 log = logging.getLogger(__name__)
 
@@ -45,11 +45,11 @@ _WEIGHTS = {"prepare": 0.03, "calibrate": 0.25, "correlate": 0.62, "triangulate"
 
 
 @dataclass(frozen=True)
-class Tracked:
+class SessionMatches:
     """A surface through some steps, and what is told of it. errors : of the pairs' reconstruction of control points."""
 
     series: Series
-    ring: Ring
+    ring: CalibratedRig
     errors: dict[tuple[str, str], ReconstructionError]
     drift: dict[str, Floats]
     agreement: dict[str, Any]
@@ -77,9 +77,9 @@ def process_session(path: Path, settings: Settings, report: Report = silent, exe
     """
     began = time.monotonic()
     stages = Stages(_WEIGHTS, report)
-    session = read_session(path)
+    session = open_session(path)
     steps = _with_captures_at_rest(session)
-    tracked = track(session, settings, steps, stages, executor)
+    tracked = match_session(session, settings, steps, stages, executor)
     stages.at("deform", 0.0)
     with new_run(session.path) as run:
         (run.folder / "settings.toml").write_text(settings.to_toml(), encoding="utf-8")
@@ -92,15 +92,15 @@ def process_session(path: Path, settings: Settings, report: Report = silent, exe
     return run.final
 
 
-def track(
+def match_session(
     session: Session,
     settings: Settings,
     steps: Sequence[Capture],
     stages: Stages | None = None,
     executor: Executor | None = None,
-    calibrate: Calibrate = calibrate_ring,
+    calibrate: Calibrate = calibrate_rig,
     merging: Merging = merge_surfaces,
-) -> Tracked:
+) -> SessionMatches:
     """The surface at the steps, the reference first.
 
     executor : of the tasks; None runs them in this process. calibrate, merging : what does these, where it is kept
@@ -121,23 +121,25 @@ def track(
         cameras, names = [each.camera for each in ring.cameras.values()], [step.id for step in steps]
         series, agreement = pairs_surface(session.rig.name, cameras, pairs, names, settings, merging)
         drift = {"-".join(pair.shape.ids): pair.drift for pair in pairs}
-    return Tracked(series, ring, errors, drift, agreement, (*ring.warnings, *warnings, *more_warnings))
+    return SessionMatches(series, ring, errors, drift, agreement, (*ring.warnings, *warnings, *more_warnings))
 
 
-def _deform(tracked: Tracked, steps: tuple[Capture, ...], path: Path, stages: Stages, began: float) -> dict[str, Any]:
+def _deform(
+    tracked: SessionMatches, steps: tuple[Capture, ...], path: Path, stages: Stages, began: float
+) -> dict[str, Any]:
     """Deformation and uncertainty of every step, each written when it is found; the summary. path : of the results.
 
     Of captures at rest, which are not written, the summary tells the noise floor.
     """
     series = tracked.series
-    stated = Stated(series.reference, camera_covariance(tracked.ring.bundle), series.noise)
+    stated = StepUncertainty(series.reference, camera_covariance(tracked.ring.bundle), series.noise)
     kept = [k for k, step in enumerate(steps) if step.kind != "static"]
     reference = stated.of(series.reference, 0)
     at_rest = [replace(series.reference, matches=())]
     figures: list[summary.StepFigures] = []
     with ResultsWriter(path, reference, [series.names[k] for k in kept]) as file:
 
-        def made(k: int) -> Results | tuple[Written, summary.StepFigures]:
+        def made(k: int) -> Results | tuple[StepRecord, summary.StepFigures]:
             results = series.at(k) if k else reference
             if k not in kept:
                 return replace(results, matches=())
@@ -157,7 +159,7 @@ def _deform(tracked: Tracked, steps: tuple[Capture, ...], path: Path, stages: St
         found = summary.summarise(
             reference, figures, tracked.ring, tracked.errors, drift, tracked.agreement, tracked.warnings
         )
-        found["noise_floor"] = noise_floor.noise_floor(joined(at_rest)) if len(at_rest) > 1 else None
+        found["noise_floor"] = noise_floor.noise_floor(join_steps(at_rest)) if len(at_rest) > 1 else None
         found["seconds"] = round(time.monotonic() - began, 2)
         file.finish(tracked.calibration, found)
     return found
@@ -177,7 +179,7 @@ def _with_captures_at_rest(session: Session) -> tuple[Capture, ...]:
 
 
 def _usable_pairs(
-    session: Session, ring: Ring, steps: tuple[Capture, ...]
+    session: Session, ring: CalibratedRig, steps: tuple[Capture, ...]
 ) -> tuple[dict[tuple[str, str], ReconstructionError], tuple[str, ...]]:
     """Pairs of calibrated cameras with a reference image and how well they agree; a sentence for each left out."""
     usable: dict[tuple[str, str], ReconstructionError] = {}
@@ -203,29 +205,29 @@ def _usable_pairs(
 
 def _pairs(
     session: Session,
-    ring: Ring,
+    ring: CalibratedRig,
     pairs: tuple[tuple[str, str], ...],
     steps: tuple[Capture, ...],
     settings: Settings,
     stages: Stages,
     executor: Executor | None,
-) -> tuple[list[FollowedPair], list[str]]:
+) -> tuple[list[PairSurface], list[str]]:
     """Every pair matched at every step, as tasks, and triangulated; a sentence for each that gave no surface."""
     cameras = {id_: each.camera for id_, each in ring.cameras.items()}
     correlation = CorrelationSettings(**settings.correlation.keywords)
     jobs = pair_jobs(session, cameras, pairs, steps, _search(session, settings), correlation)
-    _run(in_order(jobs), executor, stages, session)
-    shelf = Shelf(work_folder(session.path))
+    _run(ordered_tasks(jobs), executor, stages, session)
+    shelf = StepCache(work_folder(session.path))
 
-    def followed(job: PairJob) -> FollowedPair | str:
+    def followed(job: PairJob) -> PairSurface | str:
         try:
             grid, at_first = job.at_reference()
         except ComputationError as error:
             return str(error)
         shape = pair_shape(job.cameras, grid.xy, grid.faces, at_first, correlation.step, settings.surface.sigma_max_px)
-        return follow(shape, lambda k: job.step(k, at_first) if k else at_first, len(steps), shelf)
+        return reconstruct_pair(shape, lambda k: job.step(k, at_first) if k else at_first, len(steps), shelf)
 
-    found: list[FollowedPair] = []
+    found: list[PairSurface] = []
     warnings: list[str] = []
     for k, made in enumerate(in_turn(lambda k: followed(jobs[k]), range(len(jobs))), start=1):
         stages.at("triangulate", k / len(jobs), f"pair {jobs[k - 1].name}")
@@ -257,7 +259,7 @@ def _run(tasks: Sequence[Task], executor: Executor | None, stages: Stages, sessi
 
 def _whole_ring(
     session: Session,
-    ring: Ring,
+    ring: CalibratedRig,
     pairs: tuple[tuple[str, str], ...],
     steps: tuple[Capture, ...],
     settings: Settings,

@@ -51,13 +51,13 @@ def serve(lines: Iterable[str], say: Say) -> None:
     began = time.monotonic()
     kept.limit = _memory()
     say({"worker": "warming"})
-    warm_up()
+    compile_and_load()
     say({"worker": "ready", "seconds": round(time.monotonic() - began, 1)})
     while (order := orders.next()) is not None:
         say(_carried_out(order, say, orders))
 
 
-def warm_up() -> None:
+def compile_and_load() -> None:
     """Have the kernels compiled at low priority, where they are not yet, and load them."""
     lowered = getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0)
     command = [sys.executable, "-P", "-m", "ringdic.jobs", "--compile"]
@@ -67,10 +67,10 @@ def warm_up() -> None:
 
 def _load_kernels() -> None:
     from ringdic.correlation.correlate import load_kernels
-    from ringdic.jobs.warm_up import rehearse
+    from ringdic.jobs.warm_up import run_small_plate
 
     load_kernels()
-    rehearse()
+    run_small_plate()
 
 
 def compile_kernels(say: Say) -> None:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ringdic.arrays import Floats
+from ringdic.calibration.calibrated_rig import CalibratedRig
 from ringdic.calibration.drift import drift_sentences
 from ringdic.calibration.quality import ReconstructionError
-from ringdic.calibration.rig import Ring
 from ringdic.measure.window_study import gauge
 from ringdic.results.fields import available
 from ringdic.results.results import Results
@@ -36,7 +36,7 @@ class StepFigures:
 def summarise(
     reference: Results,
     steps: Sequence[StepFigures],
-    ring: Ring,
+    ring: CalibratedRig,
     errors: dict[tuple[str, str], ReconstructionError],
     drift: Mapping[str, Floats],
     agreement: Mapping[str, Any],
@@ -78,7 +78,7 @@ def step_figures(results: Results, motion: RigidMotion, found: Deformation) -> S
     return StepFigures(_row(results, last, motion, found), _uncertainty(results, last))
 
 
-def _calibration(ring: Ring) -> dict[str, Any]:
+def _calibration(ring: CalibratedRig) -> dict[str, Any]:
     """How the cameras were found and how well: the pairs, the target as adjusted, and what could be done better."""
     return {
         "method": "dlt" if ring.bundle is None else "bundle",

@@ -11,9 +11,9 @@ from ringdic.arrays import Floats
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.pairs.matching import StepMatches
 from ringdic.pairs.reconstruction import pair_shape
-from ringdic.pairs.surfaces import FollowedPair, follow, pairs_surface
-from ringdic.results.series import Shelf
-from ringdic.results.uncertainty import Stated
+from ringdic.pairs.surfaces import PairSurface, pairs_surface, reconstruct_pair
+from ringdic.results.series import StepCache
+from ringdic.results.uncertainty import StepUncertainty
 from ringdic.results.writer import write_series
 from ringdic.settings import Settings
 
@@ -25,15 +25,15 @@ _SIZE = (800, 800)
 _STEPS = 2
 
 
-def rehearse() -> None:
+def run_small_plate() -> None:
     """Two pairs of three cameras in a row see a plate, with an overlap, at the reference and a little stretched."""
     cameras = [_camera(str(k), x) for k, x in enumerate((-80.0, 0.0, 80.0))]
     settings = Settings()
     with TemporaryDirectory() as folder:
-        shelf = Shelf(Path(folder))
+        shelf = StepCache(Path(folder))
         pairs = [_followed((cameras[k], cameras[k + 1]), 80.0 * k - 120.0, shelf) for k in range(2)]
         series, _ = pairs_surface("rehearsal", cameras, pairs, [str(k) for k in range(_STEPS)], settings)
-        Stated(series.reference, None, series.noise).of(series.at(1), 1)
+        StepUncertainty(series.reference, None, series.noise).of(series.at(1), 1)
         write_series(Path(folder) / "results.h5", series, lambda _: None, {}, {})
         shelf.close()
 
@@ -49,7 +49,7 @@ def _camera(name: str, x: float) -> Camera:
     return Camera(name, P / P[2, 3], _SIZE, lens)
 
 
-def _followed(cameras: tuple[Camera, Camera], left: float, shelf: Shelf) -> FollowedPair:
+def _followed(cameras: tuple[Camera, Camera], left: float, shelf: StepCache) -> PairSurface:
     """A pair's part of the plate, from ``left`` mm on along x."""
     column, row = (axis.ravel() for axis in np.meshgrid(np.arange(_SIDE), np.arange(_SIDE), indexing="ij"))
     places = np.column_stack([left + _PITCH * column, _PITCH * row - 80.0, np.zeros(len(row))])
@@ -59,7 +59,7 @@ def _followed(cameras: tuple[Camera, Camera], left: float, shelf: Shelf) -> Foll
     steps = [_matches(cameras, places * [1.0 + 1e-3 * k, 1.0, 1.0]) for k in range(_STEPS)]
     grid = _PITCH * np.column_stack([column, row]).astype(np.float64)
     shape = pair_shape(cameras, grid, faces, steps[0], int(_PITCH), 1.0)
-    return follow(shape, steps.__getitem__, _STEPS, shelf)
+    return reconstruct_pair(shape, steps.__getitem__, _STEPS, shelf)
 
 
 def _matches(cameras: tuple[Camera, Camera], xyz: Floats) -> StepMatches:

@@ -9,12 +9,12 @@ import numpy as np
 from ringdic.measure.path import shortest_path
 from ringdic.measure.place import Place
 from ringdic.measure.table import Table
-from ringdic.results.evaluation import Evaluated
+from ringdic.results.evaluation import EvaluatedResults
 
 _UNITS = dict.fromkeys(("along_surface", "straight"), "mm")
 
 
-def extensometer(seen: Evaluated, start: Place, end: Place) -> Table:
+def extensometer(seen: EvaluatedResults, start: Place, end: Place) -> Table:
     """One row a step: lengths in mm and engineering strains ``L / L0 - 1``.
 
     ``along_surface`` follows the material that was the shortest way in the reference; ``straight`` is the chord. L0 is

@@ -12,7 +12,7 @@ from ringdic.arrays import Floats, Mask
 from ringdic.errors import InputError
 from ringdic.measure.table import Table
 from ringdic.mesh.mesh import Mesh
-from ringdic.results.evaluation import Evaluated
+from ringdic.results.evaluation import EvaluatedResults
 
 
 class Region(Protocol):
@@ -66,7 +66,7 @@ class Ball:
 
 
 @dataclass(frozen=True)
-class Patch:
+class AngularPatch:
     """A window in azimuth, rad, counter-clockwise from the first to the second, and in height z, mm."""
 
     azimuth: tuple[float, float]
@@ -101,7 +101,7 @@ class Listed:
         return chosen
 
 
-def region_statistics(seen: Evaluated, region: Region, fields: Sequence[str] = ()) -> Table:
+def region_statistics(seen: EvaluatedResults, region: Region, fields: Sequence[str] = ()) -> Table:
     """One row a field and step over the triangles of a region, or over the points that are their corners.
 
     ``mean``, ``std`` and ``rms`` are weighted by the area in the reference (a point has a third of its triangles in the

@@ -12,7 +12,7 @@ from ringdic.arrays import Floats, Indices, Mask
 from ringdic.errors import InputError
 from ringdic.measure.table import Table
 from ringdic.mesh.mesh import Mesh
-from ringdic.results.evaluation import Evaluated
+from ringdic.results.evaluation import EvaluatedResults
 from ringdic.results.fields import Field
 
 
@@ -64,7 +64,7 @@ class Crossings:
         return np.asarray((first + shares * (second - first)).mean(axis=1))
 
 
-def section(seen: Evaluated, cut: Cut, fields: Sequence[str] = ()) -> Table:
+def section(seen: EvaluatedResults, cut: Cut, fields: Sequence[str] = ()) -> Table:
     """One row a crossed triangle and step: line, arc length in the reference, position and fields.
 
     fields : names; every field there is unless given. Raises InputError for a field there is not, or a cut that misses

@@ -9,10 +9,10 @@ import numpy as np
 
 from ringdic.measure.place import Place
 from ringdic.measure.table import Table
-from ringdic.results.evaluation import Evaluated
+from ringdic.results.evaluation import EvaluatedResults
 
 
-def time_series(seen: Evaluated, places: Sequence[Place], fields: Sequence[str] = ()) -> Table:
+def time_series(seen: EvaluatedResults, places: Sequence[Place], fields: Sequence[str] = ()) -> Table:
     """One row a place and step: position and fields, those of points interpolated, those of faces of its triangle.
 
     fields : names; every field there is unless given. Raises InputError for a field there is not.
@@ -35,7 +35,7 @@ def time_series(seen: Evaluated, places: Sequence[Place], fields: Sequence[str] 
     return Table.of_rows(rows, units, _notes(seen, places))
 
 
-def _notes(seen: Evaluated, places: Sequence[Place]) -> list[str]:
+def _notes(seen: EvaluatedResults, places: Sequence[Place]) -> list[str]:
     reference = seen.results.vertices_ref
     return [
         f"{place.label} is in triangle {place.face}, in the reference at "

@@ -198,7 +198,7 @@ def _corner_angles(mesh: Mesh) -> Floats:
     return np.arctan2(np.linalg.norm(np.cross(ahead, behind), axis=2), np.einsum("mki,mki->mk", ahead, behind))
 
 
-def neighbours(faces: Indices) -> Indices:
+def face_neighbours(faces: Indices) -> Indices:
     """Triangles beside each triangle, (M, 3): across the edge from corner k to the next; -1 at a border.
 
     Where more than two triangles share an edge, one of the others.

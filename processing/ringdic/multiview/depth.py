@@ -9,7 +9,7 @@ import numpy as np
 from ringdic.arrays import Floats, Indices, Mask
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
-from ringdic.multiview.lattice import TURN, Lattice, Pieces, robust_pieces
+from ringdic.multiview.lattice import TURN, Pieces, SurfaceLattice, robust_pieces
 
 _SMOOTHING = 12.0  # mm, reach of the pieces that join the samples of the sweeps
 _MARGIN = 3  # rows beyond the samples
@@ -26,17 +26,17 @@ def px_per_mm(cameras: Sequence[Camera], radius: float) -> float:
     return float(np.median(scales))
 
 
-def lay_lattice(samples: Floats, spacing: float) -> Lattice:
+def lay_lattice(samples: Floats, spacing: float) -> SurfaceLattice:
     """A lattice over points of the surface (n, 3) mm, its nodes ``spacing`` mm apart on the middling radius."""
     radius = float(np.median(np.hypot(samples[:, 0], samples[:, 1])))
     columns = max(8, round(TURN * radius / spacing))
     low, high = (float(value) for value in (samples[:, 2].min(), samples[:, 2].max()))
     first = np.floor(low / spacing) - _MARGIN
     count = int(np.ceil(high / spacing) + _MARGIN - first) + 1
-    return Lattice(radius, columns, (first + np.arange(count)) * spacing)
+    return SurfaceLattice(radius, columns, (first + np.arange(count)) * spacing)
 
 
-def rough_surface(lattice: Lattice, samples: Floats) -> Pieces:
+def rough_surface(lattice: SurfaceLattice, samples: Floats) -> Pieces:
     """Smooth pieces through samples (n, 3) mm of the surface that are scattered over the lattice and may be wrong.
 
     Raises ComputationError where they do not make a surface.

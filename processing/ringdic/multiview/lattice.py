@@ -23,7 +23,7 @@ _RIDGE = 1e-9
 
 
 @dataclass(frozen=True)
-class Lattice:
+class SurfaceLattice:
     """Nodes (columns, rows): columns close round the axis at equal angles, rows at equal heights.
 
     radius : mm, of the cylinder whose arcs measure the columns. columns : their number. z : (rows,) mm, rising.
@@ -78,7 +78,7 @@ class Pieces:
     support : (columns, rows), nodes known within reach, by weight, as a share of all.
     """
 
-    lattice: Lattice
+    lattice: SurfaceLattice
     coefficients: Floats
     support: Floats
 
@@ -105,7 +105,7 @@ class Pieces:
 
 
 def fit_pieces(
-    lattice: Lattice, radius: Floats, reach: float, degree: int = 3, *, least: float = 0.2, density: float = 1.0
+    lattice: SurfaceLattice, radius: Floats, reach: float, degree: int = 3, *, least: float = 0.2, density: float = 1.0
 ) -> Pieces:
     """Fit a piece about every node that has enough known nodes within reach.
 
@@ -144,7 +144,7 @@ def fit_pieces(
 
 
 def robust_pieces(
-    lattice: Lattice,
+    lattice: SurfaceLattice,
     radius: Floats,
     reach: float,
     degree: int = 3,
@@ -190,7 +190,7 @@ def evaluate(coefficients: Floats, a: Floats, b: Floats) -> tuple[Floats, Floats
     return value, by_a, by_b
 
 
-def _window(lattice: Lattice, reach: float) -> tuple[Floats, Floats, Floats]:
+def _window(lattice: SurfaceLattice, reach: float) -> tuple[Floats, Floats, Floats]:
     """a, b and weights of the nodes within reach; a and b in units of the reach."""
     along, up = lattice.spacing
     half = (max(2, math.ceil(reach / along)), max(2, math.ceil(reach / up)))

@@ -37,7 +37,7 @@ _PATIENCE = 25  # iterations; steep and small subsets take some ten
 
 
 @dataclass
-class Ring:
+class ReferenceImages:
     """The cameras and their reference images.
 
     image : gives the grey image of a camera's id, or None where it has none. masks : regions drawn by the user.
@@ -126,7 +126,7 @@ class NodeMatches:
 
 
 def match_nodes(
-    ring: Ring,
+    ring: ReferenceImages,
     pieces: Pieces,
     nodes: tuple[Indices, Indices],
     reference: Indices,
@@ -189,7 +189,7 @@ class _Parts:
     systematic: Floats
     matches: Floats
 
-    def add(self, ring: Ring, cameras: tuple[int, int], found: Correlation, nodes: Indices) -> None:
+    def add(self, ring: ReferenceImages, cameras: tuple[int, int], found: Correlation, nodes: Indices) -> None:
         """Add the matches found from the first camera to the second. The first has the mean of its nodes' matches.
 
         Half of what is no noise is laid to either image.

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from ringdic.arrays import Floats, Indices, Mask
 from ringdic.correlation import CorrelationSettings, Status
 from ringdic.geometry.camera import Camera
-from ringdic.geometry.outliers import Lost, neighbours, surface_outliers
+from ringdic.geometry.outliers import LostPoint, grid_neighbours, surface_outliers
 from ringdic.multiview.agreement import triangulate_agreeing
 from ringdic.multiview.matching import Image
 from ringdic.multiview.shape import ReferenceShape
-from ringdic.multiview.tracking import Track, Tracking, track
+from ringdic.multiview.tracking import CameraTrack, Tracking, track
 from ringdic.multiview.weights import smooth_sigma
 from ringdic.uncertainty.matches import match_parts
 from ringdic.uncertainty.noise import camera_noise
@@ -31,7 +31,7 @@ _LEAST_SIGMA = 1e-3  # px, what no match is better than
 
 
 @dataclass(frozen=True)
-class CameraTrack:
+class VertexTrack:
     """The k points that one camera followed through F steps.
 
     camera : its index. vertex : (k,) the points. px, sigma : (F, k, 2) px, sigma with all that is uncertain in it;
@@ -67,7 +67,7 @@ class Motion:
     degrees: Indices
     c_ls: Floats
     status: NDArray[np.int8]
-    tracks: tuple[CameraTrack, ...]
+    tracks: tuple[VertexTrack, ...]
     drift: Floats
 
 
@@ -110,8 +110,8 @@ def measure_motion(
 
 
 def camera_track(
-    camera: int, x0: Floats, vertex: Indices, shape: ReferenceShape, found: Track, step: int, sigma_max: float
-) -> CameraTrack:
+    camera: int, x0: Floats, vertex: Indices, shape: ReferenceShape, found: CameraTrack, step: int, sigma_max: float
+) -> VertexTrack:
     """One camera's track with what its pixels are uncertain by.
 
     camera : its index. x0 : (k, 2) px of the points ``vertex`` (k,) at the reference. found : at all F steps, the
@@ -119,16 +119,16 @@ def camera_track(
     """
     with np.errstate(invalid="ignore"):
         uncertain = (found.status == 0) & (found.sigma > sigma_max).any(axis=2)
-    status = np.where(uncertain, Lost.UNCERTAIN, found.status).astype(np.int8)
+    status = np.where(uncertain, LostPoint.UNCERTAIN, found.status).astype(np.int8)
     texture = shape.textures[camera].part(vertex)
     variance = camera_noise(float(shape.grey_noise[camera]), found.c_ls[1:], texture.contrast)
     noise, sigma = _parted(found, texture, variance)
     weight = np.stack([smooth_sigma(x0, np.maximum(one, _LEAST_SIGMA), _CELL * step) for one in sigma])
     used = np.zeros(status.shape, bool)
-    return CameraTrack(camera, vertex, found.px, sigma, noise, weight, variance, found.c_ls, status, used)
+    return VertexTrack(camera, vertex, found.px, sigma, noise, weight, variance, found.c_ls, status, used)
 
 
-def _parted(found: Track, texture: Texture, variance: float) -> tuple[Floats, Floats]:
+def _parted(found: CameraTrack, texture: Texture, variance: float) -> tuple[Floats, Floats]:
     """Standard deviations (F, k, 2) px of the displacements by noise alone, and by all."""
     noise, total = np.zeros_like(found.sigma), np.zeros_like(found.sigma)
     for step in range(1, len(found.px)):
@@ -141,7 +141,7 @@ def _parted(found: Track, texture: Texture, variance: float) -> tuple[Floats, Fl
 def motion_from(
     cameras: Sequence[Camera],
     shape: ReferenceShape,
-    tracks: Sequence[CameraTrack],
+    tracks: Sequence[VertexTrack],
     steps: int,
     placed: Placed | None = None,
 ) -> Motion:
@@ -183,9 +183,9 @@ def _step(cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, step
     points, used = triangulate_agreeing(cameras, px, sigma)
     enough: Mask = np.asarray(np.isfinite(px[..., 0]).sum(axis=0) >= 2)
     lost: Mask = np.asarray(~np.isfinite(points.xyz).all(axis=1))
-    status = np.where(lost, np.where(enough, Lost.RESIDUAL, status), 0).astype(np.int8)
+    status = np.where(lost, np.where(enough, LostPoint.RESIDUAL, status), 0).astype(np.int8)
     moved = np.where(lost[:, None], np.nan, points.xyz - shape.xyz)
-    status = np.where(surface_outliers(neighbours(shape.node.astype(float), 1), moved), Lost.SURFACE, status)
+    status = np.where(surface_outliers(grid_neighbours(shape.node.astype(float), 1), moved), LostPoint.SURFACE, status)
     measured: Mask = np.asarray(status == 0)
     used &= measured
     motion.status[step] = status

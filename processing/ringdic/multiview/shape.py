@@ -22,11 +22,11 @@ from ringdic.arrays import Floats, Indices, Mask
 from ringdic.correlation import CorrelationSettings, Status
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
-from ringdic.geometry.outliers import Lost
+from ringdic.geometry.outliers import LostPoint
 from ringdic.multiview.agreement import triangulate_agreeing
 from ringdic.multiview.depth import lay_lattice, px_per_mm, rough_surface
-from ringdic.multiview.lattice import Lattice, Pieces, evaluate, robust_pieces
-from ringdic.multiview.matching import Image, NodeMatches, Ring, match_nodes
+from ringdic.multiview.lattice import Pieces, SurfaceLattice, evaluate, robust_pieces
+from ringdic.multiview.matching import Image, NodeMatches, ReferenceImages, match_nodes
 from ringdic.multiview.tube import lattice_faces
 from ringdic.multiview.views import seen
 from ringdic.multiview.weights import smooth_sigma
@@ -113,7 +113,7 @@ class ReferenceShape:
     def from_arrays(cls, arrays: Mapping[str, NDArray]) -> ReferenceShape:
         """From what ``arrays`` gave."""
         radius, columns, *z = arrays["lattice"].tolist()
-        lattice = Lattice(radius, int(columns), np.array(z))
+        lattice = SurfaceLattice(radius, int(columns), np.array(z))
         textures = tuple(
             Texture(**{each.name: arrays[f"texture_{k}_{each.name}"] for each in fields(Texture)})
             for k in range(len(arrays["px"]))
@@ -141,7 +141,7 @@ def reference_shape(
     Raises ComputationError where no two cameras share a textured surface.
     """
     settings = settings or ShapeSettings()
-    ring = Ring(cameras, image, masks, correlation)
+    ring = ReferenceImages(cameras, image, masks, correlation)
     samples = _samples(ring, pairs, search, lambda share: progress(0.3 * share, "searching for the surface"))
     lattice = lay_lattice(samples, settings.spacing or _spacing(cameras, samples, correlation))
     surface = _Surface(ring, settings, rough_surface(lattice, samples))
@@ -161,7 +161,9 @@ def _spacing(cameras: Sequence[Camera], samples: Floats, correlation: Correlatio
     return correlation.step / px_per_mm(cameras, radius)
 
 
-def _samples(ring: Ring, pairs: Sequence[tuple[int, int]], search: Search, progress: Callable[[float], None]) -> Floats:
+def _samples(
+    ring: ReferenceImages, pairs: Sequence[tuple[int, int]], search: Search, progress: Callable[[float], None]
+) -> Floats:
     """Places (n, 3) mm where the sweeps of the pairs found the surface."""
     found = []
     for k, (a, b) in enumerate(pairs):
@@ -184,7 +186,7 @@ def _samples(ring: Ring, pairs: Sequence[tuple[int, int]], search: Search, progr
 class _Surface:
     """The surface while it is being measured: what is known of each node."""
 
-    def __init__(self, ring: Ring, settings: ShapeSettings, pieces: Pieces) -> None:
+    def __init__(self, ring: ReferenceImages, settings: ShapeSettings, pieces: Pieces) -> None:
         count, (columns, rows) = len(ring.cameras), pieces.lattice.shape
         self.ring, self.settings, self.pieces = ring, settings, pieces
         self.xyz = np.full((columns, rows, 3), np.nan)
@@ -261,7 +263,7 @@ class _Surface:
         density = 1.0 / _EVERY**2 if self.thin else 1.0
         self.pieces, kept = robust_pieces(lattice, radius, self.settings.piece, density=density)
         off = self.known & ~kept
-        self.status[off] = Lost.SURFACE
+        self.status[off] = LostPoint.SURFACE
         self.xyz[off] = np.nan
         return int(off.sum())
 
@@ -284,9 +286,9 @@ class _Surface:
         sigma = np.stack([smooth_sigma(at, own, cell) for at, own in zip(px, sigma, strict=True)])
         points, used = triangulate_agreeing(cameras, px, sigma, reference)
         status = np.where(found.status != 0, found.status, 0)
-        status = np.where((status == 0) & ~np.isfinite(points.xyz).all(axis=1), Lost.RESIDUAL, status)
+        status = np.where((status == 0) & ~np.isfinite(points.xyz).all(axis=1), LostPoint.RESIDUAL, status)
         few = (np.isfinite(found.px[..., 0]) & ~uncertain).sum(axis=0) < 2
-        status = np.where((status == Lost.RESIDUAL) & few & uncertain.any(axis=0), Lost.UNCERTAIN, status)
+        status = np.where((status == LostPoint.RESIDUAL) & few & uncertain.any(axis=0), LostPoint.UNCERTAIN, status)
         good = status == 0
         used &= good
         self.status[nodes] = status

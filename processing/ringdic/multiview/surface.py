@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 
 from ringdic.arrays import Floats, Image, Indices, Mask
-from ringdic.calibration.moving_cameras import SteadiedCameras
+from ringdic.calibration.refined_cameras import RefinedCameras
 from ringdic.correlation import CorrelationSettings, Status
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
-from ringdic.geometry.outliers import Lost
+from ringdic.geometry.outliers import LostPoint
 from ringdic.geometry.triangulation import reprojection_residuals
-from ringdic.multiview.certainty import certainty
-from ringdic.multiview.motion import CameraTrack, Motion, camera_track, measure_motion, motion_from
+from ringdic.multiview.motion import Motion, VertexTrack, camera_track, measure_motion, motion_from
 from ringdic.multiview.shape import ReferenceShape, ShapeSettings, reference_shape
-from ringdic.multiview.tracking import Track, Tracking
+from ringdic.multiview.tracking import CameraTrack, Tracking
+from ringdic.multiview.uncertainty import surface_uncertainty
 from ringdic.multiview.views import incidence
 from ringdic.results.results import Matches, Results
 from ringdic.settings import Settings
@@ -79,7 +79,7 @@ def ring_surface(
     )
     _require_faces(shape)
     rate = f"{shape.made / shape.seconds:,.0f} points/s" if shape.seconds else ""
-    steadied = SteadiedCameras(cameras)
+    steadied = RefinedCameras(cameras)
     motion = measure_motion(
         cameras,
         shape,
@@ -101,7 +101,7 @@ def surface_of_tracks(
     pairs: Sequence[tuple[str, str]],
     steps: Sequence[str],
     shape: ReferenceShape,
-    tracks: Mapping[int, Track],
+    tracks: Mapping[int, CameraTrack],
     settings: Settings,
 ) -> RingSurface:
     """The same from the reference shape and each camera's track through all steps, by its index."""
@@ -111,7 +111,7 @@ def surface_of_tracks(
     for k, found in tracks.items():
         vertex, x0 = reference_places(cameras[k], shape, k)
         followed.append(camera_track(k, x0, vertex, shape, found, step, sigma_max))
-    steadied = SteadiedCameras(cameras)
+    steadied = RefinedCameras(cameras)
     placed = steadied if settings.calibration.refine_poses else None
     motion = motion_from(cameras, shape, followed, len(steps), placed)
     return _found(rig, cameras, pairs, steps, shape, motion, steadied, settings)
@@ -151,7 +151,7 @@ def _found(
     steps: Sequence[str],
     shape: ReferenceShape,
     motion: Motion,
-    steadied: SteadiedCameras,
+    steadied: RefinedCameras,
     settings: Settings,
 ) -> RingSurface:
     residuals = reprojection_residuals(cameras, shape.xyz, shape.px)
@@ -178,7 +178,7 @@ def _drift(cameras: Sequence[Camera], residuals: Floats, motion: Motion) -> dict
 
 
 def _agreement(shape: ReferenceShape, residuals: Floats) -> dict[str, Any]:
-    reasons = {int(reason): reason.name.lower() for kind in (Status, Lost) for reason in kind}
+    reasons = {int(reason): reason.name.lower() for kind in (Status, LostPoint) for reason in kind}
     lost, count = np.unique(shape.status, return_counts=True)
     matched = residuals.copy()
     matched[shape.reference, np.arange(len(shape.xyz))] = np.nan  # whole pixels by definition
@@ -227,7 +227,7 @@ def _results(
     corners = vertex_pair[shape.faces]
     alike = (corners == corners[:, :1]).all(axis=1)
     tracking = settings.correlation
-    sure = certainty(cameras, shape, motion, tracking.radius_px, tracking.order)
+    sure = surface_uncertainty(cameras, shape, motion, tracking.radius_px, tracking.order)
     with np.errstate(invalid="ignore"):
         chi2 = motion.chi2 / np.where(motion.degrees > 0, motion.degrees, 1)
     return Results(
@@ -273,11 +273,11 @@ def _facing_pairs(
     return tuple(listed), vertex_pair
 
 
-def _matches(cameras: Sequence[Camera], one: CameraTrack, shape: ReferenceShape) -> Matches:
+def _matches(cameras: Sequence[Camera], one: VertexTrack, shape: ReferenceShape) -> Matches:
     """One camera's matches. Good ones that contradicted the other cameras' are marked."""
     sigma = one.sigma.copy()
     sigma[0] = shape.sigma[one.camera, one.vertex]
-    status = np.where((one.status == 0) & ~one.used, Lost.RESIDUAL, one.status).astype(np.int8)
+    status = np.where((one.status == 0) & ~one.used, LostPoint.RESIDUAL, one.status).astype(np.int8)
     return Matches(
         cameras=(cameras[one.camera].id,),
         xy=shape.px[one.camera, one.vertex],

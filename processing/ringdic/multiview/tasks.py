@@ -18,7 +18,7 @@ from ringdic.correlation import CorrelationSettings
 from ringdic.geometry.camera import Camera
 from ringdic.multiview.shape import ReferenceShape, ShapeSettings, reference_shape
 from ringdic.multiview.surface import numbers_of, reference_places, shape_settings, tracking_of
-from ringdic.multiview.tracking import Track, Tracking, TrackState, at_reference, track_block
+from ringdic.multiview.tracking import CameraTrack, Tracking, TrackState, at_reference, track_block
 from ringdic.session.folder import Capture, Session
 from ringdic.session.images import read_mask
 from ringdic.settings import Settings
@@ -46,7 +46,7 @@ class RingJob:
         """All tasks, block by block."""
         return [self.shape, *(task for turn in zip(*self.blocks, strict=True) for task in turn)]
 
-    def found(self) -> tuple[ReferenceShape, dict[int, Track]]:
+    def found(self) -> tuple[ReferenceShape, dict[int, CameraTrack]]:
         """The shape, and the tracks through all steps of the cameras that see some of it, by index.
 
         Raises the ComputationError that the shape ended with.
@@ -56,8 +56,8 @@ class RingJob:
         for k, (camera, blocks) in enumerate(zip(self.cameras, self.blocks, strict=True)):
             vertex, x0 = reference_places(camera, shape, k)
             if len(vertex):
-                later = [_part(Track, read_output(task.output), _TRACK) for task in blocks]
-                tracks[k] = Track.joined([at_reference(x0, camera.size[::-1]), *later])
+                later = [_part(CameraTrack, read_output(task.output), _TRACK) for task in blocks]
+                tracks[k] = CameraTrack.joined([at_reference(x0, camera.size[::-1]), *later])
         return shape, tracks
 
 

@@ -27,8 +27,8 @@ from ringdic.correlation import (
     search_hypotheses,
 )
 from ringdic.errors import InputError
-from ringdic.multiview.following import Followed, follow
-from ringdic.multiview.places import Places, places
+from ringdic.multiview.step_matching import ImageMatches, match_tracked_points
+from ringdic.multiview.tracked_points import TrackedPoints, tracked_points
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ class Tracking:
 
 
 @dataclass(frozen=True)
-class Track:
+class CameraTrack:
     """n points of one camera at F steps; NaN where status is not 0.
 
     px : (F, n, 2). sigma : (F, n, 2) px, standard uncertainty of the displacement since the reference, 0 there.
@@ -78,7 +78,7 @@ class Track:
     updated: Mask
 
     @classmethod
-    def joined(cls, blocks: Sequence[Track]) -> Track:
+    def joined(cls, blocks: Sequence[CameraTrack]) -> CameraTrack:
         """The steps of several tracks of the same points, one after the other."""
         names = [each.name for each in fields(cls)]
         return cls(*(np.concatenate([getattr(block, name) for block in blocks]) for name in names))
@@ -127,7 +127,7 @@ def track(
     settings: CorrelationSettings,
     options: Tracking = Tracking(),
     progress: Callable[[float], None] = lambda _: None,
-) -> Track:
+) -> CameraTrack:
     """Follow points of one camera from its reference image, step 0, through the images of steps 1 … steps - 1.
 
     As :func:`track_block`; the reference is the first step of the result.
@@ -135,7 +135,7 @@ def track(
     block, _ = track_block(
         reference_image, image_of_step, range(1, steps), x0, mask, settings, options, progress=progress
     )
-    return Track.joined([at_reference(x0, reference_image.shape), block])
+    return CameraTrack.joined([at_reference(x0, reference_image.shape), block])
 
 
 def track_block(
@@ -148,7 +148,7 @@ def track_block(
     options: Tracking = Tracking(),
     state: TrackState | None = None,
     progress: Callable[[float], None] = lambda _: None,
-) -> tuple[Track, TrackState]:
+) -> tuple[CameraTrack, TrackState]:
     """Follow points of one camera from its reference image through some steps, and what the next steps set out from.
 
     reference_image : (h, w). image_of_step : the image of a step, None where there is none: all points are lost there;
@@ -178,7 +178,7 @@ def track_block(
     return result, points.state
 
 
-def at_reference(x0: Floats, shape: tuple[int, ...]) -> Track:
+def at_reference(x0: Floats, shape: tuple[int, ...]) -> CameraTrack:
     """The points x0 (n, 2) px in the reference image of this shape, one step."""
     x0 = np.asarray(x0, dtype=np.float64)
     inside = _inside(x0, shape)
@@ -193,13 +193,13 @@ def _inside(x0: Floats, shape: tuple[int, ...]) -> Mask:
         return np.asarray(((x0 >= 0) & (x0 <= (shape[1] - 1, shape[0] - 1))).all(axis=1))
 
 
-def _lost(steps: int, x0: Floats, inside: Mask) -> Track:
+def _lost(steps: int, x0: Floats, inside: Mask) -> CameraTrack:
     """Every point lost in every step."""
     n = len(x0)
     status = np.full((steps, n), Status.NOT_REACHED, np.int8)
     status[:, np.isfinite(x0).all(axis=1) & ~inside] = Status.OUTSIDE
     px, sigma = np.full((steps, n, 2), np.nan), np.full((steps, n, 2), np.nan)
-    return Track(px, sigma, np.full((steps, n), np.nan), status, np.zeros((steps, n), bool))
+    return CameraTrack(px, sigma, np.full((steps, n), np.nan), status, np.zeros((steps, n), bool))
 
 
 def painted(xy: Floats, shape: tuple[int, ...], reach: float) -> Mask:
@@ -218,7 +218,7 @@ class _Points:
     reference: Reference
     image_of_step: Callable[[int], Image | None]
     x0: Floats
-    places: Places
+    places: TrackedPoints
     settings: CorrelationSettings
     options: Tracking
     state: TrackState
@@ -231,10 +231,10 @@ class _Points:
         """The points x0 (n, 2) of the reference image, as the steps before left them."""
         region = painted(x0, image.shape, settings.step) if mask is None else mask
         reference = prepare_reference(image, region, settings)
-        where = places(reference, x0, settings, options.window, thin=options.two_pass)
+        where = tracked_points(reference, x0, settings, options.window, thin=options.two_pass)
         return cls(reference, image_of_step, x0, where, settings, options, state)
 
-    def advance(self, step: int) -> Followed | None:
+    def advance(self, step: int) -> ImageMatches | None:
         """Find the points in the image of a step and remember those found. None without an image."""
         image = self.image_of_step(step)
         if image is None:
@@ -254,12 +254,14 @@ class _Points:
         return found
 
     def _follow(
-        self, reference: Reference, current: Current, points: Places, start: Floats | None, search: bool = True
-    ) -> Followed:
-        return follow(reference, current, points, start, self.settings, two_pass=self.options.two_pass, search=search)
+        self, reference: Reference, current: Current, points: TrackedPoints, start: Floats | None, search: bool = True
+    ) -> ImageMatches:
+        return match_tracked_points(
+            reference, current, points, start, self.settings, two_pass=self.options.two_pass, search=search
+        )
 
-    def _places(self, reference: Reference, at: Floats) -> Places:
-        return places(reference, at, self.settings, self.options.window, thin=self.options.two_pass)
+    def _places(self, reference: Reference, at: Floats) -> TrackedPoints:
+        return tracked_points(reference, at, self.settings, self.options.window, thin=self.options.two_pass)
 
     def _start(self, current: Current) -> Floats | None:
         """Start values (n, 12): the motion so far, or that carried on, whichever resembles the image better."""
@@ -279,14 +281,14 @@ class _Points:
         found = search_hypotheses(self.reference, current, np.rint(xy), warp[seeds][:, None, :6], self.settings.radius)
         return float(np.median(found[1]))
 
-    def _worth_asking(self, found: Followed) -> list[int]:
+    def _worth_asking(self, found: ImageMatches) -> list[int]:
         """The steps whose images showed most of the points lost now, a few at most: each has to be filtered anew."""
         last = self.state.last
         step, count = np.unique(last[~found.good & (last > 0)], return_counts=True)
         order = np.argsort(-count, kind="stable")[:_ASKED]
         return [int(step[k]) for k in order if count[k] >= _FEW * len(self.x0)]
 
-    def _through(self, step: int, found: Followed, current: Current, by_way: Indices) -> Followed:
+    def _through(self, step: int, found: ImageMatches, current: Current, by_way: Indices) -> ImageMatches:
         """Points lost now that were last seen at ``step``, sought from the image of that step. Fills by_way."""
         image, last, warp = self.image_of_step(step), self.state.last, self.state.warp
         lost = np.flatnonzero(~found.good & (last == step))
@@ -320,13 +322,13 @@ class _Points:
         by_way[lost[there]] = np.where(agree, 0, step)
         return self._accepted(found, lost[there], _placed(composed, np.flatnonzero(agree), direct.part(agree)))
 
-    def _accepted(self, found: Followed, index: Indices, other: Followed) -> Followed:
+    def _accepted(self, found: ImageMatches, index: Indices, other: ImageMatches) -> ImageMatches:
         """The points found, and the points ``index`` (k,) as others found them where they agree with the rest."""
         both = _placed(found, index, other)
         odd = self.places.contradict(both.warp[:, :2], np.hypot(*both.sigma.T))[index]
         return _placed(found, index[~odd], other.part(~odd))
 
-    def _composed(self, index: Indices, since: Followed) -> Followed:
+    def _composed(self, index: Indices, since: ImageMatches) -> ImageMatches:
         """Points ``index`` (k,): their motion until they were last seen, and since."""
         state = self.state
         G = np.eye(2) + since.warp[:, 2:6].reshape(-1, 2, 2)
@@ -335,9 +337,9 @@ class _Points:
         warp[:, 2:6] = (G @ (np.eye(2) + state.warp[index, 2:6].reshape(-1, 2, 2)) - np.eye(2)).reshape(-1, 4)
         # An error of the position then is carried along by the gradient since.
         variance = np.einsum("nij,nj->ni", G**2, state.sigma[index] ** 2) + since.sigma**2
-        return Followed(warp, np.sqrt(variance), np.fmax(state.c_ls[index], since.c_ls), since.rest, since.status)
+        return ImageMatches(warp, np.sqrt(variance), np.fmax(state.c_ls[index], since.c_ls), since.rest, since.status)
 
-    def _remember(self, step: int, found: Followed, by_way: Indices) -> None:
+    def _remember(self, step: int, found: ImageMatches, by_way: Indices) -> None:
         good, state = found.good, self.state
         self.state = TrackState(
             warp=np.where(good[:, None], found.warp, state.warp),
@@ -360,11 +362,11 @@ def _between(first: Floats, second: Floats) -> Floats:
     return out
 
 
-def _placed(found: Followed, index: Indices, other: Followed) -> Followed:
+def _placed(found: ImageMatches, index: Indices, other: ImageMatches) -> ImageMatches:
     """``found`` with the points ``index`` (k,) as in ``other``."""
     arrays = []
     for name in ("warp", "sigma", "c_ls", "rest", "status"):
         values = getattr(found, name).copy()
         values[index] = getattr(other, name)
         arrays.append(values)
-    return Followed(*arrays)
+    return ImageMatches(*arrays)

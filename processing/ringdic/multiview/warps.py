@@ -10,7 +10,7 @@ import numpy as np
 
 from ringdic.arrays import Floats
 from ringdic.geometry.camera import Camera
-from ringdic.multiview.lattice import Lattice, evaluate
+from ringdic.multiview.lattice import SurfaceLattice, evaluate
 
 #: Positions of the differences: centre, ± x, ± y, and the four corners.
 _STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]], dtype=float)
@@ -18,7 +18,7 @@ _NEWTON = 6
 
 
 def surface_stencil(
-    lattice: Lattice, coefficients: Floats, theta: Floats, z: Floats, camera: Camera, px: Floats, reach: float
+    lattice: SurfaceLattice, coefficients: Floats, theta: Floats, z: Floats, camera: Camera, px: Floats, reach: float
 ) -> Floats:
     """Where pixels about px (n, 2) of a camera meet the pieces of the surface. (n, 9, 3) mm.
 

@@ -18,8 +18,8 @@ from ringdic.correlation import CorrelationSettings, Current, Status, grid, prep
 from ringdic.correlation.start_field import lattice_spacing, match_from_lattice
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
-from ringdic.pairs.tracking import Places
-from ringdic.sweep.region import paint, well_seen
+from ringdic.pairs.tracking import CameraPixels
+from ringdic.sweep.region import lattice_region, well_seen
 from ringdic.sweep.sweep import SWEEP_RADII, Search, radii_of, sweep
 
 
@@ -98,7 +98,7 @@ def match_reference(stereo: Stereo, first: Image, second: Image, mask: Mask | No
     return Grid(region, xy, faces), matched
 
 
-def at_step(at_reference: StepMatches, seen: tuple[Places | None, Places | None]) -> StepMatches:
+def at_step(at_reference: StepMatches, seen: tuple[CameraPixels | None, CameraPixels | None]) -> StepMatches:
     """A pair's points at a step, by what its cameras' images say of their places there; None where one is missing.
 
     A point that the pair's reference images do not share keeps its status: it never has a place in space. sigma is that
@@ -133,7 +133,7 @@ def _find_region(stereo: Stereo, image: Image, current: Current, mask: Mask | No
             f"cameras {first.id} and {second.id}: no textured surface that both see was found{where}; check that the "
             f"specimen is speckled and stands where the target stood{covered}, and that the images are in focus"
         )
-    region = mask if mask is not None else paint(found.points, good, first.size)
+    region = mask if mask is not None else lattice_region(found.points, good, first.size)
     return region, found.px[good.ravel()], found.warps[good.ravel()]
 
 

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask
 from ringdic.geometry.camera import Camera
-from ringdic.geometry.outliers import Lost, crossing_outliers, neighbours, surface_outliers
+from ringdic.geometry.outliers import LostPoint, crossing_outliers, grid_neighbours, surface_outliers
 from ringdic.geometry.triangulation import LinearSystem, reprojection_residuals
 from ringdic.mesh.mesh import Mesh
 from ringdic.uncertainty.position import linear_sigma
 
 
-class Matched(Protocol):
+class PairMatches(Protocol):
     """A pair's n points in both images of one step.
 
     px, sigma : (2, n, 2) px, NaN where a camera has no match. c_ls : (n,). status : (n,), 0 good in both. seconds :
@@ -82,7 +82,7 @@ class PairShape:
         found[self.rows] = np.arange(len(self.rows))
         return found
 
-    def step(self, found: Matched) -> PairStep:
+    def step(self, found: PairMatches) -> PairStep:
         """The points at a later step, by its matches."""
         # The second camera's place rests on the match between the cameras and on that in time. The noise of its
         # reference image is in both, the other way round, and goes out: the larger deviation holds.
@@ -100,7 +100,7 @@ def pair_shape(
     cameras: tuple[Camera, Camera],
     xy: Floats,
     faces: NDArray[np.int32],
-    found: Matched,
+    found: PairMatches,
     step_px: int,
     sigma_max_px: float,
 ) -> PairShape:
@@ -109,7 +109,7 @@ def pair_shape(
     xy : (n, 2) px, the grid in the first camera's image, of spacing ``step_px``. faces : (m, 3) over it. found : its
     matches. sigma_max_px : least certain match that is believed.
     """
-    beside = neighbours(xy, step_px)
+    beside = grid_neighbours(xy, step_px)
     xyz, sigma, status, drift = _placed(cameras, found, found.sigma, sigma_max_px)
     _drop(surface_outliers(beside, xyz), xyz, status)
     whole = _whole_faces(xyz, faces, cameras)
@@ -119,7 +119,7 @@ def pair_shape(
 
 
 def _placed(
-    cameras: tuple[Camera, Camera], found: Matched, scatter: NDArray[Any], sigma_max_px: float
+    cameras: tuple[Camera, Camera], found: PairMatches, scatter: NDArray[Any], sigma_max_px: float
 ) -> tuple[Floats, Floats, NDArray[np.int8], float]:
     """Places (n, 3) mm and their standard deviations, status (n,) and drift px, by where the lines of sight cross.
 
@@ -127,25 +127,25 @@ def _placed(
     """
     with np.errstate(invalid="ignore"):
         uncertain = (found.sigma > sigma_max_px).any(axis=(0, 2))
-    status = np.where((found.status == 0) & uncertain, Lost.UNCERTAIN, found.status).astype(np.int8)
+    status = np.where((found.status == 0) & uncertain, LostPoint.UNCERTAIN, found.status).astype(np.int8)
     good = status == 0
     px = np.where(good[None, :, None], found.px, np.nan)
     system = LinearSystem.of(cameras, px)
     xyz, sigma = system.solution, linear_sigma(cameras, system, scatter)
     residuals = reprojection_residuals(cameras, xyz, px)
     drift = float(np.nanmean(residuals[0, :, 1])) if good.any() else np.nan
-    _drop(good & crossing_outliers(residuals), xyz, status, Lost.RESIDUAL)
+    _drop(good & crossing_outliers(residuals), xyz, status, LostPoint.RESIDUAL)
     xyz[status != 0] = np.nan
     return xyz, sigma, status, drift
 
 
-def _drop(lost: Mask, xyz: Floats, status: NDArray[np.int8], why: Lost = Lost.SURFACE) -> None:
+def _drop(lost: Mask, xyz: Floats, status: NDArray[np.int8], why: LostPoint = LostPoint.SURFACE) -> None:
     status[lost] = why
     xyz[lost] = np.nan
 
 
 def _of_rows(
-    rows: Indices, xyz: Floats, sigma: Floats, status: NDArray[np.int8], found: Matched, drift: float
+    rows: Indices, xyz: Floats, sigma: Floats, status: NDArray[np.int8], found: PairMatches, drift: float
 ) -> PairStep:
     lost = status[rows] != 0
     correlation, scatter = found.c_ls[rows].astype(np.float32), sigma[rows].astype(np.float32)

@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices
 from ringdic.geometry.camera import Camera
-from ringdic.pairs.merging import Merged, Mismatch, Seam, Sheet, merge, mismatches
-from ringdic.pairs.reconstruction import Matched, PairShape, PairStep
+from ringdic.pairs.merging import Merged, Mismatch, Seam, SurfacePart, merge, mismatches
+from ringdic.pairs.reconstruction import PairMatches, PairShape, PairStep
 from ringdic.results.results import Matches, Results
-from ringdic.results.series import Shelf, usual
+from ringdic.results.series import StepCache, median_deviations
 from ringdic.settings import Settings
 
 _MOST = 0.5  # a step at which fewer points of a pair were measured says nothing about single points
 
 
 @dataclass(frozen=True)
-class FollowedPair:
+class PairSurface:
     """A pair's surface through F steps, which are read again when they are asked for.
 
     correlation : (N,) of each point the worst over the steps, NaN if it was lost at one. drift : (F,) px, of
@@ -29,29 +29,31 @@ class FollowedPair:
     """
 
     shape: PairShape
-    at: Callable[[int], tuple[PairStep, Matched]]
+    at: Callable[[int], tuple[PairStep, PairMatches]]
     correlation: Floats
     drift: Floats
     noise: Floats
 
     @property
-    def sheet(self) -> Sheet:
+    def sheet(self) -> SurfacePart:
         """The reference shape, with the worst correlation over the steps."""
         return self._sheet(self.correlation)
 
     @property
-    def sheet_at_reference(self) -> Sheet:
+    def sheet_at_reference(self) -> SurfacePart:
         """The same as if there were no other step."""
         return self._sheet(self.shape.at_first.correlation)
 
-    def _sheet(self, correlation: NDArray[Any]) -> Sheet:
-        return Sheet(self.shape.at_first.vertices, self.shape.faces, correlation.astype(float))
+    def _sheet(self, correlation: NDArray[Any]) -> SurfacePart:
+        return SurfacePart(self.shape.at_first.vertices, self.shape.faces, correlation.astype(float))
 
 
-Merging = Callable[[Sequence[FollowedPair], str], Merged]
+Merging = Callable[[Sequence[PairSurface], str], Merged]
 
 
-def follow(shape: PairShape, matched: Callable[[int], Matched], steps: int, shelf: Shelf) -> FollowedPair:
+def reconstruct_pair(
+    shape: PairShape, matched: Callable[[int], PairMatches], steps: int, shelf: StepCache
+) -> PairSurface:
     """A pair's surface through its steps. matched : of each. shelf : where the points in space are laid aside."""
     worst = shape.at_first.correlation.astype(float)
     drift, noise = np.full(steps, np.nan), np.full((steps, 2), np.nan)
@@ -59,13 +61,13 @@ def follow(shape: PairShape, matched: Callable[[int], Matched], steps: int, shel
         found = matched(k)
         step = shape.step(found) if k else shape.at_first
         shelf.put((shape.ids, k), (step, found))
-        drift[k], noise[k] = step.drift, usual(found.sigma, step.status)
+        drift[k], noise[k] = step.drift, median_deviations(found.sigma, step.status)
         if np.mean(step.status[shape.rows] == 0) >= _MOST:
             worst = np.maximum(worst, step.correlation)
-    return FollowedPair(shape, lambda k: shelf.get((shape.ids, k)), worst, drift, noise)
+    return PairSurface(shape, lambda k: shelf.get((shape.ids, k)), worst, drift, noise)
 
 
-def merge_surfaces(pairs: Sequence[FollowedPair], heuristic: str) -> Merged:
+def merge_surfaces(pairs: Sequence[PairSurface], heuristic: str) -> Merged:
     """One surface of the pairs' surfaces."""
     return merge([pair.sheet for pair in pairs], heuristic)
 
@@ -73,7 +75,7 @@ def merge_surfaces(pairs: Sequence[FollowedPair], heuristic: str) -> Merged:
 def pairs_surface(
     rig: str,
     cameras: Sequence[Camera],
-    pairs: Sequence[FollowedPair],
+    pairs: Sequence[PairSurface],
     names: Sequence[str],
     settings: Settings,
     merging: Merging = merge_surfaces,
@@ -107,7 +109,7 @@ class PairsSeries:
 
     names: tuple[str, ...]
     reference: Results
-    pairs: tuple[FollowedPair, ...]
+    pairs: tuple[PairSurface, ...]
     kept: Indices
 
     @property
@@ -141,7 +143,7 @@ class PairsSeries:
         )
 
 
-def _with_step(at_first: Matches, step: PairStep, found: Matched) -> Matches:
+def _with_step(at_first: Matches, step: PairStep, found: PairMatches) -> Matches:
     """A pair's matches at the reference and at a step."""
     return replace(
         at_first,
@@ -153,7 +155,7 @@ def _with_step(at_first: Matches, step: PairStep, found: Matched) -> Matches:
 
 
 def _side_by_side(
-    rig: str, cameras: Sequence[Camera], pairs: Sequence[FollowedPair], reference: str, settings: Settings
+    rig: str, cameras: Sequence[Camera], pairs: Sequence[PairSurface], reference: str, settings: Settings
 ) -> Results:
     """The results of the reference alone."""
     shapes = [pair.shape for pair in pairs]
@@ -178,7 +180,7 @@ def _side_by_side(
     )
 
 
-def _at_reference(pair: FollowedPair, offset: int) -> Matches:
+def _at_reference(pair: PairSurface, offset: int) -> Matches:
     shape, found = pair.shape, pair.at(0)[1]
     vertex = shape.vertex
     return Matches(

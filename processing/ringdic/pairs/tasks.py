@@ -17,7 +17,16 @@ from ringdic.correlation import CorrelationSettings, Reference, prepare_referenc
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.pairs.matching import Grid, StepMatches, Stereo, at_step, match_reference
-from ringdic.pairs.tracking import CameraGrid, Followed, Own, Places, Shared, camera_grid, follow, places
+from ringdic.pairs.tracking import (
+    CameraGrid,
+    CameraMatches,
+    CameraPixels,
+    Own,
+    Shared,
+    camera_grid,
+    match_camera,
+    places,
+)
 from ringdic.session.folder import Capture, Session
 from ringdic.session.images import read_mask
 from ringdic.sweep.sweep import Search
@@ -35,7 +44,7 @@ class CameraJob:
 
     steps: tuple[Task | None, ...]
 
-    def places(self, step: int, xy: Floats) -> Places | None:
+    def places(self, step: int, xy: Floats) -> CameraPixels | None:
         """Where places xy (n, 2) px of the reference image lie at a step from 1 on; None without an image."""
         task = self.steps[step - 1]
         if task is None:
@@ -109,7 +118,7 @@ def pair_jobs(
     ]
 
 
-def in_order(jobs: Sequence[PairJob]) -> list[Task]:
+def ordered_tasks(jobs: Sequence[PairJob]) -> list[Task]:
     """All tasks, camera by camera: what the steps of one need is read while it is still in memory."""
     followed = {id(each): each for job in jobs for each in job.followed}
     later = [task for each in followed.values() for task in each.steps if task is not None]
@@ -140,7 +149,7 @@ def camera_task(
 ) -> Arrays:
     """A camera's points in its image of one step. is_first : whether it is the first camera of each pair in inputs."""
     grid, prepared = _prepared(camera, settings, is_first, reference, inputs)
-    found = follow(prepared, step_image(image, camera), grid, settings)
+    found = match_camera(prepared, step_image(image, camera), grid, settings)
     arrays = {name: getattr(found, name) for name in _FOLLOWED}
     return {**arrays, "step": np.array(found.step), "points": np.array(len(grid.xy))}
 
@@ -177,12 +186,12 @@ def _prepared(
     return kept.get(("reference", camera.id, *map(str, pairs)), make, size)
 
 
-def _followed(output: Path) -> Followed:
+def _followed(output: Path) -> CameraMatches:
     arrays = read_output(output)
-    return Followed(step=int(arrays["step"]), **{name: arrays[name] for name in _FOLLOWED})
+    return CameraMatches(step=int(arrays["step"]), **{name: arrays[name] for name in _FOLLOWED})
 
 
-def _bytes(found: Followed) -> int:
+def _bytes(found: CameraMatches) -> int:
     return sum(int(getattr(found, name).nbytes) for name in _FOLLOWED)
 
 

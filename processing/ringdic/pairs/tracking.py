@@ -21,7 +21,7 @@ from ringdic.correlation import (
     Current,
     Reference,
     Status,
-    correlate,
+    correlate_points,
     prepare_current,
     search_hypotheses,
 )
@@ -52,7 +52,7 @@ class CameraGrid:
 
 
 @dataclass(frozen=True)
-class Followed:
+class CameraMatches:
     """The n points xy (n, 2) px of a camera's grid in its image of one step, NaN where lost.
 
     step : px, of the grid. uv : (n, 2) px. gradient : (n, 2, 2). sigma : (n, 2) px. c_ls, status : (n,).
@@ -68,7 +68,7 @@ class Followed:
 
 
 @dataclass(frozen=True)
-class Places:
+class CameraPixels:
     """What a camera's images of one step say of places in its reference image, NaN where nothing is known.
 
     px : (n, 2) there now. sigma : (n, 2) px. c_ls : (n,). status : (n,), 0 good.
@@ -104,10 +104,10 @@ def camera_grid(size: tuple[int, int], step: int, own: Sequence[Own], shared: Se
     return CameraGrid(region > 0, step * np.stack([column, row], axis=1).astype(np.float64), step)
 
 
-def follow(reference: Reference, image: Image, grid: CameraGrid, settings: CorrelationSettings) -> Followed:
+def match_camera(reference: Reference, image: Image, grid: CameraGrid, settings: CorrelationSettings) -> CameraMatches:
     """The camera's points in its image of a step. reference : its reference image with the grid's region."""
     found = match_in_time(reference, prepare_current(image, settings=settings), grid.xy, settings)
-    return Followed(
+    return CameraMatches(
         grid.xy.astype(np.int32),
         grid.step,
         found.uv,
@@ -118,7 +118,7 @@ def follow(reference: Reference, image: Image, grid: CameraGrid, settings: Corre
     )
 
 
-def places(found: Followed, xy: Floats) -> Places:
+def places(found: CameraMatches, xy: Floats) -> CameraPixels:
     """Where places xy (n, 2) px of the camera's reference image lie in its image of a step."""
     values = np.column_stack([found.uv, found.gradient.reshape(-1, 4), found.sigma, found.c_ls]).astype(np.float64)
     told, weight = between_corners(found.xy, values, found.step, xy)
@@ -126,7 +126,7 @@ def places(found: Followed, xy: Floats) -> Places:
     told[lost] = np.nan
     status = np.zeros(len(xy), np.int8)
     status[lost] = _beside(found, xy[lost])
-    return Places(xy + told[:, :2], told[:, 6:8], told[:, 8], status)
+    return CameraPixels(xy + told[:, :2], told[:, 6:8], told[:, 8], status)
 
 
 def match_in_time(reference: Reference, current: Current, xy: Floats, settings: CorrelationSettings) -> Correlation:
@@ -140,17 +140,17 @@ def match_in_time(reference: Reference, current: Current, xy: Floats, settings: 
     warps, zncc, _ = search_hypotheses(reference, current, xy[chosen[known]], flow[known][:, None], settings.radius)
     held = zncc > _HELD
     if held.sum() < _SOME * max(len(chosen), 1):
-        return correlate(reference, current, xy, settings)
+        return correlate_points(reference, current, xy, settings)
     start = np.full((len(xy), 6), np.nan)
     start[chosen[known[held]]] = warps[held]
     found = match_from_lattice(reference, current, xy, settings, start, lattice_spacing(settings))
     if found.good.mean() >= _ENOUGH:
         return found
-    searched = correlate(reference, current, xy, settings)
+    searched = correlate_points(reference, current, xy, settings)
     return searched if searched.good.sum() > found.good.sum() else found
 
 
-def _beside(found: Followed, xy: Floats) -> NDArray[np.int8]:
+def _beside(found: CameraMatches, xy: Floats) -> NDArray[np.int8]:
     """Why nothing is known at places xy (k, 2) px: what befell the grid's point nearest to each."""
     cells = found.xy // found.step
     told = np.full((found.xy.max(axis=0, initial=0) // found.step + 2), Status.NOT_REACHED, np.int8)

@@ -15,7 +15,7 @@ from ringdic.mesh.mesh import Mesh
 from ringdic.pictures.overlay import no_larger, overlay, photograph, with_bar
 from ringdic.pictures.scale import Picture, Scale, looked_up, on_faces
 from ringdic.pictures.views import Extent, from_side, side_extent
-from ringdic.results.evaluation import Evaluated
+from ringdic.results.evaluation import EvaluatedResults
 from ringdic.session.folder import Session
 
 _STRIP = 26  # px, of the line of text over a frame
@@ -23,7 +23,7 @@ _INSIDE = (219, 222, 227)
 
 
 def overlay_frames(
-    seen: Evaluated, session: Session, camera_id: str, scale: Scale, side: int = 720, opacity: float = 0.65
+    seen: EvaluatedResults, session: Session, camera_id: str, scale: Scale, side: int = 720, opacity: float = 0.65
 ) -> Iterator[Picture]:
     """A frame a step: the camera's photograph with the field over it, its colour bar and the step's name."""
     for step, name in enumerate(seen.steps):
@@ -31,7 +31,7 @@ def overlay_frames(
         yield _framed(no_larger(laid, side), scale, f"{step}: {name}, camera {camera_id}")
 
 
-def surface_frames(seen: Evaluated, scale: Scale, azimuth: float, side: int = 720) -> Iterator[Picture]:
+def surface_frames(seen: EvaluatedResults, scale: Scale, azimuth: float, side: int = 720) -> Iterator[Picture]:
     """A frame a step: the body seen from ``azimuth`` (rad), as it stood, or moved back if the evaluation says so."""
     meshes = [Mesh(seen.positions(step), seen.results.faces) for step in range(len(seen.steps))]
     extents = np.array([side_extent(mesh, azimuth) for mesh in meshes if mesh.whole_faces().any()])

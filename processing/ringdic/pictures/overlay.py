@@ -11,12 +11,14 @@ from ringdic.geometry.camera import Camera
 from ringdic.mesh.mesh import Mesh
 from ringdic.pictures.scale import Picture, Scale, looked_up, on_faces
 from ringdic.pictures.views import through_camera
-from ringdic.results.evaluation import Evaluated
+from ringdic.results.evaluation import EvaluatedResults
 from ringdic.session.folder import Session
 from ringdic.session.images import read_gray
 
 
-def overlay(seen: Evaluated, camera_id: str, image: Image, scale: Scale, step: int, opacity: float = 0.65) -> Picture:
+def overlay(
+    seen: EvaluatedResults, camera_id: str, image: Image, scale: Scale, step: int, opacity: float = 0.65
+) -> Picture:
     """The photograph (h, w) with the field over it, (h, w, 3) sRGB.
 
     camera_id : of a camera of the run. scale : the field's colours. step : at which ``image`` was taken. opacity : of
@@ -49,7 +51,7 @@ def photograph(session: Session, capture_id: str, camera_id: str) -> Image:
     raise InputError(f"{session.path}: camera {camera_id} has no image in {capture_id}; choose another camera or step")
 
 
-def camera_of(seen: Evaluated, camera_id: str) -> Camera:
+def camera_of(seen: EvaluatedResults, camera_id: str) -> Camera:
     """The camera of this id; InputError if the run has none."""
     for camera in seen.results.cameras:
         if camera.id == camera_id:

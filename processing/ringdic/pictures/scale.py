@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ringdic.arrays import Floats
 from ringdic.errors import InputError
 from ringdic.results.colours import colours
-from ringdic.results.evaluation import Evaluated
+from ringdic.results.evaluation import EvaluatedResults
 from ringdic.results.fields import Field
 
 Picture = NDArray[np.uint8]
@@ -69,13 +69,13 @@ class Scale:
         return whole
 
 
-def scale_of(seen: Evaluated, name: str, limits: tuple[float, float] | None = None) -> Scale:
+def scale_of(seen: EvaluatedResults, name: str, limits: tuple[float, float] | None = None) -> Scale:
     """The scale of a field, by default between limits that serve all steps. InputError for a field there is not."""
     low, high = seen.limits(name) if limits is None else limits
     return Scale(seen.field(name), float(low), float(high))
 
 
-def on_faces(seen: Evaluated, entry: Field, values: Floats, step: int) -> Floats:
+def on_faces(seen: EvaluatedResults, entry: Field, values: Floats, step: int) -> Floats:
     """Values of a field at a step on the triangles (M,): of points, the mean of the corners; NaN where not measured."""
     faces = seen.results.faces
     if entry.location == "point":

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ringdic.arrays import Floats
 from ringdic.measure.region import statistics
 from ringdic.pictures.scale import Scale, on_faces
-from ringdic.results.evaluation import Evaluated
+from ringdic.results.evaluation import EvaluatedResults
 from ringdic.results.fields import Field
 from ringdic.results.ranges import Ranges, even_limits
 
@@ -34,7 +34,10 @@ class Gathered:
 
 
 def gather(
-    seen: Evaluated, names: Sequence[str], shown: Sequence[int], progress: Callable[[float], None] = lambda _: None
+    seen: EvaluatedResults,
+    names: Sequence[str],
+    shown: Sequence[int],
+    progress: Callable[[float], None] = lambda _: None,
 ) -> Gathered:
     """Gather the fields of these names that the run has; keep the values of the steps shown."""
     fields = [entry for name in names for entry in seen.fields if entry.name == name]
@@ -61,7 +64,7 @@ def _scale(entry: Field, row: dict[str, Any]) -> Scale:
     return Scale(entry, *even_limits(row["range"], entry.centre))
 
 
-def _weights(seen: Evaluated) -> dict[str, Floats]:
+def _weights(seen: EvaluatedResults) -> dict[str, Floats]:
     """Area in the reference of each triangle, and of each point a third of its triangles'."""
     mesh = seen.results.mesh
     areas = mesh.areas

@@ -18,9 +18,9 @@ from ringdic.report.document import Document, figure
 from ringdic.report.gathered import Gathered, gather
 from ringdic.report.hardware import camera_facts
 from ringdic.report.noise import STATED, noise, noise_rows
-from ringdic.results.evaluation import Evaluated, evaluated
+from ringdic.results.evaluation import EvaluatedResults, evaluated
 from ringdic.results.results import Results
-from ringdic.session.folder import Session, newest_results, read_session
+from ringdic.session.folder import Session, newest_results, open_session
 
 #: Fields that get maps, where the run has them.
 _MAPS = (
@@ -51,7 +51,7 @@ def write_report(
     out = results_path.parent / "report.html" if out is None else Path(out)
     if out.is_dir() or not out.parent.is_dir():
         raise InputError(f"{out}: not a file in a folder that is there; give the name of an HTML file")
-    session, seen = read_session(session_path), evaluated(results_path)
+    session, seen = open_session(session_path), evaluated(results_path)
     results = seen.results
     document = Document(
         f"{session.name}: report of run {results_path.parent.name}",
@@ -105,7 +105,9 @@ def _describe(document: Document, session: Session, results: Results, gathered: 
     tables.steps(document, session, results)
 
 
-def _pictures(document: Document, seen: Evaluated, gathered: Gathered, progress: Callable[[float], None]) -> None:
+def _pictures(
+    document: Document, seen: EvaluatedResults, gathered: Gathered, progress: Callable[[float], None]
+) -> None:
     document.section("courses", "Courses and statistics")
     document.picture(
         "courses-plot",
@@ -163,7 +165,7 @@ def shown_steps(count: int) -> list[int]:
     return sorted({int(k) for k in np.rint(np.linspace(1, count - 1, min(_STEPS_SHOWN, count - 1)))})
 
 
-def _views(seen: Evaluated, steps: Sequence[int]) -> list[plots.StepViews]:
+def _views(seen: EvaluatedResults, steps: Sequence[int]) -> list[plots.StepViews]:
     """The views of the steps shown; the map lies over the reference, so that a place stays where it is."""
     reference = unrolled(seen.results.mesh)
     front = mean_azimuth(seen.results.mesh)
@@ -180,7 +182,7 @@ def _views(seen: Evaluated, steps: Sequence[int]) -> list[plots.StepViews]:
     return [plots.StepViews(each.step, each.name, each.unrolled, each.sides[:fewest]) for each in made]
 
 
-def _how_to_read(seen: Evaluated, steps: Sequence[int]) -> str:
+def _how_to_read(seen: EvaluatedResults, steps: Sequence[int]) -> str:
     which = "all steps" if len(steps) >= len(seen.steps) - 1 else f"{len(steps)} of the {len(seen.steps) - 1} steps"
     return (
         f"Shown are {which}: left the surface unrolled over azimuth and height of the reference, so that a place of "

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ringdic.correlation.status import Status
-from ringdic.geometry.outliers import Lost
+from ringdic.geometry.outliers import LostPoint
 from ringdic.measure.window_study import gauge
 from ringdic.report.document import UNKNOWN, Document, figure
 from ringdic.report.hardware import CameraFacts
@@ -25,9 +25,9 @@ _REASONS: dict[int, str] = {
     Status.INCONSISTENT: "it contradicts its neighbours",
     Status.OUTSIDE: "it left the image",
     Status.NO_TEXTURE: "too little pattern, or too few pixels inside the mask",
-    Lost.RESIDUAL: "its cameras contradict one another, or too few see it",
-    Lost.UNCERTAIN: "its match is too uncertain",
-    Lost.SURFACE: "it stands out of the surface",
+    LostPoint.RESIDUAL: "its cameras contradict one another, or too few see it",
+    LostPoint.UNCERTAIN: "its match is too uncertain",
+    LostPoint.SURFACE: "it stands out of the surface",
 }
 
 

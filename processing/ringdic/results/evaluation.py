@@ -54,7 +54,7 @@ class Evaluation:
         return cls(reference == "previous", rigid_motion_removed, window, exponent)
 
 
-class Evaluated:
+class EvaluatedResults:
     """Results under an evaluation. Steps are computed when they are asked for, one at a time."""
 
     def __init__(self, results: Results, evaluation: Evaluation = Evaluation()) -> None:
@@ -132,6 +132,6 @@ class Evaluated:
         return even_limits(ranges.table()[0]["range"], entry.centre)
 
 
-def evaluated(results_path: Path, evaluation: Evaluation = Evaluation()) -> Evaluated:
+def evaluated(results_path: Path, evaluation: Evaluation = Evaluation()) -> EvaluatedResults:
     """The results of a file under an evaluation, without the 2D matches."""
-    return Evaluated(read_results(results_path, matches=False), evaluation)
+    return EvaluatedResults(read_results(results_path, matches=False), evaluation)

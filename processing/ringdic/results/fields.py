@@ -215,7 +215,7 @@ class StepFields:
 
 
 @dataclass(frozen=True)
-class Certainty:
+class StepQuality:
     """What is known of each point and triangle beside its place, at one step; None where it is not known.
 
     correlation : (N,) C_LS. sigma_xyz, sigma_displacement : (N, 3) mm and sigma_lambda : (M, 2), by the noise of the
@@ -282,7 +282,7 @@ def compute_fields(
     current: Floats,
     faces: Indices,
     to_reference: RigidMotion,
-    certainty: Certainty,
+    certainty: StepQuality,
     pair: Indices,
     window: StrainWindow | None = None,
     scatter: WindowScatter | None = None,

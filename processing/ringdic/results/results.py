@@ -33,7 +33,7 @@ from ringdic.errors import InputError
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.mesh.mesh import Mesh
 from ringdic.results import vtkhdf
-from ringdic.results.fields import Certainty, Field, StepFields, available, compute_fields
+from ringdic.results.fields import Field, StepFields, StepQuality, available, compute_fields
 from ringdic.results.fields import field as field_of
 from ringdic.strain.deformation import Deformation, deformation
 from ringdic.strain.rigid_motion import RigidMotion, motion_to_reference
@@ -210,10 +210,10 @@ class Results:
             self.before(step, previous), current, self.faces, motion, certainty, self.pair, window, scatter
         )
 
-    def certainty(self, step: int, previous: bool = False) -> Certainty:
+    def certainty(self, step: int, previous: bool = False) -> StepQuality:
         """What is known of each point and triangle beside its place; previous as of :meth:`deformation`."""
         of_motion = None if previous else step  # what cameras add is known of the motion since the reference
-        return Certainty(
+        return StepQuality(
             self.correlation[step],
             self.sigma_xyz[step],
             self._since(self.sigma_displacement, step, previous),

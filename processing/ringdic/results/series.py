@@ -59,26 +59,26 @@ class InMemory:
     def noise(self) -> list[Floats]:
         """See `Series`."""
         return [
-            np.array([usual(*step) for step in zip(matches.sigma, matches.status, strict=True)])
+            np.array([median_deviations(*step) for step in zip(matches.sigma, matches.status, strict=True)])
             for matches in self.results.matches
         ]
 
     def at(self, step: int) -> Results:
         """See `Series`."""
-        return part(self.results, [0, step] if step else [0])
+        return select_steps(self.results, [0, step] if step else [0])
 
     def without_matches(self) -> InMemory:
         """See `Series`."""
         return InMemory(replace(self.results, matches=()))
 
 
-def usual(sigma: NDArray[Any], status: NDArray[np.int8]) -> Floats:
+def median_deviations(sigma: NDArray[Any], status: NDArray[np.int8]) -> Floats:
     """The medians (C,) of the standard deviations (C, n, 2) px of good matches (n,); NaN where there are none."""
     good = [each[np.isfinite(each)] for each in sigma[:, status == 0]]
     return np.array([np.median(each) if len(each) else np.nan for each in good], dtype=float)
 
 
-def part(results: Results, steps: Sequence[int]) -> Results:
+def select_steps(results: Results, steps: Sequence[int]) -> Results:
     """The same results with some of their steps only, in the order given; the reference, 0, must be the first."""
     index = list(steps)
     if not index or index[0] != 0:
@@ -86,7 +86,7 @@ def part(results: Results, steps: Sequence[int]) -> Results:
     return _with_steps(results, [(results, index)])
 
 
-def joined(parts: Sequence[Results]) -> Results:
+def join_steps(parts: Sequence[Results]) -> Results:
     """The results of the steps of all parts, each with the reference and a step of its own, the first perhaps alone."""
     first, *others = parts
     return _with_steps(first, [(first, range(len(first.steps))), *((other, [1]) for other in others)])
@@ -121,7 +121,7 @@ def _with_steps(like: Results, chosen: Sequence[tuple[Results, Sequence[int]]]) 
     )
 
 
-class Shelf:
+class StepCache:
     """Values laid aside in a file that nobody else sees and that goes with the process. Safe to be used from threads.
 
     folder : where the file lies.

@@ -26,7 +26,7 @@ from ringdic.calibration.bundle import BundleFit
 from ringdic.calibration.parameters import PER_CAMERA
 from ringdic.geometry.camera import Camera
 from ringdic.results.results import Matches, Results
-from ringdic.results.series import InMemory, joined
+from ringdic.results.series import InMemory, join_steps
 from ringdic.strain.deformation import Deformation
 from ringdic.uncertainty.calibration import (
     CameraCovariance,
@@ -52,19 +52,19 @@ def camera_covariance(fit: BundleFit | None) -> CameraCovariance | None:
     return CameraCovariance(fit.cameras, fit.covariance[:size, :size])
 
 
-def with_uncertainty(results: Results, known: CameraCovariance | None) -> Results:
+def add_uncertainty(results: Results, known: CameraCovariance | None) -> Results:
     """The same results with every standard deviation that can be stated of them.
 
     known : of the cameras; None where nothing is: then nothing is stated of what the calibration adds.
     """
     series = InMemory(results)
-    stated = Stated(series.reference, known, series.noise)
+    stated = StepUncertainty(series.reference, known, series.noise)
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         parts = pool.map(lambda k: stated.of(series.at(k), k), range(len(results.steps)))
-        return joined(list(parts))
+        return join_steps(list(parts))
 
 
-class Stated:
+class StepUncertainty:
     """What can be stated of the uncertainty of a run's results, a step at a time.
 
     reference : the results of the reference alone. known : of the cameras, None where nothing is. noise : of `Series`.

@@ -17,7 +17,7 @@ from ringdic.arrays import Floats, Indices
 _CELL_GROUPS = ("Vertices", "Lines", "Polygons", "Strips")
 
 
-def create(file: h5py.File, faces: Indices, points: int, steps: int) -> h5py.Group:
+def create_group(file: h5py.File, faces: Indices, points: int, steps: int) -> h5py.Group:
     """A new group for ``steps`` steps of constant triangles (M, 3); :func:`write_step` fills its arrays."""
     group = file.create_group("VTKHDF", track_order=True)
     group.attrs["Version"] = np.array([2, 0], dtype=np.int64)

@@ -58,7 +58,7 @@ def write_series(
     """The same of results that are not all in memory. calibration, summary : JSON values."""
     with ResultsWriter(path, series.reference, series.names) as file:
 
-        def made(step: int) -> Written:
+        def made(step: int) -> StepRecord:
             only = series.at(step)
             last = len(only.steps) - 1
             return file.made(only, only.motion(last), only.deformation(last))
@@ -82,7 +82,7 @@ def in_turn(made: Callable[[int], T], steps: Sequence[int]) -> Iterator[T]:
 
 
 @dataclass(frozen=True)
-class Written:
+class StepRecord:
     """What the file keeps of one step.
 
     positions : (N, 3) mm, finite. point, face : arrays of the points and of the triangles. extent : of the fields.
@@ -112,7 +112,7 @@ class ResultsWriter:
         self._ranges = Ranges(available(first.names))
         self._motions: list[RigidMotion] = []
         self._file = h5py.File(path, "x")
-        self._group = vtkhdf.create(self._file, reference.faces, len(reference.vertices_ref), len(self._names))
+        self._group = vtkhdf.create_group(self._file, reference.faces, len(reference.vertices_ref), len(self._names))
         for name in _CONSTANT:
             vtkhdf.write_constant(self._group, "CellData", name, first.face[name].astype(np.float32))
         self._own = self._file.create_group("ringdic")
@@ -128,7 +128,7 @@ class ResultsWriter:
     ) -> None:
         self._file.close()
 
-    def made(self, results: Results, motion: RigidMotion, found: Deformation) -> Written:
+    def made(self, results: Results, motion: RigidMotion, found: Deformation) -> StepRecord:
         """What is written of the last step of some results; of several steps at once, from several threads.
 
         motion, found : its rigid motion back onto the reference and its deformation.
@@ -140,9 +140,9 @@ class ResultsWriter:
         flags = {"measured": measured.astype(np.uint8), "status": results.status[last].astype(np.int8)}
         matches = tuple({name: getattr(each, name)[last] for name in _OF_MATCHES} for each in results.matches)
         extent = self._ranges.extent(fields)
-        return Written(positions, {**_kept(fields.point), **flags}, _kept(fields.face), extent, motion, matches)
+        return StepRecord(positions, {**_kept(fields.point), **flags}, _kept(fields.face), extent, motion, matches)
 
-    def write(self, step: int, one: Written) -> None:
+    def write(self, step: int, one: StepRecord) -> None:
         """Write one step; they come in order."""
         vtkhdf.write_step(self._group, step, one.positions, one.point, one.face)
         for k, matches in enumerate(one.matches):

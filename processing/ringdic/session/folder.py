@@ -78,7 +78,7 @@ class Session:
         return runs(self.path)
 
 
-def read_session(path: Path) -> Session:
+def open_session(path: Path) -> Session:
     """The session of a folder; InputError says what is missing."""
     path = Path(path)
     _require_session(path)

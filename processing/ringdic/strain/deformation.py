@@ -157,7 +157,7 @@ def of_directors(D: Floats, d: Floats, area: Floats, isotropy: Floats) -> Deform
     places = d.shape[:-2]
     F, E = np.empty(d.shape), np.empty(d.shape)
     scalars, directions = np.empty((5, *places)), np.empty((4, *places, 3))
-    kernels.deformation(
+    kernels.fill_deformation(
         _matrices(D), _matrices(d), _matrices(F), _matrices(E), scalars.reshape(5, -1), directions.reshape(4, -1, 3)
     )
     lambda1, lambda2, J, E1, E2 = scalars
@@ -174,7 +174,7 @@ def directors(vertices: Floats, faces: NDArray[np.int_]) -> tuple[Floats, Floats
     """Directors (..., M, 3, 3), rows D1 D2 D3 (eq. 12), and areas (..., M) mm², of vertices (..., N, 3) mm."""
     vertices, faces = _steps(vertices), np.ascontiguousarray(faces)
     D, area = np.empty((*vertices.shape[:-2], len(faces), 3, 3)), np.empty((*vertices.shape[:-2], len(faces)))
-    kernels.directors(
+    kernels.fill_directors(
         vertices.reshape(-1, *vertices.shape[-2:]), faces, D.reshape(-1, len(faces), 3, 3), area.reshape(-1, len(faces))
     )
     return D, area
@@ -184,7 +184,7 @@ def isotropy(vertices: Floats, faces: NDArray[np.int_]) -> Floats:
     """Shape of triangles, (..., M), 1 equilateral … 0 degenerate: ``2 σ2/(σ2 + σ3)`` of ``X Xᵀ/3`` about centroids."""
     vertices, faces = _steps(vertices), np.ascontiguousarray(faces)
     out = np.empty((*vertices.shape[:-2], len(faces)))
-    kernels.isotropy(vertices.reshape(-1, *vertices.shape[-2:]), faces, out.reshape(-1, len(faces)))
+    kernels.fill_isotropy(vertices.reshape(-1, *vertices.shape[-2:]), faces, out.reshape(-1, len(faces)))
     return out
 
 

@@ -38,7 +38,7 @@ def _reciprocal(D, R):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def directors(vertices, faces, D, area):  # type: ignore[no-untyped-def]
+def fill_directors(vertices, faces, D, area):  # type: ignore[no-untyped-def]
     """vertices (S, N, 3), faces (M, 3); D (S, M, 3, 3) and area (S, M) are filled."""
     for s in range(len(vertices)):
         for m in range(len(faces)):
@@ -57,7 +57,7 @@ def directors(vertices, faces, D, area):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def isotropy(vertices, faces, out):  # type: ignore[no-untyped-def]
+def fill_isotropy(vertices, faces, out):  # type: ignore[no-untyped-def]
     """vertices (S, N, 3), faces (M, 3); out (S, M) is filled."""
     X, S = np.empty((3, 3)), np.empty((3, 3))
     for s in range(len(vertices)):
@@ -92,7 +92,7 @@ def _smaller_axis(half, E12, radius):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def deformation(D, d, F, E, scalars, directions):  # type: ignore[no-untyped-def]
+def fill_deformation(D, d, F, E, scalars, directions):  # type: ignore[no-untyped-def]
     """Eq. 13 to 16 and the principal values in the plane.
 
     D (M, 3, 3), d (S M, 3, 3): directors before and after. Filled: F, E (S M, 3, 3), scalars (5, S M) λ1 λ2 J E1 E2,
@@ -216,7 +216,7 @@ def stretch_variance(slopes, gain, sigma, alike, faces, variance):  # type: igno
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def stretch_slopes(D, F, directions, stretches, current, before):  # type: ignore[no-untyped-def]
+def fill_stretch_slopes(D, F, directions, stretches, current, before):  # type: ignore[no-untyped-def]
     """How λ1 and λ2 move with the corners, as :func:`ringdic.uncertainty.strain.stretch_slopes`.
 
     D, F (M, 3, 3), directions (2, M, 3) before, stretches (2, M); current, before (2, M, 3, 3) are filled, before not

@@ -21,19 +21,19 @@ from ringdic.geometry.camera import Camera
 
 
 @dataclass(frozen=True)
-class Lattice:
+class ImageLattice:
     """Positions on a regular lattice over an image. ``xy`` (rows, columns, 2) px, ``spacing`` px."""
 
     xy: Floats
     spacing: int
 
 
-def lattice(size: tuple[int, int], spacing: int, margin: int) -> Lattice:
+def image_lattice(size: tuple[int, int], spacing: int, margin: int) -> ImageLattice:
     """All multiples of ``spacing`` that keep ``margin`` px from the image's edge; size is (width, height)."""
     first = -(-margin // spacing) * spacing
     x = np.arange(first, size[0] - margin, spacing, dtype=float)
     y = np.arange(first, size[1] - margin, spacing, dtype=float)
-    return Lattice(np.stack(np.meshgrid(x, y), axis=-1), spacing)
+    return ImageLattice(np.stack(np.meshgrid(x, y), axis=-1), spacing)
 
 
 def coherent(radius: Floats, convincing: Mask, tolerance: float, least: int = 0) -> Mask:
@@ -121,7 +121,7 @@ def well_seen(xyz: Floats, cameras: tuple[Camera, Camera], limit_deg: float) -> 
         return np.logical_and.reduce([camera.incidence_cosine(xyz, normals) > limit for camera in cameras])
 
 
-def paint(points: Lattice, good: Mask, size: tuple[int, int]) -> Mask:
+def lattice_region(points: ImageLattice, good: Mask, size: tuple[int, int]) -> Mask:
     """The lattice's good positions as a filled region of the image. (height, width)."""
     width, height = size
     region = np.zeros((height, width), bool)

@@ -18,7 +18,7 @@ from ringdic.correlation import CorrelationSettings, Current, search_row
 from ringdic.correlation.start_field import lattice_spacing
 from ringdic.geometry.camera import Camera
 from ringdic.sweep.proxies import on_cylinder, stereo_hypotheses, sweep_radii
-from ringdic.sweep.region import Lattice, coherent, contrast, lattice
+from ringdic.sweep.region import ImageLattice, coherent, contrast, image_lattice
 
 # Beside the speckled surface there may be bare skin that matches, but poorly: less contrast than this share of the
 # usual is no speckle.
@@ -51,7 +51,7 @@ class Sweep:
     good : (rows, columns), convincing and at the depth of its neighbours.
     """
 
-    points: Lattice
+    points: ImageLattice
     px: Floats
     warps: Floats
     xyz: Floats
@@ -86,7 +86,7 @@ def sweep(
     of a connected piece of surface that is kept; 0 keeps the largest alone.
     """
     first, second = cameras
-    points = lattice(first.size, lattice_spacing(settings, SWEEP_RADII), settings.radius + 2)
+    points = image_lattice(first.size, lattice_spacing(settings, SWEEP_RADII), settings.radius + 2)
     shape = points.xy.shape[:2]
     px = points.xy.reshape(-1, 2)
     drawn = np.ones(len(px), bool) if mask is None else mask[px[:, 1].astype(int), px[:, 0].astype(int)]

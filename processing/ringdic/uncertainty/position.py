@@ -45,7 +45,7 @@ def covariance(gain: Floats, sigma: Floats) -> Floats:
 
     NaN where fewer than two cameras take part.
     """
-    found = kernels.covariance(np.ascontiguousarray(gain, dtype=float), np.ascontiguousarray(sigma, dtype=float))
+    found = kernels.fill_covariance(np.ascontiguousarray(gain, dtype=float), np.ascontiguousarray(sigma, dtype=float))
     return np.asarray(found)
 
 

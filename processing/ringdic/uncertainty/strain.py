@@ -86,7 +86,7 @@ def stretch_slopes(
     current = np.empty((2, len(faces), 3, 3))
     before = np.empty((2, 0 if current_only else len(faces), 3, 3))
     directions = np.stack([found.direction1_reference, found.direction2_reference])
-    kernels.stretch_slopes(D, found.F, directions, np.stack([found.lambda1, found.lambda2]), current, before)
+    kernels.fill_stretch_slopes(D, found.F, directions, np.stack([found.lambda1, found.lambda2]), current, before)
     return current, before
 
 

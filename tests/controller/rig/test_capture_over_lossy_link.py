@@ -111,7 +111,7 @@ class SimulatedNode:
 
     def tick(self, life: int) -> None:
         if life == self.born and self.agent is not None:
-            self.handle(node_.Tick())
+            self.handle(node_.AgentTick())
             self.world.after(100 * MS, lambda: self.tick(life))
 
     def ask(self, make: Callable[[int], node_.Event], reply: Callable) -> None:
@@ -191,7 +191,7 @@ class SimulatedController:
         self.nodes = {name: SimulatedNode(world, name, self) for name in cameras}
         self.records: dict[str, int] = {}
         self.archive: dict[tuple[str, str], bytes] = {}
-        self.outcomes: dict[str, dict[str, round_.Outcome]] = {}
+        self.outcomes: dict[str, dict[str, round_.CameraOutcome]] = {}
         self.refusals: dict[str, str] | None = None
         self.round: CaptureRound | None = None
         self.capture_id = ""
@@ -211,7 +211,7 @@ class SimulatedController:
 
     def beat(self) -> None:
         if self.round is not None and not self.round.over:
-            self.tell(round_.Tick())
+            self.tell(round_.RoundTick())
             self.world.after(20 * MS, self.beat)
 
     def tell(self, event: round_.Event) -> None:

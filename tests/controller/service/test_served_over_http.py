@@ -21,7 +21,7 @@ from ringdic_controller.archive.writer import Archive
 from ringdic_controller.service.app import create_app
 from ringdic_controller.service.config import ControllerConfig
 from ringdic_controller.service.desk import Desk
-from ringdic_controller.service.service import SHUTDOWN_LIMIT, open_desk, serve
+from ringdic_controller.service.service import SHUTDOWN_LIMIT, open_desk, serve_page
 
 RIG = '[rig]\nname = "ring-2"\n[[cameras]]\nid = "01"\n'
 
@@ -96,13 +96,13 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from ringdic_controller.service.config import ControllerConfig
-from ringdic_controller.service.service import open_desk, serve
+from ringdic_controller.service.service import open_desk, serve_page
 
 child = "import os, sys, time; open(sys.argv[1] + '/pid', 'w').write(str(os.getpid())); time.sleep(60)"
 config = ControllerConfig(archive=Path(sys.argv[1]), port=0)
 with open_desk(config, lambda session: [sys.executable, "-c", child, str(session)]) as desk:
     desk.jobs.submit("limb", Path(sys.argv[1]), reason="asked for")
-    serve(desk, config, lambda address: print(address, flush=True))
+    serve_page(desk, config, lambda address: print(address, flush=True))
 print("closed in order", flush=True)
 """
 
@@ -144,7 +144,7 @@ def test_a_port_that_is_taken_is_named(desk: Desk) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match=str(port)):
-            serve(desk, ControllerConfig(port=port))
+            serve_page(desk, ControllerConfig(port=port))
 
 
 @pytest.mark.parametrize("name", ["rig", "settings"])

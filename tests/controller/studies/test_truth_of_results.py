@@ -6,7 +6,7 @@ from ringdic.geometry.camera import Camera
 from ringdic.results.results import Results
 from ringdic_controller.studies.truth import TURN, SurfaceGrid, errors, face_middles
 from ringdic_node.virtual_rig.rig import paper_rig
-from ringdic_node.virtual_rig.scenes import Cylinder, Damage, Limb, Patch, Specimen
+from ringdic_node.virtual_rig.scenes import Cylinder, Damage, Limb, Specimen, SpoiltPatch
 
 RIG = paper_rig(12, 0.25)
 
@@ -101,7 +101,7 @@ def test_the_cells_of_a_cylinder_have_its_area_and_two_cameras_see_them() -> Non
 
 
 def test_worn_cells_are_seen_but_not_clean() -> None:
-    specimen = Specimen(Limb(), 0, 0, Damage(patches=(Patch(1.0, 100.0, 10.0, 15.0),)))
+    specimen = Specimen(Limb(), 0, 0, Damage(patches=(SpoiltPatch(1.0, 100.0, 10.0, 15.0),)))
     grid = SurfaceGrid.of(specimen)
     seen, clean = grid.views(RIG.cameras)
     worn = specimen.damage.worn(grid.theta, grid.z)

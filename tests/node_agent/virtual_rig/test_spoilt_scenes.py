@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from ringdic_node.virtual_rig.render import radiance
 from ringdic_node.virtual_rig.rig import paper_rig
-from ringdic_node.virtual_rig.scenes import Bar, Cylinder, Damage, Limb, Patch, Specimen, Target
+from ringdic_node.virtual_rig.scenes import Bar, Cylinder, Damage, Limb, Specimen, SpoiltPatch, TargetScene
 from ringdic_node.virtual_rig.sensor import POINT_SPREAD
 
 CAMERA = paper_rig(12, 0.25, seed=3).cameras[1]
@@ -53,7 +53,7 @@ def test_a_bar_behind_the_body_is_not_seen() -> None:
 
 def test_worn_speckles_are_missing_on_the_material_that_lost_them() -> None:
     azimuth = np.arctan2(CAMERA.centre[1], CAMERA.centre[0])
-    damage = Damage(patches=(Patch(azimuth - 0.2, 120.0, 12.0, 18.0),))
+    damage = Damage(patches=(SpoiltPatch(azimuth - 0.2, 120.0, 12.0, 18.0),))
     theta, z, _, _, px = seen(4, damage)
     worn, change = damage.worn(theta, z), changed(4, damage, px)
     assert worn.sum() * (220 / 200) * (2 * np.pi * 57 / 300) == pytest.approx(np.pi * 12 * 18, rel=0.05)  # mm²
@@ -63,13 +63,13 @@ def test_worn_speckles_are_missing_on_the_material_that_lost_them() -> None:
 
 
 def test_a_patch_round_the_seam_is_whole() -> None:
-    damage = Damage(patches=(Patch(0.0, 100.0, 10.0, 10.0),))
+    damage = Damage(patches=(SpoiltPatch(0.0, 100.0, 10.0, 10.0),))
     theta = np.array([0.1, 2 * np.pi - 0.1, -0.1, 0.25])
     np.testing.assert_array_equal(damage.worn(theta, np.full(4, 100.0)), [True, True, True, False])
 
 
 def test_printed_dots_are_off_their_places_by_what_is_told() -> None:
-    exact, printed = Target(), Target(print_error=0.15, seed=2)
+    exact, printed = TargetScene(), TargetScene(print_error=0.15, seed=2)
     error = printed.dots() - exact.dots()
     assert np.linalg.norm(error, axis=-1).std() > 0
     assert np.std(printed.prints()) == pytest.approx(0.15, rel=0.1)  # 1,200 numbers
@@ -95,7 +95,7 @@ def test_printed_dots_are_off_their_places_by_what_is_told() -> None:
 
 def test_a_print_error_beyond_reason_is_refused() -> None:
     with pytest.raises(ValueError, match=r"between 0 and 0\.2"):
-        Target(print_error=0.5)
+        TargetScene(print_error=0.5)
 
 
 def test_a_finely_sampled_body_looks_as_the_mean_of_its_parts() -> None:

@@ -5,13 +5,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from ringdic.correlation import CorrelationSettings, correlate, prepare_current, prepare_reference
+from ringdic.correlation import CorrelationSettings, correlate_points, prepare_current, prepare_reference
 from ringdic_node.virtual_rig.body import approach
-from ringdic_node.virtual_rig.lens import VirtualCamera, distort, ideal
+from ringdic_node.virtual_rig.lens import VirtualCamera, distort, ideal_of_pixel
 from ringdic_node.virtual_rig.render import radiance, render
 from ringdic_node.virtual_rig.rig import paper_rig, write_truth
-from ringdic_node.virtual_rig.scenes import Cylinder, Limb, Specimen, Target, scene
-from ringdic_node.virtual_rig.sensor import FULL_WELL, READ_NOISE, encode, expose
+from ringdic_node.virtual_rig.scenes import Cylinder, Limb, Specimen, TargetScene, scene
+from ringdic_node.virtual_rig.sensor import FULL_WELL, READ_NOISE, expose, quantise
 from ringdic_node.virtual_rig.texture import speckle
 from scipy.stats import norm
 
@@ -31,7 +31,7 @@ def test_no_lens_folds_the_image_over(camera: VirtualCamera) -> None:
     lens = camera.lens
     for u in (0.0, camera.width - 1.0):
         for v in (0.0, camera.height - 1.0):
-            x, y, xu, xv, yu, yv = ideal(u, v, lens, (u - lens[3]) / lens[0], (v - lens[4]) / lens[1])
+            x, y, xu, xv, yu, yv = ideal_of_pixel(u, v, lens, (u - lens[3]) / lens[0], (v - lens[4]) / lens[1])
             assert abs(x) < 1
             assert abs(y) < 1
             assert xu * yv - xv * yu > 0
@@ -41,7 +41,7 @@ def test_the_lens_inverts_itself_all_over_the_image() -> None:
     lens = CAMERA.lens
     for u in np.linspace(0, CAMERA.width, 7):
         for v in np.linspace(0, CAMERA.height, 7):
-            x, y, *_ = ideal(u, v, lens, (u - lens[3]) / lens[0], (v - lens[4]) / lens[1])
+            x, y, *_ = ideal_of_pixel(u, v, lens, (u - lens[3]) / lens[0], (v - lens[4]) / lens[1])
             a, b = distort(x, y, lens)
             assert lens[0] * a + lens[2] * b + lens[3] == pytest.approx(u, abs=1e-9)
             assert lens[1] * b + lens[4] == pytest.approx(v, abs=1e-9)
@@ -49,8 +49,8 @@ def test_the_lens_inverts_itself_all_over_the_image() -> None:
 
 def test_the_lens_derivatives_are_those_of_its_inverse() -> None:
     lens, h = CAMERA.lens, 1e-4
-    x, y, xu, xv, yu, yv = ideal(100.0, 700.0, lens, 0.0, 0.0)
-    right, below = ideal(100.0 + h, 700.0, lens, x, y), ideal(100.0, 700.0 + h, lens, x, y)
+    x, y, xu, xv, yu, yv = ideal_of_pixel(100.0, 700.0, lens, 0.0, 0.0)
+    right, below = ideal_of_pixel(100.0 + h, 700.0, lens, x, y), ideal_of_pixel(100.0, 700.0 + h, lens, x, y)
     np.testing.assert_allclose([xu, yu], [(right[0] - x) / h, (right[1] - y) / h], rtol=1e-4, atol=1e-9)
     np.testing.assert_allclose([xv, yv], [(below[0] - x) / h, (below[1] - y) / h], rtol=1e-4, atol=1e-9)
 
@@ -105,8 +105,8 @@ def test_a_point_off_the_surface_is_named_and_measured(surface: Cylinder | Limb)
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (5.0, 0.0, 0.0)])
 def test_the_dots_are_where_their_centres_project(offset: tuple[float, float, float]) -> None:
-    image = linear(render(CAMERA, Target(offset), 5))
-    centres = Target(offset).dots()
+    image = linear(render(CAMERA, TargetScene(offset), 5))
+    centres = TargetScene(offset).dots()
     outwards = (centres - offset) * [1, 1, 0] / 57.0
     towards = CAMERA.centre - centres
     frontal = np.sum(outwards * towards, axis=-1) / np.linalg.norm(towards, axis=-1) > np.cos(np.radians(35))
@@ -183,7 +183,7 @@ def test_a_subset_moves_as_its_material_does_to_a_thousandth_of_a_pixel() -> Non
     K = full.K - np.array([[0, 0, full.width / 2 - 150], [0, 0, full.height / 2 - 150], [0, 0, 0]])
     window = replace(full, K=K, width=300, height=300)
     cylinder = Cylinder(per_step=(0.0, 0.0, 0.05))
-    before, after = (255 * encode(radiance(window, Specimen(cylinder, step))) for step in (0, 1))
+    before, after = (255 * quantise(radiance(window, Specimen(cylinder, step))) for step in (0, 1))
     facing = np.arctan2(full.centre[1], full.centre[0])
     theta, z = np.meshgrid(facing + np.linspace(-0.3, 0.3, 60), np.linspace(60, 200, 150))
     xy, moved = (window.project(cylinder.position(theta.ravel(), z.ravel(), step)) for step in (0, 1))
@@ -192,7 +192,7 @@ def test_a_subset_moves_as_its_material_does_to_a_thousandth_of_a_pixel() -> Non
     start = np.zeros((inside.sum(), 6))
     start[:, :2] = (moved - xy)[inside]
     current = prepare_current(after, settings=settings)
-    found = correlate(prepare_reference(before, None, settings), current, xy[inside], settings, start=start)
+    found = correlate_points(prepare_reference(before, None, settings), current, xy[inside], settings, start=start)
     assert inside.sum() > 200
     error = found.uv - (moved - xy)[inside]
     assert np.abs(error.mean(axis=0)).max() < 0.0005

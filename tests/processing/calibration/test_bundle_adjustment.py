@@ -14,7 +14,7 @@ from ringdic.calibration import dlt
 from ringdic.calibration.bundle import BundleFit, TargetPrior, adjust_ring, centroid_shift
 from ringdic.calibration.camera_calibration import CameraCalibration
 from ringdic.calibration.intrinsics import IntrinsicsFit, calibrate_intrinsics
-from ringdic.calibration.patch import Sheet, Views, nodes, patch_jacobians, project_patches, sheet_points
+from ringdic.calibration.patch import PrintedSheet, Views, nodes, patch_jacobians, project_patches, sheet_points
 from ringdic.calibration.target import DotObservations, dot_points
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera, Intrinsics
@@ -87,12 +87,12 @@ def observed(
     rng: np.random.Generator,
     *,
     target: Target = TARGET,
-    sheet: Sheet | None = None,
+    sheet: PrintedSheet | None = None,
     print_errors: np.ndarray | None = None,
     points: int = 400,
 ) -> CameraCalibration:
     """The paper's calibration of a camera that sees the target as it truly is: the start of the adjustment."""
-    sheet = sheet or Sheet.nominal(target)
+    sheet = sheet or PrintedSheet.nominal(target)
     rows, columns = (axis.ravel() for axis in np.mgrid[1 : target.rows + 1, 1 : target.columns + 1])
     xyz = dot_points(target, rows, columns)
     seen = camera.incidence_cosine(xyz, xyz * [1 / 57, 1 / 57, 0]) > np.cos(np.deg2rad(55))
@@ -194,7 +194,7 @@ def test_the_centroid_of_a_patch_is_that_of_its_outline(true_cameras, shape) -> 
 def test_centroids_of_a_moved_target_are_known_too(true_cameras) -> None:
     camera, rows, columns = true_cameras["c03"], np.array([1, 8, 20]), np.array([4, 6, 8])
     R, t = turned(np.array([0.01, -0.02, 0.03])), np.array([5.0, 1.0, -2.0])
-    sz = sheet_points(TARGET, Sheet.nominal(TARGET), rows, columns)
+    sz = sheet_points(TARGET, PrintedSheet.nominal(TARGET), rows, columns)
     M = np.column_stack([R, t])
     moved = Camera("moved", camera.P @ np.vstack([M, [0, 0, 0, 1]]), SIZE, camera.intrinsics)
     centre = camera.project(dot_points(TARGET, rows, columns) @ R.T + t)
@@ -285,7 +285,7 @@ def test_print_errors_are_found_and_leave_the_diameter_alone(true_cameras, fits,
 
 
 def test_a_target_of_another_size_is_measured_where_that_is_allowed(half_ring, fits) -> None:
-    sheet = Sheet(57.02, 12.01, 0.001)
+    sheet = PrintedSheet(57.02, 12.01, 0.001)
     start = seen_by_all(half_ring, fits, 7, print_error=0.01, sheet=sheet)
     cameras, fit = adjust_ring(start, TARGET, TargetPrior(radius=0.1, pitch=0.05, tilt=0.01))
     error = np.array([fit.sheet.radius, fit.sheet.pitch, fit.sheet.tilt]) - [57.02, 12.01, 0.001]

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 from ringdic.calibration.bundle import adjust_ring, centroid_shift
+from ringdic.calibration.calibrated_rig import calibrate_rig, control_points
 from ringdic.calibration.camera_calibration import CameraCalibration, calibrate_camera
 from ringdic.calibration.dots import find_dots
-from ringdic.calibration.rig import calibrate_ring, control_points
 from ringdic.calibration.target import DotObservations, identify
 from ringdic.errors import InputError
 from ringdic.geometry.camera import Camera, Intrinsics
@@ -239,10 +239,10 @@ def session(folder, rig, tmp_path) -> Session:
 
 def test_a_session_is_calibrated_as_its_settings_say_and_once(session, rig, ways) -> None:
     told: list[tuple[float, str]] = []
-    plain = calibrate_ring(session, CalibrationGroup(), lambda done, who: told.append((done, who)))
+    plain = calibrate_rig(session, CalibrationGroup(), lambda done, who: told.append((done, who)))
     assert plain.bundle is None
     assert told[-1] == (1.0, "camera cam_02")
-    first = calibrate_ring(session, CalibrationGroup(method="bundle"), lambda done, who: told.append((done, who)))
+    first = calibrate_rig(session, CalibrationGroup(method="bundle"), lambda done, who: told.append((done, who)))
     assert told[-1] == (1.0, "all cameras together")
     assert first.bundle is not None
     assert first.bundle.cameras == ("cam_12", "cam_01", "cam_02")
@@ -250,7 +250,7 @@ def test_a_session_is_calibrated_as_its_settings_say_and_once(session, rig, ways
     assert sum(path.name.startswith("bundle-") for path in kept) == 1
     assert sum(path.name.startswith("survey-") for path in kept) == 1
     assert len(kept) == 5  # the start is shared by both methods
-    again = calibrate_ring(session, CalibrationGroup(method="bundle"))
+    again = calibrate_rig(session, CalibrationGroup(method="bundle"))
     assert {path: path.stat().st_mtime_ns for path in (session.path / "calibration").iterdir()} == kept
     assert again.bundle is not None
     assert again.bundle.to_dict() == first.bundle.to_dict()
@@ -258,14 +258,14 @@ def test_a_session_is_calibrated_as_its_settings_say_and_once(session, rig, ways
         assert again.cameras[id_].to_dict() == calibration.to_dict()
         assert np.array_equal(plain.cameras[id_].camera.P, ways.dlt[id_].camera.P)
         assert not np.array_equal(calibration.camera.P, plain.cameras[id_].camera.P)
-    loose = calibrate_ring(session, CalibrationGroup(method="bundle", print_error_mm=0.0, radius_error_mm=0.05))
+    loose = calibrate_rig(session, CalibrationGroup(method="bundle", print_error_mm=0.0, radius_error_mm=0.05))
     assert loose.bundle is not None
     assert loose.bundle.print_sigma == 0.0
     assert loose.bundle.sheet.radius == pytest.approx(57.0, abs=0.005)
 
 
 def test_a_session_s_lenses_have_the_terms_that_its_settings_allow(session) -> None:
-    ring = calibrate_ring(session, CalibrationGroup(radial_terms=2, skew=False, terms="criterion"))
+    ring = calibrate_rig(session, CalibrationGroup(radial_terms=2, skew=False, terms="criterion"))
     assert {row.lens_terms for row in ring.quality} <= {"2 radial terms, tangential", "2 radial terms"}
     assert all("information criterion" in row.lens_reason for row in ring.quality)
     assert all(each.camera.intrinsics.K[0, 1] == 0 for each in ring.cameras.values())
@@ -282,7 +282,7 @@ def test_a_session_whose_cameras_are_exchanged_is_refused(session, folder) -> No
     others = tuple(each for each in session.captures if each.kind != "target")
     wrong = replace(session, captures=(*others, replace(target, images=images)))
     with pytest.raises(InputError, match=r"cam_12 stands at azimuth 30°, where rig.toml has camera cam_02"):
-        calibrate_ring(wrong, CalibrationGroup())
+        calibrate_rig(wrong, CalibrationGroup())
 
 
 def test_a_session_whose_lenses_were_touched_is_told_so(session, folder) -> None:
@@ -296,7 +296,7 @@ def test_a_session_whose_lenses_were_touched_is_told_so(session, folder) -> None
         else capture
         for capture in session.captures
     ]
-    ring = calibrate_ring(replace(session, captures=tuple(boards)), CalibrationGroup(method="bundle"))
+    ring = calibrate_rig(replace(session, captures=tuple(boards)), CalibrationGroup(method="bundle"))
     assert len(ring.warnings) == 1
     assert "cam_01" in ring.warnings[0]
     assert "check that the board is flat" in ring.warnings[0]
@@ -305,4 +305,4 @@ def test_a_session_whose_lenses_were_touched_is_told_so(session, folder) -> None
 def test_a_session_without_a_target_is_refused(session) -> None:
     bare = replace(session, captures=session.of_kind("board"))
     with pytest.raises(InputError, match="no capture of the calibration target"):
-        calibrate_ring(bare, CalibrationGroup(method="bundle"))
+        calibrate_rig(bare, CalibrationGroup(method="bundle"))

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from ringdic.calibration.moving_cameras import SteadiedCameras
 from ringdic.calibration.parameters import LENS, Parameters
-from ringdic.calibration.refinement import loose_covariance, refine_poses
+from ringdic.calibration.pose_refinement import loose_covariance, refine_poses
+from ringdic.calibration.refined_cameras import RefinedCameras
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.geometry.triangulation import triangulate
@@ -121,7 +121,7 @@ def test_displacements_between_shaken_steps_are_those_of_the_body(figures) -> No
     seen = np.isfinite(before)
     step = xyz + np.array([1.0, 0.0, 0.0])
     rng, sigma = np.random.default_rng(12), np.where(seen, noise, np.nan)
-    steadied, off = SteadiedCameras(believed), {}
+    steadied, off = RefinedCameras(believed), {}
     for k, cameras in ((1, believed), (2, shaken(believed, jitter(12, 13)))):
         px = np.stack([camera.project(step) for camera in cameras]) + rng.normal(0, noise, before.shape)
         px[~seen] = np.nan

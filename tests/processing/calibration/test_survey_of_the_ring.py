@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from ringdic.calibration.dots import Dots, find_dots
-from ringdic.calibration.labels import printed, read_labels
+from ringdic.calibration.labels import has_labels, read_labels
 from ringdic.calibration.survey import Sight, sight, survey
 from ringdic.calibration.target import identify, possible_azimuths
 from ringdic.errors import InputError
@@ -130,5 +130,5 @@ def test_numbers_are_seen_where_they_are_printed(shared_data, rig) -> None:
     for camera, azimuth in (("201", 61.0), ("202", 92.0)):
         image = grey(shared_data / "multidic_rig" / "calibration" / f"{camera}.jpg")
         observed = identify(find_dots(image, real), real, azimuth)
-        assert printed(read_labels(image, observed, real))
-        assert not printed(read_labels(image, observed, real, below=True))
+        assert has_labels(read_labels(image, observed, real))
+        assert not has_labels(read_labels(image, observed, real, below=True))

@@ -6,7 +6,7 @@ import pytest
 from ringdic.correlation import (
     CorrelationSettings,
     Status,
-    correlate,
+    correlate_points,
     grid,
     prepare_current,
     prepare_reference,
@@ -48,7 +48,7 @@ def inner(margin=30):
 def match(reference, current, settings=SETTINGS, mask=None, **options):
     xy, _ = grid(inner() if mask is None else mask, settings.step)
     prepared = prepare_reference(reference, mask, settings), prepare_current(current, None, settings)
-    return correlate(*prepared, xy, settings, **options)
+    return correlate_points(*prepared, xy, settings, **options)
 
 
 def affine(x, y):
@@ -104,7 +104,7 @@ def test_points_between_pixels_are_matched_as_well():
     xy, _ = grid(inner(), 14)
     xy = xy + np.array([0.37, -0.61])
     prepared = prepare_reference(reference, None, SETTINGS), prepare_current(current, None, SETTINGS)
-    result = correlate(*prepared, xy, SETTINGS)
+    result = correlate_points(*prepared, xy, SETTINGS)
     assert result.good.all()
     assert np.abs(result.uv - np.stack(affine(*xy.T), axis=1)).max() < 5e-4
 
@@ -212,9 +212,9 @@ def test_bare_and_departed_points_say_so():
     start = np.zeros((3, 6))
     start[2, 0] = 80.0
     prepared = prepare_reference(reference, None, SETTINGS), prepare_current(current, None, SETTINGS)
-    result = correlate(*prepared, xy[:2], SETTINGS, start=start[:2])
+    result = correlate_points(*prepared, xy[:2], SETTINGS, start=start[:2])
     assert list(result.status) == [Status.NO_TEXTURE, Status.GOOD]
-    lone = correlate(*prepared, xy[2:], SETTINGS, start=start[2:])
+    lone = correlate_points(*prepared, xy[2:], SETTINGS, start=start[2:])
     assert list(lone.status) == [Status.OUTSIDE]
 
 

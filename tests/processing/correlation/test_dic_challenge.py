@@ -17,7 +17,7 @@ from ringdic.correlation import (
     Correlation,
     CorrelationSettings,
     Status,
-    correlate,
+    correlate_points,
     grid,
     prepare_current,
     prepare_reference,
@@ -61,7 +61,7 @@ def match(reference, current, settings, mask=None):
         mask = np.zeros(reference.shape, bool)
         mask[settings.radius : -settings.radius, settings.radius : -settings.radius] = True
     xy, _ = grid(mask, settings.step)
-    return correlate(
+    return correlate_points(
         prepare_reference(reference, None, settings), prepare_current(current, None, settings), xy, settings
     )
 
@@ -173,7 +173,7 @@ def test_static_object_drifts_as_another_code_sees_it(challenge):
         table = theirs[theirs["frame"] == frame]
         xy = np.stack([table["x_px"], table["y_px"]], axis=1)
         current = prepare_current(read_gray(folder / f"cam0_0{frame}.png"), None, settings)
-        result = correlate(reference, current, xy, settings)
+        result = correlate_points(reference, current, xy, settings)
         difference = result.uv - np.stack([table["u_px"], table["v_px"]], axis=1)
         print(
             f"static frame {frame}: median {np.median(difference, axis=0)}, largest {np.abs(difference).max():.5f} px"

@@ -9,10 +9,10 @@ from ringdic.correlation.lanes import (
     BITS,
     LANES,
     WINDOW,
+    absolute,
     chosen,
     floor,
     load,
-    magnitude,
     marked,
     picked,
     pointer,
@@ -84,7 +84,7 @@ def test_levels_are_those_of_the_spline_for_any_slope(degree):
 def _arithmetic(a, b, bits, out):
     x, y, at = load(pointer(a), _U(0)), load(pointer(b), _U(0)), pointer(out)
     store(at, _U(0), 2.0 * x - y * x + 1.0)
-    store(at, _U(LANES), select(x >= y, floor(x), magnitude(y)))
+    store(at, _U(LANES), select(x >= y, floor(x), absolute(y)))
     store(at, _U(2 * LANES), select(chosen(bits), x, 0.0))
     return total(x)
 

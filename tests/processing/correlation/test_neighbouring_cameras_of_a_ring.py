@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ringdic.correlation import CorrelationSettings, correlate, prepare_current, prepare_reference
+from ringdic.correlation import CorrelationSettings, correlate_points, prepare_current, prepare_reference
 from ringdic.geometry.camera import Intrinsics
 from ringdic.session.images import read_gray
 
@@ -47,7 +47,7 @@ def test_every_visible_point_is_matched(ring, cameras, steps, order, bias, rms):
     ]
     xy, to = (project(described[camera], x) for camera, x in zip(cameras, xyz, strict=True))
     settings = CorrelationSettings(radius=12, step=20, order=order)
-    result = correlate(prepare_reference(images[0]), prepare_current(images[1]), xy, settings)
+    result = correlate_points(prepare_reference(images[0]), prepare_current(images[1]), xy, settings)
     error = result.uv - (to - xy)
     print(f"{result.good.sum()} of {len(xy)}, bias {np.nanmean(error, axis=0)}, rms {np.nanstd(error, axis=0)} px")
     assert result.good.mean() > 0.99

@@ -1,7 +1,7 @@
 """Neighbours on a grid and among scattered points, and what they say about one another."""
 
 import numpy as np
-from ringdic.correlation.neighbours import inconsistent, local_fit, neighbours
+from ringdic.correlation.neighbours import inconsistent, local_fit, point_neighbours
 from scipy.spatial import cKDTree
 
 STEP = 10.0
@@ -21,14 +21,14 @@ def affine(xy: np.ndarray) -> np.ndarray:
 
 
 def judged(xy: np.ndarray, p: np.ndarray, good: np.ndarray) -> np.ndarray:
-    return inconsistent(xy, p, good, neighbours(xy, STEP), np.full(len(xy), np.nan), np.ones(len(xy), bool))
+    return inconsistent(xy, p, good, point_neighbours(xy, STEP), np.full(len(xy), np.nan), np.ones(len(xy), bool))
 
 
 def test_neighbours_are_all_points_within_reach_on_a_grid_and_off_it():
     grid = holed_grid()
     for xy in (grid, grid + np.random.default_rng(1).uniform(-1.0, 1.0, grid.shape), grid[::40]):
         expected = cKDTree(xy).query_ball_point(xy, 1.6 * STEP)
-        for k, row in enumerate(neighbours(xy, STEP)):
+        for k, row in enumerate(point_neighbours(xy, STEP)):
             assert set(row[row >= 0]) == set(expected[k]) - {k}
             assert (row >= 0).sum() == len(expected[k]) - 1
 
@@ -47,7 +47,7 @@ def test_a_point_that_contradicts_its_neighbours_and_a_small_island_are_found():
 
 def test_the_judgement_of_what_has_changed_is_that_of_everything():
     xy, random = holed_grid(), np.random.default_rng(2)
-    near, p, good = neighbours(xy, STEP), affine(xy), np.ones(len(xy), bool)
+    near, p, good = point_neighbours(xy, STEP), affine(xy), np.ones(len(xy), bool)
     jump, stale = np.full(len(xy), np.nan), np.ones(len(xy), bool)
     for _ in range(10):
         some = random.integers(0, len(xy), 12)
@@ -61,16 +61,16 @@ def test_the_judgement_of_what_has_changed_is_that_of_everything():
 
 def test_a_fit_continues_an_affine_field_and_a_row_of_points_along_itself():
     xy = holed_grid()
-    p, near = affine(xy), neighbours(xy, STEP)
+    p, near = affine(xy), point_neighbours(xy, STEP)
     good = np.abs(xy[:, 0] - 150.0) > 25.0
     wanted = np.flatnonzero(~good)
     p[wanted] = np.nan
     np.testing.assert_allclose(local_fit(xy, p, good, near, wanted), affine(xy[wanted]), atol=1e-6)
     row = STEP * np.stack([np.arange(20.0), np.zeros(20)], 1)
     good = np.arange(20) != 7
-    fit = local_fit(row, affine(row), good, neighbours(row, STEP), np.array([7]))
+    fit = local_fit(row, affine(row), good, point_neighbours(row, STEP), np.array([7]))
     np.testing.assert_allclose(fit[0, [0, 1, 6, 7]], affine(row[7:8])[0, [0, 1, 6, 7]], atol=1e-6)
     np.testing.assert_allclose(fit[0, [2, 8]], 0.0, atol=1e-9)
     assert np.isnan(
-        local_fit(row[:6], affine(row[:6]), np.arange(6) > 0, neighbours(row[:6], STEP), np.array([0]))
+        local_fit(row[:6], affine(row[:6]), np.arange(6) > 0, point_neighbours(row[:6], STEP), np.array([0]))
     ).all()

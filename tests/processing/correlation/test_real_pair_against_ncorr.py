@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ringdic.correlation import CorrelationSettings, correlate, grid, prepare_current, prepare_reference
+from ringdic.correlation import CorrelationSettings, correlate_points, grid, prepare_current, prepare_reference
 from ringdic.correlation.command import correlate_files
 from ringdic.session.images import read_gray, read_mask
 
@@ -49,7 +49,7 @@ def test_all_points_are_matched_and_agree_with_ncorr(rig, ncorr, reference, came
     truth = ncorr[f"points2d_{camera}"][frame - 1]
     xy = ncorr["points2d_201"][0]
     current = prepare_current(read_gray(rig / "speckle" / f"{camera}_{frame}.jpg"), None, SETTINGS)
-    result = correlate(reference, current, xy, SETTINGS)
+    result = correlate_points(reference, current, xy, SETTINGS)
     error = np.hypot(*(xy + result.uv - truth).T)
     p50, p95 = np.percentile(error, [50, 95])
     found = f"{camera}_{frame}: {result.good.sum()} of {len(xy)}"

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from ringdic.correlation import CorrelationSettings, correlate, grid, prepare_current, prepare_reference
+from ringdic.correlation import CorrelationSettings, correlate_points, grid, prepare_current, prepare_reference
 from ringdic.correlation.refinement import refine
 from ringdic.correlation.spline import PAD, coefficients, gradients
 
@@ -179,8 +179,8 @@ def test_a_reference_used_again_gives_the_same_matches_to_the_last_digit(speckle
     used = prepare_reference(np.rint(speckle), mask, settings)
     for image in images:
         current = prepare_current(image, None, settings)
-        again = correlate(used, current, xy, settings)
-        once = correlate(prepare_reference(np.rint(speckle), mask, settings), current, xy, settings)
+        again = correlate_points(used, current, xy, settings)
+        once = correlate_points(prepare_reference(np.rint(speckle), mask, settings), current, xy, settings)
         assert again.good.mean() > 0.95
         for name in ("uv", "gradient", "curvature", "zncc", "sigma", "status", "iterations"):
             np.testing.assert_array_equal(getattr(again, name), getattr(once, name))
@@ -224,7 +224,7 @@ def test_bias_and_scatter_of_shifts_stay_at_the_bound(radius, interpolation, fig
                 for s in (spectrum, spectrum * turn)
             ]
             start = np.tile([shift, 0.0, 0.0, 0.0, 0.0, 0.0], (len(xy), 1))
-            result = correlate(
+            result = correlate_points(
                 prepare_reference(images[0], mask, settings), prepare_current(images[1], None, settings), xy, settings,
                 start=start,
             )  # fmt: skip

@@ -1,7 +1,7 @@
 """Wrong points are found among noisy good ones; good ones stay."""
 
 import numpy as np
-from ringdic.geometry.outliers import crossing_outliers, midpoint_residuals, neighbours, surface_outliers
+from ringdic.geometry.outliers import crossing_outliers, grid_neighbours, midpoint_residuals, surface_outliers
 
 STEP = 10
 
@@ -28,7 +28,7 @@ def test_planted_outliers_are_found_and_no_good_point_is_lost() -> None:
     apart = np.flatnonzero((xy % (4 * STEP) == 20).all(axis=1))
     planted = rng.choice(apart, 20, replace=False)
     xyz[planted] += rng.choice([-1.0, 1.0], (20, 3)) * rng.uniform(0.5, 2.0, (20, 3))
-    found = np.flatnonzero(surface_outliers(neighbours(xy, STEP), xyz))
+    found = np.flatnonzero(surface_outliers(grid_neighbours(xy, STEP), xyz))
     np.testing.assert_array_equal(found, np.sort(planted))
 
 
@@ -46,4 +46,4 @@ def test_a_jump_of_one_camera_as_a_whole_is_no_outlier() -> None:
 def test_lost_points_are_no_outliers() -> None:
     xy, xyz = cylinder_grid()
     xyz[50] = np.nan
-    assert not surface_outliers(neighbours(xy, STEP), xyz)[50]
+    assert not surface_outliers(grid_neighbours(xy, STEP), xyz)[50]

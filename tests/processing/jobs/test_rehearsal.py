@@ -5,7 +5,7 @@ from pathlib import Path
 
 from numba.core.dispatcher import Dispatcher
 from ringdic.jobs.pipeline import process_session
-from ringdic.jobs.warm_up import rehearse
+from ringdic.jobs.warm_up import run_small_plate
 from ringdic.settings import load_settings
 
 MODULES = (
@@ -26,7 +26,7 @@ def compiled() -> set[tuple[str, str]]:
 
 
 def test_a_job_needs_no_kernel_that_was_not_rehearsed(session: Path) -> None:
-    rehearse()
+    run_small_plate()
     before = compiled()
     assert any(name == "pairs.merging.stars.stars" for name, _ in before)
     process_session(session, load_settings(None, ["correlation.radius_px=12", "correlation.step_px=8"]))

@@ -11,13 +11,13 @@ from ringdic.geometry.camera import Camera
 from ringdic.measure.extensometer import extensometer
 from ringdic.measure.path import shortest_path
 from ringdic.measure.place import Place, nearest_place, place_of_face, place_of_vertex
-from ringdic.measure.region import Ball, Box, Everything, Listed, Patch, region_statistics, statistics
+from ringdic.measure.region import AngularPatch, Ball, Box, Everything, Listed, region_statistics, statistics
 from ringdic.measure.section import Cut, crossings, section
 from ringdic.measure.series import time_series
 from ringdic.measure.table import Table
 from ringdic.measure.window_study import gauge, window_study
 from ringdic.mesh.mesh import Mesh
-from ringdic.results.evaluation import Evaluated, Evaluation
+from ringdic.results.evaluation import EvaluatedResults, Evaluation
 from ringdic.results.results import Results
 from ringdic.strain.window import strain_window
 
@@ -51,8 +51,8 @@ def drawn_tube(lost: bool = False) -> Results:
 
 
 @pytest.fixture(scope="module")
-def seen() -> Evaluated:
-    return Evaluated(drawn_tube())
+def seen() -> EvaluatedResults:
+    return EvaluatedResults(drawn_tube())
 
 
 def on_tube(theta: float, z: float) -> tuple[float, float, float]:
@@ -96,7 +96,7 @@ def test_vertices_and_faces_are_places_too_and_wrong_ones_are_refused() -> None:
 # Time series ------------------------------------------------------------------------------------
 
 
-def test_a_place_is_followed_with_its_fields(seen: Evaluated) -> None:
+def test_a_place_is_followed_with_its_fields(seen: EvaluatedResults) -> None:
     mesh = seen.results.mesh
     places = [nearest_place(mesh, on_tube(0.4, 33.0)), place_of_vertex(mesh, 10)]
     table = time_series(seen, places, ["displacement_z", "lambda2", "E2"])
@@ -117,7 +117,7 @@ def test_a_place_is_followed_with_its_fields(seen: Evaluated) -> None:
 
 
 def test_a_lost_place_is_lost_for_its_step_alone() -> None:
-    seen = Evaluated(drawn_tube(lost=True))
+    seen = EvaluatedResults(drawn_tube(lost=True))
     table = time_series(seen, [place_of_vertex(seen.results.mesh, LOST)], ["displacement"])
     assert np.isfinite(table["displacement"][1])
     assert np.isnan(table["displacement"][2])
@@ -166,7 +166,7 @@ def test_a_way_across_a_plane_is_straight_and_round_a_hole_is_taut() -> None:
         shortest_path(apart, nearest_place(apart, (2.0, 9.0, 0.0)), nearest_place(apart, (18.0, 9.0, 0.0)))
 
 
-def test_an_extensometer_follows_its_material(seen: Evaluated) -> None:
+def test_an_extensometer_follows_its_material(seen: EvaluatedResults) -> None:
     mesh = seen.results.mesh
     along = extensometer(seen, nearest_place(mesh, on_tube(0.5, 10)), nearest_place(mesh, on_tube(0.5, 60)))
     np.testing.assert_allclose(along["along_surface"], 50.0 * np.array(STRETCH), rtol=1e-9)
@@ -176,13 +176,13 @@ def test_an_extensometer_follows_its_material(seen: Evaluated) -> None:
     np.testing.assert_allclose(across["strain_along_surface"], 0.0, atol=1e-6)
     np.testing.assert_allclose(across["straight"], 2 * RADIUS * np.sin(1.0), rtol=1e-3)
     assert across["along_surface"][0] == pytest.approx(2.0 * RADIUS, rel=1e-3)
-    previous = Evaluated(seen.results, Evaluation(previous=True))
+    previous = EvaluatedResults(seen.results, Evaluation(previous=True))
     step = extensometer(previous, nearest_place(mesh, on_tube(0.5, 10)), nearest_place(mesh, on_tube(0.5, 60)))
     np.testing.assert_allclose(step["strain_straight"], [0.0, 0.1, 0.1], atol=1e-9)
 
 
 def test_an_extensometer_over_lost_material_says_so_by_nan_and_keeps_its_chord() -> None:
-    seen = Evaluated(drawn_tube(lost=True))
+    seen = EvaluatedResults(drawn_tube(lost=True))
     mesh = seen.results.mesh
     x, y, z = mesh.vertices[LOST]
     found = extensometer(seen, nearest_place(mesh, (x, y, z - 11)), nearest_place(mesh, (x, y, z + 11.0)))
@@ -193,7 +193,7 @@ def test_an_extensometer_over_lost_material_says_so_by_nan_and_keeps_its_chord()
 # Sections ---------------------------------------------------------------------------------------
 
 
-def test_a_section_across_the_tube_is_one_closed_line(seen: Evaluated) -> None:
+def test_a_section_across_the_tube_is_one_closed_line(seen: EvaluatedResults) -> None:
     found = crossings(seen.results.mesh, Cut.at_height(33.3))
     assert len(found.faces) == 2 * AROUND
     assert set(found.line) == {0}
@@ -207,7 +207,7 @@ def test_a_section_across_the_tube_is_one_closed_line(seen: Evaluated) -> None:
     assert neighbours.max() < circumference / AROUND  # no jump: each follows its neighbour
 
 
-def test_a_section_carries_material_fields(seen: Evaluated) -> None:
+def test_a_section_carries_material_fields(seen: EvaluatedResults) -> None:
     table = section(seen, Cut.at_azimuth(np.radians(31.0)), ["displacement_z", "lambda2"])
     step, s, z0 = (np.array(table[name]) for name in ("step", "s", "z_reference"))
     last = step == 2
@@ -242,15 +242,17 @@ def test_regions_hold_what_they_say() -> None:
     np.testing.assert_array_equal(Box((0, 0, 10), (60, 60, 20)).faces(mesh), (x >= 0) & (y >= 0) & (abs(z - 15) <= 5))
     distance = np.linalg.norm(mesh.centroids - [50, 0, 30], axis=1)
     np.testing.assert_array_equal(Ball((50, 0, 30), 12.0).faces(mesh), distance <= 12)
-    across = Patch((np.radians(170.0), np.radians(-170.0)), (10.0, 20.0)).faces(mesh)  # over the seam of the angle
+    across = AngularPatch((np.radians(170.0), np.radians(-170.0)), (10.0, 20.0)).faces(
+        mesh
+    )  # over the seam of the angle
     np.testing.assert_array_equal(across, (np.abs(angle) >= 170) & (abs(z - 15) <= 5))
-    assert Patch((0.0, 2 * np.pi), (0.0, 75.0)).faces(mesh).all()
+    assert AngularPatch((0.0, 2 * np.pi), (0.0, 75.0)).faces(mesh).all()
     assert np.flatnonzero(Listed((3, 5)).faces(mesh)).tolist() == [3, 5]
     for refused, words in (
         (lambda: Listed((9999999,)).faces(mesh), "no face 9999999"),
         (lambda: Box((0, 0, 20), (1, 1, 10)), "first corner of a box is the lower one"),
         (lambda: Ball((0, 0, 0), 0.0), "above 0 mm"),
-        (lambda: Patch((0.0, 1.0), (20.0, 10.0)), "lower one"),
+        (lambda: AngularPatch((0.0, 1.0), (20.0, 10.0)), "lower one"),
     ):
         with pytest.raises(InputError, match=words):
             refused()
@@ -270,7 +272,7 @@ def test_statistics_are_weighted_by_area() -> None:
 
 
 def test_the_mean_over_a_region_is_the_integral_over_its_area() -> None:
-    seen = Evaluated(drawn_tube(lost=True))
+    seen = EvaluatedResults(drawn_tube(lost=True))
     table = region_statistics(seen, Box((-60, -60, 0), (60, 60, 75.0)), ["displacement_z", "lambda2"])
     rows = {(row["field"], row["step"]): row for row in table.rows()}
     # u_z rises linearly with z, and every vertex stands for the area round it: the mean is that at half height.

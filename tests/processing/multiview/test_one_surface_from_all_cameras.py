@@ -10,7 +10,7 @@ from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.mesh.mesh import Mesh
 from ringdic.mesh.topology import holes, inconsistent_edges, is_closed_tube, non_manifold_vertices
 from ringdic.multiview.agreement import triangulate_agreeing
-from ringdic.multiview.lattice import Lattice, Pieces, fit_pieces
+from ringdic.multiview.lattice import Pieces, SurfaceLattice, fit_pieces
 from ringdic.multiview.motion import measure_motion
 from ringdic.multiview.shape import reference_shape
 from ringdic.multiview.surface import ring_surface
@@ -29,7 +29,7 @@ from ringdic_node.virtual_rig.rig import paper_rig
 from ringdic_node.virtual_rig.scenes.specimen import Limb, Specimen
 
 SCALE = 0.25
-LATTICE = Lattice(radius=57.0, columns=240, z=np.arange(10.0, 230.1, 1.5))
+LATTICE = SurfaceLattice(radius=57.0, columns=240, z=np.arange(10.0, 230.1, 1.5))
 
 
 def ring(cameras: int = 12, scale: float = 1.0) -> list[Camera]:

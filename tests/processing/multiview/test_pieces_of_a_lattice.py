@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from ringdic.multiview.lattice import TURN, Lattice, evaluate, fit_pieces, robust_pieces
+from ringdic.multiview.lattice import TURN, SurfaceLattice, evaluate, fit_pieces, robust_pieces
 
-LATTICE = Lattice(radius=50.0, columns=160, z=np.arange(0.0, 121.0, 2.0))
+LATTICE = SurfaceLattice(radius=50.0, columns=160, z=np.arange(0.0, 121.0, 2.0))
 ANGLE, HEIGHT = 1.0, 60.0
 
 
@@ -82,4 +82,4 @@ def test_nodes_that_lie_off_are_left_out_and_no_other() -> None:
 @pytest.mark.parametrize("bad", [{"radius": 0.0}, {"columns": 4}, {"z": np.array([1.0])}])
 def test_a_lattice_needs_a_size(bad: dict) -> None:
     with pytest.raises(ValueError, match="lattice"):
-        Lattice(**{"radius": 50.0, "columns": 100, "z": np.arange(10.0), **bad})
+        SurfaceLattice(**{"radius": 50.0, "columns": 100, "z": np.arange(10.0), **bad})

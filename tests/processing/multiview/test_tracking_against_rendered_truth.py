@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from ringdic.correlation import CorrelationSettings, Status
 from ringdic.geometry.camera import Camera, Intrinsics
-from ringdic.multiview.tracking import Track, Tracking, track
+from ringdic.multiview.tracking import CameraTrack, Tracking, track
 from ringdic.session.images import read_gray
 from ringdic_node.virtual_rig.render import render
 from ringdic_node.virtual_rig.rig import paper_rig
-from ringdic_node.virtual_rig.scenes.damage import Bar, Damage, Patch
+from ringdic_node.virtual_rig.scenes.damage import Bar, Damage, SpoiltPatch
 from ringdic_node.virtual_rig.scenes.specimen import Cylinder, Limb, Specimen
 
 ONE_PASS, SECOND, TWO_PASS = Tracking(two_pass=False), Tracking(two_pass=False, order=2), Tracking()
 
 
-def errors(result: Track, step: int, truth: np.ndarray, keep: np.ndarray) -> np.ndarray:
+def errors(result: CameraTrack, step: int, truth: np.ndarray, keep: np.ndarray) -> np.ndarray:
     """Measured minus true pixels of the points kept, (k, 2); all of them must have been found."""
     assert (result.status[step, keep] == Status.GOOD).all()
     return (result.px[step] - truth)[keep]
@@ -44,7 +44,7 @@ def limb(shared_data: Path):
 
 
 @pytest.fixture(scope="module")
-def followed(limb) -> dict[str, Track]:
+def followed(limb) -> dict[str, CameraTrack]:
     images, px, _ = limb
     settings = CorrelationSettings(radius=20, step=13)
     ways = {"first order": ONE_PASS, "second order": SECOND, "two passes": TWO_PASS}
@@ -128,7 +128,7 @@ def damage(step: int) -> Damage:
     if step == 0:
         return Damage()
     return Damage(
-        patches=(Patch(0.35, 90.0, 8.0, 10.0), Patch(-0.5, 170.0, 5.0, 5.0)),
+        patches=(SpoiltPatch(0.35, 90.0, 8.0, 10.0), SpoiltPatch(-0.5, 170.0, 5.0, 5.0)),
         lamps=((380.0, 60.0, 160.0 + 3.0 * step),),
         bars=(Bar((75.0, -40.0, 60.0 + 20.0 * step), (75.0, 10.0, 110.0 + 20.0 * step), 1.5),),
     )

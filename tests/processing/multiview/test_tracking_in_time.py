@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from ringdic.correlation import CorrelationSettings, Status
 from ringdic.errors import InputError
-from ringdic.multiview.tracking import Track, Tracking, TrackState, at_reference, track, track_block
+from ringdic.multiview.tracking import CameraTrack, Tracking, TrackState, at_reference, track, track_block
 
 SIZE = 260
 SETTINGS = CorrelationSettings(radius=12, step=10)
@@ -67,7 +67,7 @@ def rest(x, y):
     return np.zeros_like(x), np.zeros_like(y)
 
 
-def follow_all(images, x0, settings=SETTINGS, options=None, mask=None) -> Track:
+def follow_all(images, x0, settings=SETTINGS, options=None, mask=None) -> CameraTrack:
     return track(images[0], lambda k: images[k], len(images), x0, mask, settings, options or Tracking())
 
 
@@ -204,6 +204,6 @@ def test_blocks_of_steps_continue_as_one_series():
     first, state = block(range(1, 3))
     kept = TrackState(**{name: values.copy() for name, values in state.arrays().items()})  # as if from a file
     second, _ = block(range(3, 4), kept)
-    joined = Track.joined([at_reference(x0, images[0].shape), first, second])
+    joined = CameraTrack.joined([at_reference(x0, images[0].shape), first, second])
     for name, values in whole.arrays().items():
         np.testing.assert_array_equal(joined.arrays()[name], values, err_msg=name)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from ringdic.correlation import CorrelationSettings, Status, prepare_reference
 from ringdic.correlation.lattice_field import between_corners
-from ringdic.pairs.tracking import Followed, camera_grid, follow, places
+from ringdic.pairs.tracking import CameraMatches, camera_grid, match_camera, places
 
 STEP = 10
 RNG = np.random.default_rng(3)
@@ -49,7 +49,7 @@ def test_a_place_is_lost_with_the_points_about_it_and_says_why() -> None:
     values = field(xy)
     values[lost] = np.nan
     zeros = np.zeros((len(xy), 2), np.float32)
-    found = Followed(
+    found = CameraMatches(
         xy, STEP, values[:, :2], values[:, 2:6].reshape(-1, 2, 2).astype(np.float32), zeros, zeros[:, 0],
         np.where(lost, Status.NO_CONVERGENCE, Status.GOOD).astype(np.int8),
     )  # fmt: skip
@@ -105,7 +105,7 @@ def test_places_between_the_points_are_found_as_well_as_the_points(order: int) -
     own = STEP * np.stack([column, row], axis=1).astype(float)
     grid = camera_grid((260, 240), STEP, [(region, own)], [])
     np.testing.assert_array_equal(grid.xy, own)
-    found = follow(prepare_reference(reference, grid.region, settings), current, grid, settings)
+    found = match_camera(prepare_reference(reference, grid.region, settings), current, grid, settings)
     at = RNG.uniform(40, [220, 200], (500, 2))
     on, off = places(found, grid.xy), places(found, at)
     assert (off.status == 0).all()

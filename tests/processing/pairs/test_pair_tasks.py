@@ -8,13 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from ringdic.calibration.rig import calibrate_ring
+from ringdic.calibration.calibrated_rig import calibrate_rig
 from ringdic.correlation import CorrelationSettings, Status
 from ringdic.geometry.camera import Camera
 from ringdic.jobs.pipeline import process_session
-from ringdic.pairs.tasks import PairJob, in_order, pair_jobs
+from ringdic.pairs.tasks import PairJob, ordered_tasks, pair_jobs
 from ringdic.results.results import Results, read_results
-from ringdic.session.folder import read_session
+from ringdic.session.folder import open_session
 from ringdic.settings import Settings, load_settings
 from ringdic.sweep.sweep import Search
 from ringdic.tasks import LocalExecutor, Ran, Task, Told, kept
@@ -45,8 +45,8 @@ class Counted:
 
 def jobs(session: Path, settings: Settings = SETTINGS, steps: slice = slice(None), **changed: Camera) -> list[PairJob]:
     """The tasks of a session, with other cameras where they are given."""
-    read = read_session(session)
-    ring = calibrate_ring(read, settings.calibration)
+    read = open_session(session)
+    ring = calibrate_rig(read, settings.calibration)
     cameras = {id_: changed.get(id_, each.camera) for id_, each in ring.cameras.items()}
     search = Search(radius=57.0, reach=settings.surface.reach_mm, incidence=settings.surface.incidence_deg)
     correlation = CorrelationSettings(**settings.correlation.keywords)
@@ -54,7 +54,7 @@ def jobs(session: Path, settings: Settings = SETTINGS, steps: slice = slice(None
 
 
 def keys(session: Path, settings: Settings = SETTINGS, steps: slice = slice(None), **changed: Camera) -> list[str]:
-    return [task.key for task in in_order(jobs(session, settings, steps, **changed))]
+    return [task.key for task in ordered_tasks(jobs(session, settings, steps, **changed))]
 
 
 def same(first: Results, second: Results) -> None:
@@ -108,7 +108,7 @@ def test_what_the_reference_does_not_share_is_left_out(session: Path) -> None:
 
 
 def test_a_camera_without_an_image_at_a_step_loses_that_step_alone(session: Path) -> None:
-    last = read_session(session).of_kind("specimen")[-1]
+    last = open_session(session).of_kind("specimen")[-1]
     record = last.images["cam_02"].with_name("capture.json")
     told = json.loads(record.read_text(encoding="utf-8"))
     told["cameras"]["cam_02"].pop("file")
@@ -134,13 +134,13 @@ def test_one_more_capture_leaves_the_earlier_steps(session: Path) -> None:
 
 
 def _image(session: Path) -> None:
-    path = next(iter(sorted(read_session(session).of_kind("specimen")[1].images.values())))
+    path = next(iter(sorted(open_session(session).of_kind("specimen")[1].images.values())))
     path.write_bytes(path.read_bytes() + b" ")  # the record's size no longer agrees
 
 
 def _mask(session: Path) -> None:
     (session / "mask").mkdir()
-    first = read_session(session).rig.pairs[0][0]
+    first = open_session(session).rig.pairs[0][0]
     mask = np.full((round(3280 * SCALE), round(2464 * SCALE)), 255, np.uint8)
     assert cv2.imwrite(str(session / "mask" / f"{first}.png"), mask)
 

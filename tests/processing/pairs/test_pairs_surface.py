@@ -8,15 +8,15 @@ from ringdic.geometry.camera import Camera
 from ringdic.mesh.mesh import Mesh
 from ringdic.mesh.topology import Kind, borders, overlap_area
 from ringdic.pairs.reconstruction import PairShape, PairStep
-from ringdic.pairs.surfaces import FollowedPair, PairsSeries, pairs_surface
+from ringdic.pairs.surfaces import PairsSeries, PairSurface, pairs_surface
 from ringdic.results.results import Results
-from ringdic.results.series import joined
+from ringdic.results.series import join_steps
 from ringdic.settings import Settings, SurfaceGroup
 
 STEPS, PITCH, LOST = 3, 2.0, 7
 
 
-def sheet(pair: tuple[str, str], first: int, above: float, turned: float) -> FollowedPair:
+def sheet(pair: tuple[str, str], first: int, above: float, turned: float) -> PairSurface:
     """A plate of 30 x 20 points at x = first PITCH, moved by (0, 0, step) mm a step; every value tells its vertex."""
     i, j = (axis.ravel() for axis in np.meshgrid(np.arange(30), np.arange(20), indexing="ij"))
     n = len(i)
@@ -47,12 +47,12 @@ def sheet(pair: tuple[str, str], first: int, above: float, turned: float) -> Fol
         cameras, grid, np.arange(n), faces, places[0], np.zeros((0, 4, 2), int), vertices[0], matched.sigma, 1.0
     )
     worst = c_ls.max(axis=0)
-    return FollowedPair(shape, lambda k: (places[k], matched), worst, np.zeros(STEPS), np.zeros((STEPS, 2)))
+    return PairSurface(shape, lambda k: (places[k], matched), worst, np.zeros(STEPS), np.zeros((STEPS, 2)))
 
 
 def run(heuristic: str) -> tuple[Results, dict]:
     series, figures = series_of(heuristic)
-    return joined([series.at(k) for k in range(STEPS)]), figures
+    return join_steps([series.at(k) for k in range(STEPS)]), figures
 
 
 def series_of(heuristic: str) -> tuple[PairsSeries, dict]:

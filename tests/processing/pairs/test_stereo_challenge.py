@@ -12,7 +12,7 @@ import pytest
 from ringdic.calibration.board import find_corners
 from ringdic.calibration.intrinsics import calibrate_intrinsics
 from ringdic.correlation import CorrelationSettings
-from ringdic.correlation.correlate import correlate
+from ringdic.correlation.correlate import correlate_points
 from ringdic.correlation.prepared import prepare_current, prepare_reference
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.geometry.triangulation import reprojection_residuals, triangulate
@@ -113,7 +113,7 @@ def test_the_rendered_plate_is_flat_and_moves_as_told(challenge, figures) -> Non
             by = [(start_at(xy + e) - start_at(xy - e)) / 2 - e for e in np.eye(2)]
             start = np.column_stack([at - xy, *(np.stack(by, axis=2).reshape(-1, 4)).T])
             current = prepare_current(image, settings=settings)
-            result = correlate(reference, current, xy, settings, start=start)
+            result = correlate_points(reference, current, xy, settings, start=start)
             found.append(np.where((result.status == 0)[:, None], xy + result.uv, np.nan))
         return np.stack(found)
 

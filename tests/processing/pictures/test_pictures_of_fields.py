@@ -14,7 +14,7 @@ from ringdic.pictures.overlay import camera_of, overlay
 from ringdic.pictures.painter import paint
 from ringdic.pictures.scale import Scale, scale_of
 from ringdic.pictures.views import from_side, mean_azimuth, through_camera, unrolled
-from ringdic.results.evaluation import Evaluated
+from ringdic.results.evaluation import EvaluatedResults
 from ringdic.results.results import Results
 
 RADIUS, AROUND, ALONG = 50.0, 60, 21
@@ -96,7 +96,7 @@ def test_the_body_from_a_side_shows_its_near_half_and_the_inside_over_the_rim() 
 
 def test_an_overlay_colours_what_the_camera_sees_and_leaves_the_rest_of_the_photograph() -> None:
     lost = 10  # a vertex right before the camera
-    seen = Evaluated(drawn_tube(lost))
+    seen = EvaluatedResults(drawn_tube(lost))
     results, photograph = seen.results, np.full((240, 320), 102, dtype=np.uint8)
     scale = scale_of(seen, "lambda2", (0.7, 1.3))
     drawn = overlay(seen, "one", photograph, scale, 2, opacity=0.5)
@@ -116,7 +116,7 @@ def test_an_overlay_colours_what_the_camera_sees_and_leaves_the_rest_of_the_phot
 
 
 def test_what_cannot_be_laid_over_is_refused_by_name() -> None:
-    seen = Evaluated(drawn_tube())
+    seen = EvaluatedResults(drawn_tube())
     scale = scale_of(seen, "lambda2")
     with pytest.raises(InputError, match=r"200 x 100 px.*320 x 240"):
         overlay(seen, "one", np.zeros((100, 200), np.uint8), scale, 1)
@@ -129,7 +129,7 @@ def test_what_cannot_be_laid_over_is_refused_by_name() -> None:
 
 
 def test_an_animation_has_a_frame_a_step_in_the_colours_of_the_step(tmp_path: Path) -> None:
-    seen = Evaluated(drawn_tube())
+    seen = EvaluatedResults(drawn_tube())
     scale = scale_of(seen, "lambda2", (0.7, 1.3))
     frames = list(surface_frames(seen, scale, 0.0, side=240))
     assert len({frame.shape for frame in frames}) == 1

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from ringdic.results.noise_floor import noise_floor
 from ringdic.results.results import Matches, Results
-from ringdic.results.series import part
+from ringdic.results.series import select_steps
 
 SIGMA, SHIFT, SIDE = 0.002, np.array([0.03, -0.01, 0.02]), 60
 
@@ -32,7 +32,7 @@ def sheet_at_rest() -> Results:
 
 
 def test_the_noise_that_was_put_in_is_what_is_found() -> None:
-    floor = noise_floor(part(sheet_at_rest(), [0, 1]))
+    floor = noise_floor(select_steps(sheet_at_rest(), [0, 1]))
     found = floor["quantities"]
     count = SIDE * SIDE
     for axis in "xyz":

@@ -7,10 +7,10 @@ from threading import Thread
 import numpy as np
 import pytest
 from ringdic.pairs.reconstruction import PairShape, PairStep
-from ringdic.pairs.surfaces import follow
+from ringdic.pairs.surfaces import reconstruct_pair
 from ringdic.results.results import WHERE_KNOWN, Matches, Results
-from ringdic.results.series import InMemory, Shelf, joined, part
-from ringdic.results.uncertainty import Stated, with_uncertainty
+from ringdic.results.series import InMemory, StepCache, join_steps, select_steps
+from ringdic.results.uncertainty import StepUncertainty, add_uncertainty
 
 F, N = 4, 6
 
@@ -44,33 +44,33 @@ def same(first: Results, second: Results) -> None:
 
 def test_a_part_of_the_steps_keeps_everything_that_belongs_to_them() -> None:
     whole = some_results()
-    kept = part(whole, [0, 2])
+    kept = select_steps(whole, [0, 2])
     assert kept.steps == ("a", "c")
     for name in ("vertices", "correlation", "sigma_xyz", "status", "sigma_displacement", "sigma_lambda"):
         np.testing.assert_array_equal(getattr(kept, name), getattr(whole, name)[[0, 2]])
     np.testing.assert_array_equal(kept.matches[0].px, whole.matches[0].px[[0, 2]])
     assert kept.chi2 is None
     with pytest.raises(ValueError, match="step 0"):
-        part(whole, [1, 2])
+        select_steps(whole, [1, 2])
 
 
 def test_the_steps_of_results_one_by_one_are_the_results() -> None:
     whole = some_results()
     series = InMemory(whole)
-    same(joined([series.at(k) for k in range(F)]), whole)
-    same(part(joined([series.at(0), series.at(3)]), [0, 1]), part(whole, [0, 3]))
+    same(join_steps([series.at(k) for k in range(F)]), whole)
+    same(select_steps(join_steps([series.at(0), series.at(3)]), [0, 1]), select_steps(whole, [0, 3]))
     assert series.without_matches().at(1).matches == ()
 
 
 def test_what_is_known_of_the_uncertainty_is_left_as_it_is() -> None:
     whole = some_results()
-    same(with_uncertainty(whole, None), whole)
-    stated = Stated(InMemory(whole).reference, None, InMemory(whole).noise)
-    same(stated.of(InMemory(whole).at(2), 2), part(whole, [0, 2]))
+    same(add_uncertainty(whole, None), whole)
+    stated = StepUncertainty(InMemory(whole).reference, None, InMemory(whole).noise)
+    same(stated.of(InMemory(whole).at(2), 2), select_steps(whole, [0, 2]))
 
 
 def test_values_laid_aside_come_back_whichever_thread_asks(tmp_path: Path) -> None:
-    shelf, back = Shelf(tmp_path / "new"), {}
+    shelf, back = StepCache(tmp_path / "new"), {}
 
     def use(key: int) -> None:
         for step in range(20):
@@ -115,7 +115,7 @@ def test_a_point_is_as_good_as_its_worst_step_and_a_step_that_failed_says_nothin
     shape = FixedShape(
         (None, None), np.zeros((4, 2)), np.arange(4), np.zeros((0, 3), int), steps[0], None, None, None, 1.0
     )
-    pair = follow(shape, steps.__getitem__, 3, Shelf(tmp_path))
+    pair = reconstruct_pair(shape, steps.__getitem__, 3, StepCache(tmp_path))
     np.testing.assert_array_equal(pair.correlation, np.float32([0.3, 0.2, np.nan, 0.4]))
     np.testing.assert_array_equal(pair.at(1)[0].correlation, c_ls[1])
     np.testing.assert_allclose(pair.noise, 0.01, rtol=1e-6)

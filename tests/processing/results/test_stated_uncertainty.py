@@ -14,19 +14,19 @@ import numpy as np
 import pytest
 from ringdic.correlation import CorrelationSettings, prepare_reference
 from ringdic.geometry.camera import Camera, Intrinsics
-from ringdic.multiview.certainty import Certainty, certainty
 from ringdic.multiview.motion import Motion, measure_motion
 from ringdic.multiview.shape import ReferenceShape, reference_shape
 from ringdic.multiview.tracking import Tracking
+from ringdic.multiview.uncertainty import SurfaceUncertainty, surface_uncertainty
 from ringdic.pairs import tracking as in_time
 from ringdic.pairs.matching import Grid, StepMatches, Stereo, at_step, match_reference
 from ringdic.pairs.reconstruction import pair_shape
-from ringdic.pairs.surfaces import follow as follow_pair
 from ringdic.pairs.surfaces import pairs_surface
-from ringdic.pairs.tracking import CameraGrid, Places, camera_grid, follow
+from ringdic.pairs.surfaces import reconstruct_pair as follow_pair
+from ringdic.pairs.tracking import CameraGrid, CameraPixels, camera_grid, match_camera
 from ringdic.results.results import Results
-from ringdic.results.series import Shelf, joined
-from ringdic.results.uncertainty import with_uncertainty
+from ringdic.results.series import StepCache, join_steps
+from ringdic.results.uncertainty import add_uncertainty
 from ringdic.settings import Settings
 from ringdic.strain.deformation import deformation
 from ringdic.sweep.sweep import Search
@@ -102,7 +102,7 @@ class Run:
 
     shape: ReferenceShape
     motion: Motion
-    sure: Certainty
+    sure: SurfaceUncertainty
     pair: Results
 
 
@@ -144,16 +144,21 @@ def measure(cameras: list[Camera], image: Callable[[str, int], np.ndarray]) -> R
     search = Search(radius=55.0, reach=6.0, incidence=65.0)
     shape = reference_shape(cameras, lambda id_: image(id_, 0), {}, [(0, 1), (1, 2)], search, CORRELATION)
     motion = measure_motion(cameras, shape, image, STEPS, {}, CORRELATION, Tracking(), 0.05)
-    return Run(shape, motion, certainty(cameras, shape, motion, CORRELATION.radius, 1), by_pair(cameras, image, search))
+    return Run(
+        shape,
+        motion,
+        surface_uncertainty(cameras, shape, motion, CORRELATION.radius, 1),
+        by_pair(cameras, image, search),
+    )
 
 
 def by_pair(cameras: list[Camera], image: Callable[[str, int], np.ndarray], search: Search) -> Results:
     pair = (cameras[0], cameras[1])
     grid, steps = matched(Stereo(pair, search, CORRELATION), image)
     shape = pair_shape(pair, grid.xy, grid.faces, steps[0], CORRELATION.step, 0.05)
-    followed = follow_pair(shape, steps.__getitem__, STEPS, Shelf(Path(gettempdir())))
+    followed = follow_pair(shape, steps.__getitem__, STEPS, StepCache(Path(gettempdir())))
     series, _ = pairs_surface("patch", cameras, [followed], [str(step) for step in range(STEPS)], Settings())
-    return with_uncertainty(joined([series.at(k) for k in range(STEPS)]), None)
+    return add_uncertainty(join_steps([series.at(k) for k in range(STEPS)]), None)
 
 
 def matched(stereo: Stereo, image: Callable[[str, int], np.ndarray]) -> tuple[Grid, list[StepMatches]]:
@@ -162,9 +167,9 @@ def matched(stereo: Stereo, image: Callable[[str, int], np.ndarray]) -> tuple[Gr
     own = camera_grid(first.size, CORRELATION.step, [(grid.region, grid.xy[found.good])], [])
     other = camera_grid(second.size, CORRELATION.step, [], [(found.second, grid.faces)])
 
-    def seen(id_: str, points: CameraGrid, xy: np.ndarray, step: int) -> Places:
+    def seen(id_: str, points: CameraGrid, xy: np.ndarray, step: int) -> CameraPixels:
         reference = prepare_reference(image(id_, 0), points.region, CORRELATION)
-        return in_time.places(follow(reference, image(id_, step), points, CORRELATION), xy)
+        return in_time.places(match_camera(reference, image(id_, step), points, CORRELATION), xy)
 
     later = [
         at_step(found, (seen(first.id, own, grid.xy, k), seen(second.id, other, found.second, k)))

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from ringdic.errors import InputError
-from ringdic.session.folder import read_session
+from ringdic.session.folder import open_session
 from ringdic_controller.archive.importing import import_folder, natural_order
 from ringdic_controller.archive.writer import verify
 
@@ -44,7 +44,7 @@ def src(tmp_path, rig_toml):
 def test_every_image_becomes_a_byte_copy_in_its_capture(src, tmp_path):
     seen = []
     path = import_folder(src, tmp_path / "made", progress=lambda done, total, name: seen.append((done, total)))
-    session = read_session(path)
+    session = open_session(path)
     assert [c.kind for c in session.captures] == ["board"] * 3 + ["target"] + ["specimen"] * 11
     assert set(session.captures[2].images) == {"201"}, "camera 202 has only two views of the board"
     # Natural order: the eleventh step is step10, not the one after step1.
@@ -80,7 +80,7 @@ def spoil_camera_at_rest(src):
 
 def test_captures_at_rest_are_taken_along(src, tmp_path):
     at_rest(src)
-    session = read_session(import_folder(src, tmp_path / "made"))
+    session = open_session(import_folder(src, tmp_path / "made"))
     assert [c.kind for c in session.captures[-3:]] == ["specimen", "static", "static"]
     rest = session.of_kind("static")[1].images
     assert rest["202"].read_bytes() == (src / "static" / "202" / "rest1.png").read_bytes()

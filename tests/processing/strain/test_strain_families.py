@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from ringdic.results.fields import FIELDS, Certainty, compute_fields, field, seth_hill_fields
+from ringdic.results.fields import FIELDS, StepQuality, compute_fields, field, seth_hill_fields
 from ringdic.strain import families as strain
 from ringdic.strain.deformation import deformation
 from ringdic.strain.rigid_motion import motion_to_reference
@@ -93,7 +93,7 @@ def test_principal_linear_strains_are_those_of_its_tensor_after_the_rigid_motion
     # A small stretch and a large turn of the whole: the field shows the stretch alone.
     turn = Rotation.from_rotvec([0.4, -0.2, 0.9]).as_matrix()
     moved = reference * 1.001 @ turn.T + [3.0, 4.0, 5.0]
-    certainty = Certainty(np.zeros(3), np.zeros((3, 3)))
+    certainty = StepQuality(np.zeros(3), np.zeros((3, 3)))
     fields = compute_fields(
         reference, moved, faces, motion_to_reference(reference, moved), certainty, np.zeros(1, np.int64)
     )

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 from ringdic.geometry.camera import Camera
 from ringdic.sweep.proxies import on_cylinder, stereo_hypotheses, sweep_radii
-from ringdic.sweep.region import Lattice, coherent, contrast, lattice, lattice_normals, paint, well_seen
+from ringdic.sweep.region import (
+    ImageLattice,
+    coherent,
+    contrast,
+    image_lattice,
+    lattice_normals,
+    lattice_region,
+    well_seen,
+)
 
 
 def camera(azimuth_deg: float) -> Camera:
@@ -60,7 +68,7 @@ def test_the_sweep_is_centred_and_positive() -> None:
 
 
 def test_a_lattice_keeps_its_margin_and_its_multiples() -> None:
-    points = lattice((100, 80), 12, 15)
+    points = image_lattice((100, 80), 12, 15)
     assert points.xy[..., 0].min() >= 15
     assert points.xy[..., 0].max() < 85
     assert points.xy[..., 1].max() < 65
@@ -102,9 +110,9 @@ def test_what_is_seen_too_steeply_is_left_out() -> None:
 
 
 def test_the_painted_region_covers_the_good_positions_only() -> None:
-    points = lattice((200, 200), 20, 20)
+    points = image_lattice((200, 200), 20, 20)
     good = (points.xy[..., 0] >= 60) & (points.xy[..., 0] <= 120) & (points.xy[..., 1] >= 60)
-    mask = paint(Lattice(points.xy, 20), good, (200, 200))
+    mask = lattice_region(ImageLattice(points.xy, 20), good, (200, 200))
     assert mask[100, 60:121].all()
     assert not mask[:, :48].any()
     assert not mask[:48].any()

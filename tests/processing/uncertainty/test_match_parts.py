@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from ringdic.correlation import CorrelationSettings, correlate, prepare_current, prepare_reference
+from ringdic.correlation import CorrelationSettings, correlate_points, prepare_current, prepare_reference
 from ringdic.uncertainty.matches import MatchParts, match_parts
 from ringdic.uncertainty.texture import Texture, texture_map
 
@@ -32,8 +32,8 @@ def test_over_repeated_noise_matches_scatter_as_their_two_parts_say(squeeze: flo
     uv, stated = [], []
     for _ in range(trials):
         a, b = (image + rng.normal(0.0, s, image.shape) for image, s in zip((first, second), noise, strict=True))
-        found = correlate(prepare_reference(a, settings=settings), prepare_current(b, settings=settings), XY, settings,
-                          start=start, threads=1)  # fmt: skip
+        pair = prepare_reference(a, settings=settings), prepare_current(b, settings=settings)
+        found = correlate_points(*pair, XY, settings, start=start, threads=1)
         textures = texture_map(a, 20).at(XY), texture_map(b, 20).at(XY + found.uv)
         parts = match_parts(found.sigma, found.c_ls, textures, (noise[0] ** 2, noise[1] ** 2), found.gradient)
         G = np.eye(2) + found.gradient

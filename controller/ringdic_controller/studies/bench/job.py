@@ -26,7 +26,7 @@ from ringdic.errors import ComputationError, InputError
 from ringdic.session.images import read_gray
 from ringdic_node.virtual_rig.scenes import Specimen
 
-from ringdic_controller.studies.validate.darkroom import Darkroom, Shot
+from ringdic_controller.studies.validate.darkroom import Darkroom, RenderedShot
 from ringdic_controller.studies.validate.folders import make_session
 from ringdic_controller.studies.validate.scenery import Scenery
 
@@ -38,7 +38,7 @@ _MB = 1e6
 
 
 @dataclass(frozen=True)
-class _Again(Shot):
+class _Again(RenderedShot):
     """An image once more, with rounding noise of its own, so that it is another image and costs no rendering."""
 
     turn: int = 0
@@ -48,15 +48,15 @@ class _Again(Shot):
         return f"{super().key}-{self.turn}"
 
     @property
-    def first(self) -> Shot:
+    def first(self) -> RenderedShot:
         """The image as it was rendered."""
-        return Shot(self.camera, self.scene, self.seed, self.jpeg)
+        return RenderedShot(self.camera, self.scene, self.seed, self.jpeg)
 
 
 class _Delivered(Darkroom):
     """Images of the specimen as PGM files, the others as they were developed."""
 
-    def path(self, shot: Shot) -> Path:
+    def path(self, shot: RenderedShot) -> Path:
         """Where an image lies as it goes into the session."""
         developed = super().path(shot)
         return developed.with_suffix(".pgm") if isinstance(shot.scene, Specimen) else developed
@@ -125,7 +125,7 @@ def job_ratios(new: dict[str, Any], old: dict[str, Any]) -> list[dict[str, Any]]
     return rows
 
 
-def _shots(scenery: Scenery, delivered: Darkroom, count: int, say: Say) -> list[Mapping[str, Shot]]:
+def _shots(scenery: Scenery, delivered: Darkroom, count: int, say: Say) -> list[Mapping[str, RenderedShot]]:
     """The specimen's images of each step by camera, all there."""
     developed, rendered = Darkroom(delivered.folder), scenery.shots("limb")
     every = [shot for scene in ("boards", "target") for shots in scenery.shots(scene) for shot in shots.values()]
@@ -134,7 +134,7 @@ def _shots(scenery: Scenery, delivered: Darkroom, count: int, say: Say) -> list[
     if missing:
         say(f"rendering {missing} images into {developed.folder}")
     developed.develop(every)
-    steps: list[Mapping[str, Shot]] = list(rendered[:count])
+    steps: list[Mapping[str, RenderedShot]] = list(rendered[:count])
     for k in range(len(steps), count):
         turn, which = divmod(k - 1, _RENDERED)
         shots = rendered[1 + which].items()
@@ -145,7 +145,7 @@ def _shots(scenery: Scenery, delivered: Darkroom, count: int, say: Say) -> list[
     return steps
 
 
-def _deliver(shot: Shot, developed: Darkroom, path: Path) -> None:
+def _deliver(shot: RenderedShot, developed: Darkroom, path: Path) -> None:
     """Write an image as it goes into the session."""
     image = read_gray(developed.path(shot.first if isinstance(shot, _Again) else shot))
     if isinstance(shot, _Again):

@@ -24,7 +24,7 @@ from ringdic_controller.studies.bench.capture import processor_seconds
 from ringdic_controller.studies.demo.client import Client
 from ringdic_controller.studies.demo.rig import check_alive, running_controller, running_nodes
 from ringdic_controller.studies.demo.run import settings_for
-from ringdic_controller.studies.validate.darkroom import Darkroom, Shot
+from ringdic_controller.studies.validate.darkroom import Darkroom, RenderedShot
 from ringdic_controller.studies.validate.folders import make_session
 from ringdic_controller.studies.validate.scenery import Scenery
 
@@ -105,7 +105,7 @@ def live_ratios(new: dict[str, Any], old: dict[str, Any]) -> list[dict[str, Any]
     return [row]
 
 
-def _frames(folder: Path, steps: Sequence[Mapping[str, Shot]], darkroom: Darkroom) -> dict[str, str]:
+def _frames(folder: Path, steps: Sequence[Mapping[str, RenderedShot]], darkroom: Darkroom) -> dict[str, str]:
     """The images that every node plays back, and what its configuration says of them."""
     for number, shots in enumerate(steps):
         for id_, shot in shots.items():

@@ -15,7 +15,7 @@ from ringdic_controller.studies.truth import errors, face_middles
 
 
 @dataclass(frozen=True)
-class Figure:
+class TruthFigure:
     """One row: measured minus true. mean and rms (about zero), and the largest; in ``unit``; ``true`` for scale."""
 
     quantity: str
@@ -46,7 +46,7 @@ class Figure:
         return asdict(self)
 
 
-def compare_with_truth(results_file: Path, limb: Limb) -> list[Figure]:
+def compare_with_truth(results_file: Path, limb: Limb) -> list[TruthFigure]:
     """Every step of the results against the limb's formulas; step k of the results is step k of the limb."""
     results = read_results(results_file)
     found = errors(results, limb)
@@ -63,9 +63,9 @@ def compare_with_truth(results_file: Path, limb: Limb) -> list[Figure]:
     return figures
 
 
-def _figure(quantity: str, step: str, true: str, error: Floats, unit: str) -> Figure:
+def _figure(quantity: str, step: str, true: str, error: Floats, unit: str) -> TruthFigure:
     known = error[np.isfinite(error)]
-    return Figure(
+    return TruthFigure(
         quantity,
         step,
         true,

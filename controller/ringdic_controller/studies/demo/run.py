@@ -14,7 +14,7 @@ from ringdic.cli.console import narrated, say, show_table
 from ringdic.progress import Progress, Report
 from ringdic.session.folder import newest_results
 from ringdic.session.rig import parse_rig
-from ringdic_node.virtual_rig.render import warm_up
+from ringdic_node.virtual_rig.render import load_renderer
 from ringdic_node.virtual_rig.rig import VirtualRig, paper_rig, write_truth
 from ringdic_node.virtual_rig.scenes import Limb
 
@@ -37,7 +37,7 @@ def run_demo(folder: Path, *, cameras: int, scale: float, steps: int, serve: boo
     setting = Setting(_new_folder(folder), cameras, scale)
     rig = paper_rig(cameras, scale, setting.seed)
     say(f"a simulated ring of {cameras} cameras of {rig.cameras[0].width} x {rig.cameras[0].height} px")
-    warm_up()  # compiled once here, the renderer is found compiled by every node
+    load_renderer()  # compiled once here, the renderer is found compiled by every node
     write_truth(rig, setting.folder)
     name = parse_rig(rig.rig_toml()).name
     ids = [camera.id for camera in rig.cameras]

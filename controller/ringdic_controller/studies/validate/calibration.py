@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from ringdic.arrays import Floats
 from ringdic.calibration.bundle import centroid_shift
+from ringdic.calibration.calibrated_rig import CalibratedRig, control_points
 from ringdic.calibration.camera_calibration import CameraCalibration
 from ringdic.calibration.dots import find_dots
-from ringdic.calibration.rig import Ring, control_points
 from ringdic.calibration.target import DotObservations, identify
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.geometry.triangulation import triangulate
@@ -48,7 +48,7 @@ def true_camera(camera: VirtualCamera) -> Camera:
     return Camera(camera.id, P / P[2, 3], size, lens)
 
 
-def table_1(rings: Mapping[str, Ring], true: Mapping[str, Camera], scale: float) -> Findings:
+def table_1(rings: Mapping[str, CalibratedRig], true: Mapping[str, Camera], scale: float) -> Findings:
     """Mean and standard deviation of the intrinsics over the cameras, at full scale, and their RMS error."""
     inner = {way: _inner({id_: each.camera for id_, each in ring.cameras.items()}) for way, ring in rings.items()}
     truth = _inner(true)
@@ -68,7 +68,7 @@ def table_1(rings: Mapping[str, Ring], true: Mapping[str, Camera], scale: float)
     return Findings(tuple(figures), {"true": truth, **inner})
 
 
-def table_2(rings: Mapping[str, Ring], pairs: tuple[tuple[str, str], ...]) -> Findings:
+def table_2(rings: Mapping[str, CalibratedRig], pairs: tuple[tuple[str, str], ...]) -> Findings:
     """Reconstruction error of the control points over all pairs."""
     means, rms, curves = {}, {}, {}
     for way, ring in rings.items():
@@ -86,7 +86,7 @@ def table_2(rings: Mapping[str, Ring], pairs: tuple[tuple[str, str], ...]) -> Fi
 
 
 def figure_6(
-    rings: Mapping[str, Ring], rig: Rig, images: Mapping[str, Path], pairs: tuple[tuple[str, str], ...]
+    rings: Mapping[str, CalibratedRig], rig: Rig, images: Mapping[str, Path], pairs: tuple[tuple[str, str], ...]
 ) -> Findings:
     """The target moved by the stage: length of the motion, and misfit of the control points superimposed rigidly."""
     lengths, misfits, curves = {}, {}, {}
@@ -156,7 +156,7 @@ def _moved_dots(calibration: CameraCalibration, rig: Rig, image: Path) -> DotObs
 
 
 def _stage_points(
-    ring: Ring, rig: Rig, pair: tuple[str, str], moved: Mapping[str, DotObservations]
+    ring: CalibratedRig, rig: Rig, pair: tuple[str, str], moved: Mapping[str, DotObservations]
 ) -> tuple[Floats, Floats]:
     """The dots that a pair sees before and after the motion. Two of (n, 3) mm."""
     calibrations = [ring.cameras[id_] for id_ in pair]

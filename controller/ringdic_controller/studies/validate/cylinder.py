@@ -133,7 +133,7 @@ def apart(
     return Findings(tuple(figures))
 
 
-def printed(runs: Mapping[str, Run]) -> Findings:
+def print_errors(runs: Mapping[str, Run]) -> Findings:
     """The diameter where the dots of the target are printed off their places."""
     bias = {way: fitted_cylinder(run.results.vertices_ref).diameter - TRUE for way, run in runs.items()}
     return Findings((Figure("print errors 0.03 mm", "diameter bias", "mm", bias, "", 0.005),))

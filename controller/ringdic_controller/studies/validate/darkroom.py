@@ -18,7 +18,7 @@ PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
 @dataclass(frozen=True)
-class Shot:
+class RenderedShot:
     """One image to take. seed : of the sensor's noise. jpeg : its quality, or None for an image without loss."""
 
     camera: VirtualCamera
@@ -42,11 +42,11 @@ class Darkroom:
 
     folder: Path
 
-    def path(self, shot: Shot) -> Path:
+    def path(self, shot: RenderedShot) -> Path:
         """Where an image lies once it is developed."""
         return self.folder / f"{shot.camera.id}-{shot.key}.{'png' if shot.jpeg is None else 'jpg'}"
 
-    def develop(self, shots: Sequence[Shot], progress: Callable[[float], None] = lambda _: None) -> list[Path]:
+    def develop(self, shots: Sequence[RenderedShot], progress: Callable[[float], None] = lambda _: None) -> list[Path]:
         """Render what is not there yet, on all cores, and tell where each image lies."""
         self.folder.mkdir(parents=True, exist_ok=True)
         paths = {self.path(shot): shot for shot in shots}
@@ -56,7 +56,7 @@ class Darkroom:
                 progress(done / len(missing))
         return [self.path(shot) for shot in shots]
 
-    def _take(self, shot: Shot) -> None:
+    def _take(self, shot: RenderedShot) -> None:
         path = self.path(shot)
         if path.is_file():  # another process was faster
             return

@@ -7,19 +7,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ringdic.calibration.rig import Ring, calibrate_ring
+from ringdic.calibration.calibrated_rig import CalibratedRig, calibrate_rig
 from ringdic.geometry.camera import Camera
 from ringdic.jobs.pipeline import process_session
 from ringdic.progress import Progress, Report, silent
 from ringdic.results.results import Results, read_results
-from ringdic.session.folder import read_session
+from ringdic.session.folder import open_session
 from ringdic.session.rig import Rig, parse_rig
 from ringdic.settings import CalibrationGroup, Settings
 from ringdic_node.virtual_rig.scenes import Cylinder, Specimen
 
 from ringdic_controller.studies.validate.calibration import ExactRays, figure_6, table_1, table_2, true_camera
-from ringdic_controller.studies.validate.cylinder import Run, apart, diameter, figure_7a, figure_7b, printed
-from ringdic_controller.studies.validate.darkroom import Darkroom, Shot
+from ringdic_controller.studies.validate.cylinder import Run, apart, diameter, figure_7a, figure_7b, print_errors
+from ringdic_controller.studies.validate.darkroom import Darkroom, RenderedShot
 from ringdic_controller.studies.validate.figures import PAPER, Figure, Findings
 from ringdic_controller.studies.validate.folders import make_session
 from ringdic_controller.studies.validate.limb import LimbRun, figure_9, spoilt
@@ -74,7 +74,7 @@ class Validation:
             found |= self._cylinder(rings)
         if "printed" in experiments:
             runs = {way: Run.of(results) for way, results in self._process("printed", 1).items()}
-            found["printed"] = printed(runs)
+            found["printed"] = print_errors(runs)
         if "limb" in experiments or "spoilt" in experiments:
             found |= self._limb("spoilt" in experiments)
         return found
@@ -84,7 +84,7 @@ class Validation:
         for name in dict.fromkeys(("moved", *(name for each in experiments for name in _SCENES[each]))):
             self._develop(name)
 
-    def _calibration(self, rings: Mapping[str, Ring]) -> dict[str, Findings]:
+    def _calibration(self, rings: Mapping[str, CalibratedRig]) -> dict[str, Findings]:
         self._develop("moved")
         images = {id_: self.darkroom.path(shot) for id_, shot in self.scenery.shots("moved")[0].items()}
         uncorrected = {"paper's, no correction": self._uncorrected()} if PAPER in self.ways else {}
@@ -94,7 +94,7 @@ class Validation:
             "figure_6": figure_6({**rings, **uncorrected}, self.rig, images, self.pairs),
         }
 
-    def _cylinder(self, rings: Mapping[str, Ring]) -> dict[str, Findings]:
+    def _cylinder(self, rings: Mapping[str, CalibratedRig]) -> dict[str, Findings]:
         results = self._process("cylinder")
         runs = {way: Run.of(each) for way, each in results.items()}
         uncorrected = {id_: each.camera for id_, each in self._uncorrected().cameras.items()}
@@ -117,19 +117,19 @@ class Validation:
             found["spoilt"] = spoilt(runs, clean, scenes, cameras)
         return found
 
-    def _rings(self) -> dict[str, Ring]:
+    def _rings(self) -> dict[str, CalibratedRig]:
         """The cameras as each way calibrates them; kept in the calibration's session for all others."""
-        session = read_session(self._session("calibration"))
+        session = open_session(self._session("calibration"))
         rings = {}
         for way, settings in self.ways.items():
             began = self.clock()
-            rings[way] = calibrate_ring(session, settings.calibration, self._step(f"calibrate, {way}"))
+            rings[way] = calibrate_rig(session, settings.calibration, self._step(f"calibrate, {way}"))
             self._took(f"calibration, {way}", began)
         return rings
 
-    def _uncorrected(self) -> Ring:
-        session = read_session(self._session("calibration"))
-        return calibrate_ring(session, CalibrationGroup(method="dlt", distortion=False))
+    def _uncorrected(self) -> CalibratedRig:
+        session = open_session(self._session("calibration"))
+        return calibrate_rig(session, CalibrationGroup(method="dlt", distortion=False))
 
     def _process(self, name: str, steps: int | None = None) -> dict[str, Results]:
         """The results of every way over an experiment; those there already with the same settings are read."""
@@ -145,7 +145,7 @@ class Validation:
         return found
 
     def _session(self, name: str, steps: int | None = None) -> Path:
-        captures: list[tuple[str, Mapping[str, Shot]]] = []
+        captures: list[tuple[str, Mapping[str, RenderedShot]]] = []
         for scenes in _SCENES[name]:
             self._develop(scenes)
             kind = _KINDS.get(scenes, "specimen")
@@ -196,7 +196,7 @@ def _specimens(scenery: Scenery, name: str) -> list[Specimen]:
 def _run_with(session: Path, settings: Settings) -> Path | None:
     """The newest run of a session that was made with these settings."""
     wanted = settings.to_toml()
-    for run in reversed(read_session(session).runs()):
+    for run in reversed(open_session(session).runs()):
         if (run / "settings.toml").read_text(encoding="utf-8") == wanted:
             return run
     return None

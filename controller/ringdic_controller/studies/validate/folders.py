@@ -8,13 +8,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from ringdic_controller.archive.writer import SessionWriter
-from ringdic_controller.studies.validate.darkroom import Darkroom, Shot
+from ringdic_controller.studies.validate.darkroom import Darkroom, RenderedShot
 
 
 def make_session(
     path: Path,
     rig_toml: str,
-    captures: Sequence[tuple[str, Mapping[str, Shot]]],
+    captures: Sequence[tuple[str, Mapping[str, RenderedShot]]],
     darkroom: Darkroom,
     *,
     calibration: Path | None = None,

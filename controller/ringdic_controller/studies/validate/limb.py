@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from ringdic.arrays import Floats, Mask
 from ringdic.correlation.status import Status
-from ringdic.geometry.outliers import Lost
+from ringdic.geometry.outliers import LostPoint
 from ringdic.mesh.mesh import Mesh
 from ringdic.mesh.topology import holes, is_closed_tube, non_manifold_edges, overlap_area
 from ringdic.results.results import Results
@@ -161,7 +161,7 @@ def _unnamed(results: Results) -> int:
 
 def _reasons(results: Results) -> str:
     """How many points were lost for which reason."""
-    names = {int(each): each.name.lower() for kind in (Status, Lost) for each in kind}
+    names = {int(each): each.name.lower() for kind in (Status, LostPoint) for each in kind}
     counts = Counter(results.status[results.status != 0].tolist())
     return ", ".join(f"{count:,} {names.get(code, code)}" for code, count in counts.most_common()) or "none lost"
 

@@ -11,7 +11,7 @@ from ringdic import settings as presets
 from ringdic.cli.console import narrated, say, show_table
 from ringdic.errors import InputError
 from ringdic.settings import Settings
-from ringdic_node.virtual_rig.render import warm_up
+from ringdic_node.virtual_rig.render import load_renderer
 
 from ringdic_controller.studies.validate import report
 from ringdic_controller.studies.validate.experiments import EXPERIMENTS, Validation, figures
@@ -39,7 +39,7 @@ def run_validation(
     scenery = Scenery(scale, **(_QUICK if quick else {}))
     ways = {PAPER: scaled(presets.PAPER, scale), BETTER: scaled(presets.BEST, scale)}
     chosen = tuple(only) or EXPERIMENTS
-    warm_up()
+    load_renderer()
     with narrated() as progress:
         validation = Validation(folder, scenery, ways, progress)
         if images_only:

@@ -15,17 +15,27 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ringdic_node.virtual_rig.rig import VirtualRig, paper_rig
-from ringdic_node.virtual_rig.scenes import Bar, Board, Cylinder, Damage, Limb, Patch, Scene, Specimen, Target
+from ringdic_node.virtual_rig.scenes import (
+    Bar,
+    BoardScene,
+    Cylinder,
+    Damage,
+    Limb,
+    Scene,
+    Specimen,
+    SpoiltPatch,
+    TargetScene,
+)
 
-from ringdic_controller.studies.validate.darkroom import Shot
+from ringdic_controller.studies.validate.darkroom import RenderedShot
 
 STAGE = (5.0, 0.0, 0.0)  # mm, by which the target is moved
 PRINT_ERROR = 0.03  # mm, of every dot in each direction
 JPEG = 88  # quality of the spoilt images
 _SPECKLE_SEED = 7
 
-_WORN = (Patch(0.9, 60.0, 9.0, 9.0), Patch(3.6, 150.0, 14.0, 10.0), Patch(5.4, 200.0, 10.0, 16.0))
-_DROPPED = (Patch(2.2, 90.0, 12.0, 12.0), Patch(4.6, 110.0, 8.0, 14.0))
+_WORN = (SpoiltPatch(0.9, 60.0, 9.0, 9.0), SpoiltPatch(3.6, 150.0, 14.0, 10.0), SpoiltPatch(5.4, 200.0, 10.0, 16.0))
+_DROPPED = (SpoiltPatch(2.2, 90.0, 12.0, 12.0), SpoiltPatch(4.6, 110.0, 8.0, 14.0))
 _LAMPS = ((460.0, 195.0, 250.0), (-430.0, 260.0, 60.0), (40.0, -500.0, 180.0))
 
 
@@ -57,13 +67,13 @@ class Scenery:
     def scenes(self, name: str) -> list[Scene]:
         """The scenes of one experiment, in order."""
         if name == "boards":
-            return [Board(k, self.seed) for k in range(self.boards)]
+            return [BoardScene(k, self.seed) for k in range(self.boards)]
         if name == "target":
-            return [Target()]
+            return [TargetScene()]
         if name == "moved":
-            return [Target(STAGE)]
+            return [TargetScene(STAGE)]
         if name == "printed":
-            return [Target(print_error=PRINT_ERROR, seed=self.seed)]
+            return [TargetScene(print_error=PRINT_ERROR, seed=self.seed)]
         if name == "cylinder":
             return [Specimen(Cylinder(), step, _SPECKLE_SEED) for step in range(self.cylinder + 1)]
         if name == "limb":
@@ -72,12 +82,12 @@ class Scenery:
             return [Specimen(Limb(), step, _SPECKLE_SEED, _damage(later=step > 0)) for step in (0, self.spoilt_step)]
         raise ValueError(f"there is no experiment '{name}'")
 
-    def shots(self, name: str) -> list[Mapping[str, Shot]]:
+    def shots(self, name: str) -> list[Mapping[str, RenderedShot]]:
         """The images of one experiment: for each scene one of every camera, by its id."""
         jpeg = JPEG if name == "spoilt" else None
         return [
             {
-                camera.id: Shot(camera, scene, zlib.crc32(f"{self.seed} {name} {k} {camera.id}".encode()), jpeg)
+                camera.id: RenderedShot(camera, scene, zlib.crc32(f"{self.seed} {name} {k} {camera.id}".encode()), jpeg)
                 for camera in self.rig.cameras
             }
             for k, scene in enumerate(self.scenes(name))

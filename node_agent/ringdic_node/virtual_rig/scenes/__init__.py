@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
-from ringdic_node.virtual_rig.scenes.board import Board
-from ringdic_node.virtual_rig.scenes.damage import Bar, Damage, Patch
+from ringdic_node.virtual_rig.scenes.board import BoardScene
+from ringdic_node.virtual_rig.scenes.damage import Bar, Damage, SpoiltPatch
 from ringdic_node.virtual_rig.scenes.specimen import Cylinder, Limb, Specimen
-from ringdic_node.virtual_rig.scenes.target import Target
+from ringdic_node.virtual_rig.scenes.target import TargetScene
 
-Scene = Board | Target | Specimen
+Scene = BoardScene | TargetScene | Specimen
 
-__all__ = ["Bar", "Board", "Cylinder", "Damage", "Limb", "Patch", "Scene", "Specimen", "Target", "scene"]
+__all__ = [
+    "Bar",
+    "BoardScene",
+    "Cylinder",
+    "Damage",
+    "Limb",
+    "Scene",
+    "Specimen",
+    "SpoiltPatch",
+    "TargetScene",
+    "scene",
+]
 
 _SPECIMENS = {"limb": Limb, "cylinder": Cylinder}
 
@@ -23,9 +34,9 @@ def scene(kind: str, index: int, specimen: str = "limb", seed: int = 0) -> Scene
     if index < 0:
         raise ValueError(f"the scenes of a kind are counted from 0, not {index}")
     if kind == "board":
-        return Board(index, seed)
+        return BoardScene(index, seed)
     if kind == "target":
-        return Target()
+        return TargetScene()
     if kind not in ("specimen", "static"):
         raise ValueError(f"there is no scene of kind '{kind}'; use board, target, specimen or static")
     if specimen not in _SPECIMENS:

@@ -19,7 +19,7 @@ _PLASTIC = np.array([0.7548776662466927, 0.5698402909980532])  # 1/p and 1/p² o
 
 
 @dataclass(frozen=True)
-class Board:
+class BoardScene:
     """View number ``index`` of the board; the pose also depends on the camera and the seed."""
 
     index: int

@@ -19,7 +19,7 @@ _GLARING = 0.3  # radiance added above which a speckle pattern is spoilt
 
 
 @dataclass(frozen=True)
-class Patch:
+class SpoiltPatch:
     """An ellipse where the speckles are worn off: middle at theta (rad), z (mm), half axes along arc and height, mm."""
 
     theta: float
@@ -41,7 +41,7 @@ class Bar:
 class Damage:
     """Everything that spoils a specimen's images at one step. lamps : positions, mm, mirrored by a glossy body."""
 
-    patches: tuple[Patch, ...] = ()
+    patches: tuple[SpoiltPatch, ...] = ()
     lamps: tuple[tuple[float, float, float], ...] = ()
     bars: tuple[Bar, ...] = ()
 

@@ -15,7 +15,7 @@ _LARGEST = 0.5  # mm of print error: a dot stays in its own cell of the print
 
 
 @dataclass(frozen=True)
-class Target:
+class TargetScene:
     """The target, displaced by ``offset`` mm from where it defines the world.
 
     print_error : standard deviation of the printed dots' places along the arc and along the axis, mm, drawn from

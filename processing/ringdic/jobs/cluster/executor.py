@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ringdic.errors import ComputationError, InputError
-from ringdic.jobs.cluster.worker import VISIBLE_S, Outcome, Sign, inspect, run_task, visible
+from ringdic.jobs.cluster.worker import VISIBLE_S, Sign, TaskOutcome, inspect, run_task, visible
 from ringdic.tasks import Agenda, Task, Told, code_stamp
 
 log = logging.getLogger(__name__)
@@ -156,7 +156,7 @@ class _Job:
 
     def _take(self, task: Task, future: Any, threads: dict[str, int]) -> None:
         try:
-            outcome: Outcome = future.result()
+            outcome: TaskOutcome = future.result()
         except _distributed().KilledWorker as error:
             raise ComputationError(
                 f"{task.name}: one worker after the other died at it; their logs tell why (out of memory?)"
@@ -174,7 +174,7 @@ class _Job:
                 "every machine must see the session's folder under the same path"
             )
 
-    def _shun(self, outcome: Outcome, threads: dict[str, int]) -> None:
+    def _shun(self, outcome: TaskOutcome, threads: dict[str, int]) -> None:
         """Give a worker of no use nothing more to do."""
         threads.pop(outcome.worker, None)
         if not threads:

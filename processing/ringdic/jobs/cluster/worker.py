@@ -35,7 +35,7 @@ class Sign:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TaskOutcome:
     """What a worker tells of a task: how it ran, or why this worker runs none, or what is wrong with the input."""
 
     worker: str
@@ -64,7 +64,7 @@ def inspect(sign: Sign) -> str | None:
         return None
 
 
-def run_task(task: Task, sign: Sign, share: int) -> Outcome:
+def run_task(task: Task, sign: Sign, share: int) -> TaskOutcome:
     """Run a task here.
 
     share : threads for its kernels, so that the tasks at a time do not take more than the worker's threads; where
@@ -73,17 +73,17 @@ def run_task(task: Task, sign: Sign, share: int) -> Outcome:
     address, threads = _worker()
     unfit = inspect(sign)
     if unfit is not None:
-        return Outcome(address, unfit=unfit)
+        return TaskOutcome(address, unfit=unfit)
     absent = [path for path in task.inputs if not visible(path.is_file, task.folder)]
     if absent:
-        return Outcome(address, unfit=f"it does not see {absent[0]}, which another worker has written")
+        return TaskOutcome(address, unfit=f"it does not see {absent[0]}, which another worker has written")
     try:
         if kernels_side_by_side():
-            return Outcome(address, ran=_run(task, min(share, threads)))
+            return TaskOutcome(address, ran=_run(task, min(share, threads)))
         with _alone:
-            return Outcome(address, ran=_run(task, threads))
+            return TaskOutcome(address, ran=_run(task, threads))
     except InputError as error:
-        return Outcome(address, wrong=str(error))
+        return TaskOutcome(address, wrong=str(error))
 
 
 def visible(there: Callable[[], bool], folder: Path, limit: float = VISIBLE_S) -> bool:

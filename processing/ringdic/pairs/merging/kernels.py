@@ -12,7 +12,7 @@ from ringdic.mesh.nearest import near
 
 
 @nb.njit(cache=True, nogil=True)
-def peel(start, rival, beside, living, bad):  # type: ignore[no-untyped-def]
+def peel_triangles(start, rival, beside, living, bad):  # type: ignore[no-untyped-def]
     """Take border triangles with living rivals away, the worst first, until none is left that a border reaches.
 
     start (M + 1,), rival : the competitors of each triangle in one row. beside : (M, 3), -1 at a border.
@@ -46,7 +46,7 @@ def peel(start, rival, beside, living, bad):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def regrow(start, rival, beside, living, wanted, bad):  # type: ignore[no-untyped-def]
+def regrow_triangles(start, rival, beside, living, wanted, bad):  # type: ignore[no-untyped-def]
     """Put wanted triangles (M,) without living rivals back beside living ones; most neighbours first, then the best.
 
     The other arguments are those of ``peel``.

@@ -11,7 +11,7 @@ import numpy as np
 
 from ringdic.arrays import Floats, Indices, Mask
 from ringdic.mesh.mesh import Mesh
-from ringdic.mesh.topology import neighbours, pieces, without_pinches
+from ringdic.mesh.topology import face_neighbours, pieces, without_pinches
 from ringdic.pairs.merging.fill import fill
 from ringdic.pairs.merging.mismatch import Mismatch, mismatches
 from ringdic.pairs.merging.overlap import MEASURES, badness, closer_than, cover, peel, regrow
@@ -28,7 +28,7 @@ _FEWEST = 12  # triangles of a piece that is worth keeping
 
 
 @dataclass(frozen=True)
-class Sheet:
+class SurfacePart:
     """One surface: vertices (N, 3) mm, finite; faces (M, 3), normals outwards; correlation (N,) C_LS, 0 best.
 
     NaN for a vertex that was lost at some step: where another sheet measured the place, its triangles go first.
@@ -66,7 +66,7 @@ class Seam:
                 raise ValueError(f"{name} of a seam must not be negative, not {value}")
 
     @staticmethod
-    def mean_edge(sheets: Sequence[Sheet]) -> float:
+    def mean_edge(sheets: Sequence[SurfacePart]) -> float:
         """Mean length of the edges of all triangles, mm; 0 without any."""
         lengths = [np.linalg.norm(np.diff(s.vertices[s.faces[:, [0, 1, 2, 0]]], axis=1), axis=2) for s in sheets]
         every = np.concatenate([np.zeros(0), *(length.ravel() for length in lengths)])
@@ -91,7 +91,7 @@ class Merged:
 
 
 def merge(
-    sheets: Sequence[Sheet],
+    sheets: Sequence[SurfacePart],
     heuristic: str = "combined",
     weights: Mapping[str, float] | None = None,
     seam: Seam = Seam(),
@@ -119,7 +119,7 @@ def merge(
         return Merged(faces, pair, np.unique(faces), np.flatnonzero(~kept), added, apart.result())
 
 
-def _together(sheets: Sequence[Sheet]) -> tuple[Mesh, Indices, Floats]:
+def _together(sheets: Sequence[SurfacePart]) -> tuple[Mesh, Indices, Floats]:
     """All sheets as one mesh, each triangle's sheet (M,) and worst correlation (M,), NaN if lost."""
     offsets = np.cumsum([0, *(len(sheet.vertices) for sheet in sheets)])
     faces = [sheet.faces + offset for sheet, offset in zip(sheets, offsets, strict=False)]
@@ -149,7 +149,7 @@ class _Overlap:
         cls, mesh: Mesh, owner: Indices, correlation: Floats, weights: Mapping[str, float], reach: float
     ) -> _Overlap:
         """Of triangles whose surface (M,) and correlation (M,) are given; reach : mm. Works on all cores."""
-        covered, lost, beside = cover(mesh, owner, reach), np.isnan(correlation), neighbours(mesh.faces)
+        covered, lost, beside = cover(mesh, owner, reach), np.isnan(correlation), face_neighbours(mesh.faces)
         bad = badness(mesh, beside, owner, covered, np.where(lost, 0.0, correlation), weights)
         bad[lost] += 1 + np.ptp(bad)
         return cls(np.stack([covered.own, covered.other], axis=1), beside, lost, bad)
@@ -193,7 +193,7 @@ def _tidy(mesh: Mesh, kept: Mask) -> Mask:
 
 
 def _joined(
-    mesh: Mesh, old: Indices, owner: Indices, sheets: Sequence[Sheet], seam: Seam, edge: float
+    mesh: Mesh, old: Indices, owner: Indices, sheets: Sequence[SurfacePart], seam: Seam, edge: float
 ) -> tuple[Indices, Indices, int]:
     """Triangles (M, 3) with gaps stitched and holes filled, their sheets (M,), and how many are new."""
     sheet_of = np.repeat(np.arange(len(sheets)), [len(sheet.vertices) for sheet in sheets])

@@ -149,7 +149,7 @@ def peel(beside: Indices, alive: Mask, competing: Indices, bad: Floats) -> Mask:
     competing = competing[alive[competing].all(axis=1)]
     start, rival = kernels.rivals(len(beside), competing)
     kept = alive.copy()
-    kernels.peel(start, rival, beside, kept, bad)
+    kernels.peel_triangles(start, rival, beside, kept, bad)
     for first, second in competing[kept[competing].all(axis=1)].tolist():  # what no border reached
         if kept[first] and kept[second]:
             kept[first if bad[first] > bad[second] else second] = False
@@ -164,5 +164,5 @@ def regrow(beside: Indices, alive: Mask, candidate: Mask, competing: Indices, ba
     """
     start, rival = kernels.rivals(len(beside), competing)
     living = alive.copy()
-    kernels.regrow(start, rival, beside, living, candidate & ~alive, bad)
+    kernels.regrow_triangles(start, rival, beside, living, candidate & ~alive, bad)
     return living

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from ringdic import settings as presets
 from ringdic.errors import InputError
-from ringdic.session.folder import read_session
+from ringdic.session.folder import open_session
 from ringdic.session.images import read_gray
 from ringdic_controller.studies.validate import report
-from ringdic_controller.studies.validate.darkroom import Darkroom, Shot
+from ringdic_controller.studies.validate.darkroom import Darkroom, RenderedShot
 from ringdic_controller.studies.validate.experiments import Validation, figures
 from ringdic_controller.studies.validate.figures import PAPER
 from ringdic_controller.studies.validate.folders import make_session
@@ -19,13 +19,13 @@ from ringdic_controller.studies.validate.run import run_validation, scaled
 from ringdic_controller.studies.validate.scenery import Scenery
 from ringdic_node.virtual_rig.render import radiance
 from ringdic_node.virtual_rig.rig import paper_rig
-from ringdic_node.virtual_rig.scenes import Board, Cylinder, Specimen, Target
+from ringdic_node.virtual_rig.scenes import BoardScene, Cylinder, Specimen, TargetScene
 
 SMALL = paper_rig(4, 0.06, seed=1)
 
 
-def shots(kind: int = 0) -> dict[str, Shot]:
-    return {camera.id: Shot(camera, Board(kind), 3) for camera in SMALL.cameras}
+def shots(kind: int = 0) -> dict[str, RenderedShot]:
+    return {camera.id: RenderedShot(camera, BoardScene(kind), 3) for camera in SMALL.cameras}
 
 
 def test_an_image_is_rendered_once_and_again_only_if_something_it_depends_on_changes(tmp_path: Path) -> None:
@@ -37,15 +37,15 @@ def test_an_image_is_rendered_once_and_again_only_if_something_it_depends_on_cha
     assert [path.stat().st_mtime_ns for path in first] == times
     camera = SMALL.cameras[0]
     keys = {
-        Shot(camera, Board(0), 3).key,
-        Shot(camera, Board(0), 4).key,
-        Shot(camera, Board(1), 3).key,
-        Shot(camera, Target(), 3).key,
-        Shot(camera, Target(print_error=0.03), 3).key,
-        Shot(camera, Specimen(Cylinder(), 0), 3).key,
-        Shot(camera, Specimen(Cylinder((0.2, 0, 0)), 0), 3).key,
-        Shot(camera, Board(0), 3, jpeg=80).key,
-        Shot(SMALL.cameras[1], Board(0), 3).key,
+        RenderedShot(camera, BoardScene(0), 3).key,
+        RenderedShot(camera, BoardScene(0), 4).key,
+        RenderedShot(camera, BoardScene(1), 3).key,
+        RenderedShot(camera, TargetScene(), 3).key,
+        RenderedShot(camera, TargetScene(print_error=0.03), 3).key,
+        RenderedShot(camera, Specimen(Cylinder(), 0), 3).key,
+        RenderedShot(camera, Specimen(Cylinder((0.2, 0, 0)), 0), 3).key,
+        RenderedShot(camera, BoardScene(0), 3, jpeg=80).key,
+        RenderedShot(SMALL.cameras[1], BoardScene(0), 3).key,
     }
     assert len(keys) == 9
 
@@ -54,7 +54,7 @@ def test_a_session_shares_its_images_with_the_darkroom(tmp_path: Path) -> None:
     darkroom = Darkroom(tmp_path / "images")
     darkroom.develop([*shots(0).values(), *shots(1).values()])
     path = make_session(tmp_path / "s", SMALL.rig_toml(), [("board", shots(0)), ("board", shots(1))], darkroom)
-    session = read_session(path)
+    session = open_session(path)
     assert [capture.kind for capture in session.captures] == ["board", "board"]
     for capture, wanted in zip(session.captures, (shots(0), shots(1)), strict=True):
         for id_, shot in wanted.items():

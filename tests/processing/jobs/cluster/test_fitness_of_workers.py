@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from ringdic.errors import InputError
 from ringdic.jobs.cluster import ClusterExecutor, worker
-from ringdic.jobs.cluster.worker import Outcome, Sign, inspect, run_task, visible
+from ringdic.jobs.cluster.worker import Sign, TaskOutcome, inspect, run_task, visible
 from ringdic.tasks import Task, code_stamp, read_output
 
 
@@ -57,7 +57,7 @@ def test_a_tasks_kernels_take_their_share_and_no_more_than_the_worker_has(
     monkeypatch.setattr(worker, "_worker", lambda: ("tcp://here", threads))
     monkeypatch.setattr(worker, "kernels_side_by_side", lambda: True)
     task = Task("k", "a task", threads_seen, (), tmp_path)
-    outcome: list[Outcome] = []
+    outcome: list[TaskOutcome] = []
     thread = threading.Thread(
         target=lambda: outcome.append(run_task(task, sign, share))
     )  # numba's number is a thread's

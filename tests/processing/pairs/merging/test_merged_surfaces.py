@@ -15,14 +15,14 @@ from ringdic.mesh.topology import (
     overlap_area,
     pieces,
 )
-from ringdic.pairs.merging import HEURISTICS, Merged, Seam, Sheet, merge
+from ringdic.pairs.merging import HEURISTICS, Merged, Seam, SurfacePart, merge
 
 RADIUS = 40.0
 
 
 def strip(
     middle: float, width: float, height: float = 60.0, spacing: float = 2.5, seed: int = 0, noise: float = 0.0
-) -> Sheet:
+) -> SurfacePart:
     """A patch of a tube, its grid turned by a few degrees as one camera's is against another's; angles in degrees."""
     random = np.random.default_rng(seed)
     tilt = random.uniform(-0.15, 0.15)
@@ -40,14 +40,14 @@ def strip(
     correlation = 0.01 + 0.02 * (s[inside] / RADIUS) ** 2 + 0.002 * random.random(theta.size)
     vertices = np.stack([r * np.cos(theta), r * np.sin(theta), z[inside]], axis=1)
     used, faces = np.unique(faces[(faces >= 0).all(axis=1)], return_inverse=True)
-    return Sheet(vertices[used], faces.reshape(-1, 3), correlation[used])
+    return SurfacePart(vertices[used], faces.reshape(-1, 3), correlation[used])
 
 
-def ring(count: int = 6, width: float = 100.0, noise: float = 0.02) -> list[Sheet]:
+def ring(count: int = 6, width: float = 100.0, noise: float = 0.02) -> list[SurfacePart]:
     return [strip(360 / count * k, width, seed=k, noise=noise) for k in range(count)]
 
 
-def joined(sheets: Sequence[Sheet], merged: Merged) -> Mesh:
+def joined(sheets: Sequence[SurfacePart], merged: Merged) -> Mesh:
     return Mesh(np.concatenate([sheet.vertices for sheet in sheets]), merged.faces)
 
 
@@ -124,8 +124,8 @@ def test_no_vertex_is_moved_or_made_and_old_triangles_keep_their_sheet() -> None
 def test_the_correlation_heuristic_keeps_the_better_surface() -> None:
     """Of two sheets over the same place, the one with the smaller C_LS stays whole and the other goes where covered."""
     good, bad = strip(0, 80, seed=5), strip(0, 50, height=40, seed=6)
-    good = Sheet(good.vertices, good.faces, np.full(len(good.vertices), 0.01))
-    bad = Sheet(bad.vertices, bad.faces, np.full(len(bad.vertices), 0.3))
+    good = SurfacePart(good.vertices, good.faces, np.full(len(good.vertices), 0.01))
+    bad = SurfacePart(bad.vertices, bad.faces, np.full(len(bad.vertices), 0.3))
     merged = merge([good, bad], "correlation")
     assert (merged.removed >= len(good.faces)).all()
     assert len(merged.removed) == len(bad.faces)
@@ -137,7 +137,7 @@ def test_what_was_lost_later_gives_way_to_what_was_not(heuristic: str) -> None:
     """A patch in the middle of one sheet loses its points at a later step; the other sheet saw it at every step."""
     first, second = strip(0, 80, seed=7, noise=0.02), strip(10, 80, seed=8, noise=0.02)
     hidden = np.linalg.norm(first.vertices - [RADIUS, 0, 0], axis=1) < 8
-    first = Sheet(first.vertices, first.faces, np.where(hidden, np.nan, first.correlation))
+    first = SurfacePart(first.vertices, first.faces, np.where(hidden, np.nan, first.correlation))
     merged = merge([first, second], heuristic)
     assert_sound(joined([first, second], merged))
     used = merged.vertex[merged.vertex < len(hidden)]
@@ -152,7 +152,7 @@ def test_small_holes_are_closed_and_large_ones_are_not() -> None:
     for radius, closed in ((1.0, True), (12.0, False)):
         middle = np.argmin(np.linalg.norm(whole.vertices - [RADIUS, 0, 0], axis=1))
         gone = np.linalg.norm(whole.vertices - whole.vertices[middle], axis=1) < radius
-        sheet = Sheet(whole.vertices, whole.faces[~gone[whole.faces].any(axis=1)], whole.correlation)
+        sheet = SurfacePart(whole.vertices, whole.faces[~gone[whole.faces].any(axis=1)], whole.correlation)
         merged = merge([sheet])
         mesh = joined([sheet], merged)
         assert_sound(mesh)
@@ -165,14 +165,14 @@ def test_small_holes_are_closed_and_large_ones_are_not() -> None:
 
 def test_the_two_sides_of_a_plate_are_not_taken_for_an_overlap() -> None:
     front = strip(0, 60, seed=10)
-    back = Sheet(front.vertices * 0.99, front.faces[:, ::-1], front.correlation)
+    back = SurfacePart(front.vertices * 0.99, front.faces[:, ::-1], front.correlation)
     merged = merge([front, back])
     assert len(merged.removed) == 0
     assert len(merged.mismatch) == 0
 
 
 def test_nothing_and_a_single_sheet_stay_as_they_are() -> None:
-    empty = Sheet(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros(0))
+    empty = SurfacePart(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros(0))
     assert len(merge([]).faces) == len(merge([empty]).faces) == 0
     sheet = strip(0, 60, seed=11)
     merged = merge([empty, sheet])
@@ -187,8 +187,8 @@ def test_what_cannot_be_merged_is_refused() -> None:
     with pytest.raises(ValueError, match="no measure 'colour'"):
         merge([sheet], weights={"colour": 1.0})
     with pytest.raises(ValueError, match="finite"):
-        Sheet(np.full((4, 3), np.nan), np.zeros((0, 3), np.int64), np.zeros(4))
+        SurfacePart(np.full((4, 3), np.nan), np.zeros((0, 3), np.int64), np.zeros(4))
     with pytest.raises(ValueError, match="as many correlations"):
-        Sheet(np.zeros((4, 3)), np.zeros((0, 3), np.int64), np.zeros(3))
+        SurfacePart(np.zeros((4, 3)), np.zeros((0, 3), np.int64), np.zeros(3))
     with pytest.raises(ValueError, match="bridge"):
         Seam(bridge=-1.0)

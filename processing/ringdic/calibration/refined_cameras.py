@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ringdic.arrays import Floats
-from ringdic.calibration.refinement import Refinement, refine_poses
+from ringdic.calibration.pose_refinement import Refinement, refine_poses
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.triangulation import reprojection_residuals, triangulate
@@ -25,7 +25,7 @@ LIMIT = 0.03
 
 
 @dataclass
-class SteadiedCameras:
+class RefinedCameras:
     """The cameras of a rig, and where they stood at the steps at which they were seen to have moved.
 
     cameras : as calibrated. found : by step.

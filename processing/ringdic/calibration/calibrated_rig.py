@@ -46,7 +46,7 @@ _LENS_CHI2 = 25.0
 
 
 @dataclass(frozen=True)
-class Ring:
+class CalibratedRig:
     """Calibrated cameras by id, and one sentence for each that could not take part or whose images disagree.
 
     target : as the rig describes it.
@@ -64,9 +64,9 @@ class Ring:
     advice: tuple[str, ...] = ()
 
 
-def calibrate_ring(
+def calibrate_rig(
     session: Session, settings: CalibrationGroup, progress: Callable[[float, str], None] = lambda *_: None
-) -> Ring:
+) -> CalibratedRig:
     """Calibrate every camera that has an image of the target.
 
     Raises InputError or ComputationError, naming the camera, for images that do not determine it.
@@ -98,10 +98,10 @@ def calibrate_ring(
             done += 1
             progress(done / len(taking_part), f"camera {id_}")
     if settings.method == "dlt":
-        return _judged(session.rig, Ring(session.rig.target, calibrated, warnings))
+        return _judged(session.rig, CalibratedRig(session.rig.target, calibrated, warnings))
     progress(1.0, "all cameras together")
     adjusted, fit = _adjusted(session, calibrated, keys, settings)
-    return _judged(session.rig, Ring(session.rig.target, adjusted, (*warnings, *_contradictions(fit)), fit))
+    return _judged(session.rig, CalibratedRig(session.rig.target, adjusted, (*warnings, *_contradictions(fit)), fit))
 
 
 def control_points(first: CameraCalibration, second: CameraCalibration) -> ReconstructionError:
@@ -134,7 +134,7 @@ def _surveyed(session: Session, seen_in: Capture, ids: list[str], digests: Diges
     return replace(session.rig, cameras=tuple(entries)), tuple(values["warnings"])
 
 
-def _judged(rig: Rig, ring: Ring) -> Ring:
+def _judged(rig: Rig, ring: CalibratedRig) -> CalibratedRig:
     """The ring with its figures and with advice."""
     quality = tuple(camera_quality(each, rig.camera(id_).azimuth_deg) for id_, each in ring.cameras.items())
     advice = [sentence for row in quality for sentence in camera_advice(ring.cameras[row.camera], row)]

@@ -23,7 +23,7 @@ from ringdic.uncertainty.strain import corners_alike, stretch_sigma
 
 
 @dataclass(frozen=True)
-class Certainty:
+class SurfaceUncertainty:
     """Standard deviations by the noise of the images, at F steps of n points and M triangles; NaN where lost.
 
     position : (F, n, 3) mm. displacement : (F, n, 3) mm, zero at the reference. stretches : (F, M, 2) of λ1 and λ2.
@@ -34,7 +34,9 @@ class Certainty:
     stretches: Floats
 
 
-def certainty(cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, radius: float, order: int) -> Certainty:
+def surface_uncertainty(
+    cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, radius: float, order: int
+) -> SurfaceUncertainty:
     """Standard deviations of everything that was measured. radius, order : of the subsets in time."""
     steps, n = motion.status.shape
     reference, normals = shape.reference, shape.pieces.normals[tuple(shape.node.T)]
@@ -61,7 +63,7 @@ def certainty(cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, 
         stretches[step] = stretch_sigma(found, shape.xyz, shape.faces, gain, alike, noise)
         lost = ~np.isfinite(motion.xyz[step]).all(axis=1)
         position[step, lost], displacement[step, lost] = np.nan, np.nan
-    return Certainty(position, displacement, stretches)
+    return SurfaceUncertainty(position, displacement, stretches)
 
 
 def _of_step(count: int, motion: Motion, step: int) -> tuple[Floats, Floats]:

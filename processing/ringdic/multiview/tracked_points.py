@@ -27,7 +27,7 @@ _UNLIKE = 3.0  # a mean square difference this many times the usual one is not n
 
 
 @dataclass(frozen=True)
-class Places:
+class TrackedPoints:
     """n points of a reference image, m of them knots.
 
     at : (n, 2) px. pixel : (n, 2), the whole pixels next to them, where their subsets lie. variance : (n,) of the grey
@@ -96,9 +96,9 @@ class Places:
         return _UNLIKE * np.fmax(self.quartile(rest[self.knots]), np.median(rest[known]))
 
 
-def places(
+def tracked_points(
     reference: Reference, at: Floats, settings: CorrelationSettings, window: float | None = None, *, thin: bool = True
-) -> Places:
+) -> TrackedPoints:
     """Of points ``at`` (n, 2) px of a reference image. window : px, by default 3 subset radii.
 
     thin : without it every point is a knot.
@@ -110,7 +110,7 @@ def places(
     _, knot = cKDTree(pixel[knots]).query(pixel)
     variance = _variance(reference, pixel, settings.radius)
     least = (reference.grey_range / 255.0) ** 2
-    return Places(at, pixel, variance, least, spread(at), knots, np.asarray(knot, np.int64), around, quartile)
+    return TrackedPoints(at, pixel, variance, least, spread(at), knots, np.asarray(knot, np.int64), around, quartile)
 
 
 def thinned(xy: Floats, side: float) -> Indices:

@@ -25,13 +25,13 @@ from ringdic.correlation import (
     Current,
     Reference,
     Status,
-    correlate,
-    in_order,
+    correlate_points,
     refine_alone,
+    start_order,
 )
 from ringdic.correlation.quadratic import QuadraticFit
 from ringdic.correlation.seeds import flow_starts
-from ringdic.multiview.places import Places, robust
+from ringdic.multiview.tracked_points import TrackedPoints, robust
 
 _LOOSE = 5e-3  # px, tolerance of the first of two passes
 _PATIENCE = 10  # iterations of the first of two passes
@@ -46,7 +46,7 @@ _LEFT = 0.25  # share of the bias that may be left: the neighbourhood is wider t
 
 
 @dataclass(frozen=True)
-class Followed:
+class ImageMatches:
     """n points of one image in another; NaN where status is not 0.
 
     warp : (n, 12) at the points: u v ux uy vx vy and uxx uxy uyy vxx vxy vyy. sigma : (n, 2) px of u v.
@@ -64,21 +64,21 @@ class Followed:
         """Matched points. (n,) bool."""
         return self.status == Status.GOOD
 
-    def part(self, index: NDArray) -> Followed:
+    def part(self, index: NDArray) -> ImageMatches:
         """Some of the points, by indices or a mask."""
-        return Followed(self.warp[index], self.sigma[index], self.c_ls[index], self.rest[index], self.status[index])
+        return ImageMatches(self.warp[index], self.sigma[index], self.c_ls[index], self.rest[index], self.status[index])
 
 
-def follow(
+def match_tracked_points(
     reference: Reference,
     current: Current,
-    points: Places,
+    points: TrackedPoints,
     start: Floats | None,
     settings: CorrelationSettings,
     *,
     two_pass: bool = True,
     search: bool = True,
-) -> Followed:
+) -> ImageMatches:
     """Follow points of the reference image into the current image.
 
     start : (n, 12) warps at the points, NaN rows where unknown; None: found in the images. search : look for start
@@ -125,7 +125,7 @@ def _of_knots(settings: CorrelationSettings) -> CorrelationSettings:
 def _at_knots(
     reference: Reference,
     current: tuple[Current, Current],
-    points: Places,
+    points: TrackedPoints,
     start: Floats | None,
     settings: CorrelationSettings,
     search: bool,
@@ -137,12 +137,12 @@ def _at_knots(
     part, whole = current
     xy = points.around.xy
     if start is None:
-        part, given = whole, in_order(flow_starts(reference, whole, xy, settings.radius))
+        part, given = whole, start_order(flow_starts(reference, whole, xy, settings.radius))
     else:
         given = start[points.knots]
     found = refine_alone(reference, part, xy, settings, given)
     if search and found.good.sum() < _ENOUGH * max(1, np.isfinite(given).all(axis=1).sum()):
-        searched = correlate(reference, whole, xy, settings)
+        searched = correlate_points(reference, whole, xy, settings)
         return searched if searched.good.sum() > found.good.sum() else found
     lost = np.flatnonzero(~found.good)
     if len(lost) <= _SPARE * len(xy) or not found.good.any():
@@ -194,11 +194,11 @@ def _matched(
     if start is not None:
         known = np.asarray(np.isfinite(start).all(axis=1))
     if start is None or not known.any():
-        return correlate(reference, current, pixel, settings)
-    found = correlate(reference, current, pixel, settings, start=start)
+        return correlate_points(reference, current, pixel, settings)
+    found = correlate_points(reference, current, pixel, settings, start=start)
     if not search or found.good[known].mean() >= _ENOUGH:
         return found
-    searched = correlate(reference, current, pixel, settings)
+    searched = correlate_points(reference, current, pixel, settings)
     return searched if searched.good.sum() > found.good.sum() else found
 
 
@@ -207,7 +207,7 @@ def _warp(found: Correlation) -> Floats:
     return np.concatenate([found.uv, found.gradient.reshape(n, 4), found.curvature.reshape(n, 6)], axis=1)
 
 
-def _smooth(first: Correlation, points: Places) -> Floats:
+def _smooth(first: Correlation, points: TrackedPoints) -> Floats:
     """Warps (m, 12) of the knots by the quadratics of their neighbours' displacement; NaN where these are too few."""
     return _warp_of(robust(points.around, first.uv, np.hypot(*first.sigma.T)))
 
@@ -216,7 +216,7 @@ def _warp_of(fit: QuadraticFit) -> Floats:
     return np.concatenate([fit.value, fit.gradient.reshape(-1, 4), fit.curvature.reshape(-1, 6)], axis=1)
 
 
-def _foretold(first: Correlation, points: Places, radius: int) -> Floats:
+def _foretold(first: Correlation, points: TrackedPoints, radius: int) -> Floats:
     """Warps (n, 12) of the points as the knots' matches foretell them, with the second derivatives to hold."""
     fit = robust(points.around, first.uv, np.hypot(*first.sigma.T))
     warp = _warp_of(fit)
@@ -228,7 +228,7 @@ def _foretold(first: Correlation, points: Places, radius: int) -> Floats:
     return out
 
 
-def _held(fit: QuadraticFit, first: Correlation, points: Places, radius: int) -> Floats:
+def _held(fit: QuadraticFit, first: Correlation, points: TrackedPoints, radius: int) -> Floats:
     """Second derivatives (n, 6) to hold: at the rim, where a knot's own are too uncertain, those of the nearest knot.
 
     A wrong second derivative δ moves a round first-order subset of radius r by δ r²/8, the mean of δ x²/2 over it.
@@ -245,7 +245,7 @@ def _held(fit: QuadraticFit, first: Correlation, points: Places, radius: int) ->
     return np.asarray(curvature[points.nearest(known)])
 
 
-def _unbiased(first: Correlation, second: Correlation, points: Places) -> Correlation:
+def _unbiased(first: Correlation, second: Correlation, points: TrackedPoints) -> Correlation:
     """The second pass less the smooth part of its difference from the first, as far as that is more than noise."""
     own = second.sigma[points.knots]
     with np.errstate(invalid="ignore"):
@@ -275,19 +275,19 @@ def _clear(values: Floats, sigma: Floats, limit: float) -> Floats:
         return np.nan_to_num(np.maximum(0.0, 1.0 - limit / squares))
 
 
-def _rest(found: Correlation, points: Places) -> Floats:
+def _rest(found: Correlation, points: TrackedPoints) -> Floats:
     """C_LS times the variance of the reference's subset, and no less than rounding to whole grey levels makes. (n,)."""
     return np.where(found.good, np.maximum(found.c_ls * points.variance, points.least), np.nan)
 
 
-def _nowhere(points: Places, status: Indices) -> Followed:
+def _nowhere(points: TrackedPoints, status: Indices) -> ImageMatches:
     """None of the points found, for the reasons (n,) given."""
     n = len(points.at)
     lost = np.full(n, np.nan)
-    return Followed(np.full((n, 12), np.nan), np.full((n, 2), np.nan), lost, lost.copy(), status)
+    return ImageMatches(np.full((n, 12), np.nan), np.full((n, 2), np.nan), lost, lost.copy(), status)
 
 
-def _judged(found: Correlation, points: Places) -> Followed:
+def _judged(found: Correlation, points: TrackedPoints) -> ImageMatches:
     """The matches at the points themselves; those unlike the reference or against their neighbours lost."""
     status = found.status.copy()
     rest = _rest(found, points)
@@ -298,7 +298,7 @@ def _judged(found: Correlation, points: Places) -> Followed:
     status[points.contradict(uv, np.hypot(*found.sigma.T))] = Status.INCONSISTENT
     good = status == Status.GOOD
     warp = shifted(_warp(found), -points.shift)
-    return Followed(
+    return ImageMatches(
         np.where(good[:, None], warp, np.nan),
         np.where(good[:, None], found.sigma, np.nan),
         np.where(good, found.c_ls, np.nan),
