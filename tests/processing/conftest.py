@@ -8,7 +8,7 @@ import pytest
 from ringdic.calibration.calibrated_rig import calibrate_rig
 from ringdic.session.folder import open_session
 from ringdic.settings import CalibrationGroup
-from ringdic.tasks import kept
+from ringdic.tasks import process_memory
 from ringdic_controller.archive.importing import import_folder
 from ringdic_node.virtual_rig.render import render
 from ringdic_node.virtual_rig.rig import VirtualRig, paper_rig
@@ -39,6 +39,6 @@ def two_cameras(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def session(two_cameras: Path, tmp_path: Path) -> Path:
     """A copy to process."""
-    kept.clear()
+    process_memory.clear()
     shutil.copytree(two_cameras, tmp_path / "session", ignore=shutil.ignore_patterns("results", "work"))
     return tmp_path / "session"

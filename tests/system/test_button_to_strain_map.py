@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
-from ringdic.results.results import read_results
+from ringdic.results.reader import read_results
 from ringdic.session.folder import newest_results
 from ringdic.session.rig import parse_rig
 from ringdic_controller.studies.demo.comparison import compare_with_truth

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 from ringdic.report.hardware import camera_facts
-from ringdic.results.evaluation import EvaluatedResults, evaluated
-from ringdic.results.results import read_results
+from ringdic.results.evaluation import EvaluatedResults, evaluate_results
+from ringdic.results.reader import read_results
 from ringdic.session.folder import newest_results, open_session
 from ringdic.strain.rigid_motion import motion_to_reference
 from ringdic_node.virtual_rig.render import radiance
@@ -81,7 +81,7 @@ def session(request, folder: Path, ringdic: Callable, tmp_path_factory: pytest.T
 
 @pytest.fixture(scope="module")
 def seen(session: Path) -> EvaluatedResults:
-    return evaluated(newest_results(session))
+    return evaluate_results(newest_results(session))
 
 
 def test_cameras_that_moved_between_the_steps_are_found_again(
@@ -157,7 +157,7 @@ def test_the_noise_floor_is_what_electrons_make_of_it(
     # Of two cameras, each with an image of the reference and one at rest, the mean height is as sure as one subset's;
     # subsets that are turned away or cut by the rim are less sure than those of the middle.
     found = seen.results.summary["noise_floor"]["quantities"]["displacement_z"]["std"]
-    wanted = height / seen.results.pixels_a_mm
+    wanted = height / seen.results.pixels_per_mm
     figures(
         "swelling cylinder: height at rest, from electrons, µm",
         f"{1e3 * found:.2f}, {1e3 * wanted:.2f}",

@@ -22,9 +22,10 @@ import cv2
 import numpy as np
 import pytest
 from ringdic.jobs.pipeline import process_session
-from ringdic.results.results import Results, read_results
+from ringdic.results.reader import read_results
+from ringdic.results.results import Results
 from ringdic.settings import load_settings
-from ringdic.tasks import Executor, LocalExecutor, Ran, Task, Told, work_folder
+from ringdic.tasks import Executor, LocalExecutor, OnTaskEnd, Task, TaskReport, work_folder
 from ringdic_node.virtual_rig.render import render
 from ringdic_node.virtual_rig.rig import VirtualRig, paper_rig
 from ringdic_node.virtual_rig.scenes import scene
@@ -160,12 +161,12 @@ class Counted:
         self.made = 0
         self.found = 0
 
-    def run(self, tasks: Sequence[Task], told: Told) -> None:
-        def count(task: Task, ran: Ran, done: int, total: int) -> None:
-            self.made += ran.made
-            self.found += not ran.made
+    def run(self, tasks: Sequence[Task], on_end: OnTaskEnd) -> None:
+        def count(task: Task, report: TaskReport, done: int, total: int) -> None:
+            self.made += report.computed
+            self.found += not report.computed
             self._watch(done)
-            told(task, ran, done, total)
+            on_end(task, report, done, total)
 
         self._executor.run(tasks, count)
 
@@ -210,7 +211,9 @@ def test_a_cluster_finds_what_one_machine_finds(session: Path, local: Results, c
     done = ringdic("process", session, *options, "--cluster", crew, "--json", timeout_s=300)
     same(Path(json.loads(done.stdout)["run"]), local)
     assert re.search(rf"correlate  camera .* of {TASKS}\)", done.stderr), "the progress tells of the tasks"
-    assert [path.name for path in (session / "work").iterdir() if path.suffix != ".npz"] == [], "no sign is left"
+    assert [path.name for path in (session / "work").iterdir() if path.suffix != ".npz"] == [], (
+        "no file of the handshake is left"
+    )
 
 
 def test_one_surface_from_all_cameras_is_the_same_on_a_cluster(session: Path, crew: str, tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from ringdic.results.results import read_results
+from ringdic.results.reader import read_results
 from ringdic.session.folder import live_results
 from ringdic_controller.studies.bench.live import bench_live, live_ratios
 from ringdic_controller.studies.truth import errors

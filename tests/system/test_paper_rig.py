@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ringdic.results.results import Results, read_results
+from ringdic.results.reader import read_results
+from ringdic.results.results import Results
 from ringdic.session.folder import newest_results
 from ringdic.strain.rigid_motion import kabsch
 from scipy.optimize import least_squares

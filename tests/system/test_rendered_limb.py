@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 import pytest
 from ringdic.mesh.topology import holes, inconsistent_edges, is_closed_tube, non_manifold_vertices, overlap_area
-from ringdic.results.results import Results, read_results
+from ringdic.results.reader import read_results
+from ringdic.results.results import Results
 from ringdic.session.folder import newest_results
 from ringdic.strain.deformation import deformation
 from scipy.interpolate import RectBivariateSpline

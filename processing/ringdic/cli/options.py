@@ -28,8 +28,8 @@ def results_of(
     exponent: float | None = None,
 ) -> EvaluatedResults:
     """The results of a run as the options evaluate them. Raises InputError for a run that is not there."""
-    from ringdic.results.evaluation import Evaluation, evaluated
+    from ringdic.results.evaluation import Evaluation, evaluate_results
     from ringdic.session.folder import newest_results
 
     how = Evaluation.of(reference, without_rigid_motion, window, exponent)
-    return evaluated(newest_results(session, run), how)
+    return evaluate_results(newest_results(session, run), how)

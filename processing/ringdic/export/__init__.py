@@ -30,7 +30,7 @@ from ringdic.export.matlab import export_mat
 from ringdic.export.surfaces import DEFAULT_COLOUR, export_glb, export_ply
 from ringdic.export.tables import export_csv
 from ringdic.export.vtk import export_vtkhdf, export_vtp
-from ringdic.results.evaluation import EvaluatedResults, Evaluation, evaluated
+from ringdic.results.evaluation import EvaluatedResults, Evaluation, evaluate_results
 from ringdic.session.folder import newest_results
 
 _WRITERS: dict[str, Callable[[EvaluatedResults, Path], None]] = {
@@ -72,7 +72,7 @@ def export(
         out = results_path.with_name(format if format in _FOLDERS else f"results.{format}")
     out = Path(out)
     _check_place(out, format)
-    seen = evaluated(results_path, evaluation)
+    seen = evaluate_results(results_path, evaluation)
     if format in _COLOURED:
         seen.field(colour or DEFAULT_COLOUR)
     if format in _FOLDERS:

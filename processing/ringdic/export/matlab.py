@@ -143,7 +143,7 @@ def _floats_a_face() -> int:
 
 
 def _before(seen: EvaluatedResults, step: int) -> Floats:
-    return seen.results.before(step, seen.evaluation.previous)
+    return seen.results.reference_positions(step, seen.evaluation.previous)
 
 
 def _motion(seen: EvaluatedResults, step: int) -> RigidMotion:

@@ -19,7 +19,7 @@ def export_csv(seen: EvaluatedResults, out: Path) -> None:
     for step, name in enumerate(seen.steps):
         columns: dict[str, list[tuple[str, NDArray[np.generic]]]] = {"point": [], "face": []}
         positions = seen.positions(step)
-        before = seen.results.before(step, seen.evaluation.previous)
+        before = seen.results.reference_positions(step, seen.evaluation.previous)
         for i, axis in enumerate("xyz"):
             columns["point"].append((f"{axis}_reference [mm]", before[:, i]))
             columns["point"].append((f"{axis} [mm]", positions[:, i]))

@@ -1,1 +1,10 @@
-"""What is done with a session: the whole processing, one step at once, a warm process, more than one machine."""
+"""Jobs on a session: processing it as a whole, one step at once, in a warm process, or on a cluster of machines.
+
+``pipeline``    from the session folder to the results
+``summary``     the figures of a run
+``live_step``   one step, while the capturing goes on
+``serving``     a process with loaded kernels, which carries out one order after the other
+``warm_up``     compiles the kernels that follow the matching
+``allocation``  how the process asks the system for memory
+``cluster``     tasks on more than one machine
+"""

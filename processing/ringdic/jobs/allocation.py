@@ -1,4 +1,4 @@
-"""How the process asks the system for memory."""
+"""Settings of the C library's memory allocation for this process."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import ctypes
 import os
 import sys
 
-# Of glibc's mallopt(3).
+# Parameters of mallopt(3) in glibc.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
-_KEPT = 1 << 30  # bytes of freed memory that stay with the process
-_OWN_PAGES = 32 << 20  # bytes from which on an array has pages of its own; glibc takes no more
+_FREED = 1 << 30  # bytes of freed memory that the process does not give back
+_OWN_PAGES = 32 << 20  # bytes from which on an array gets pages of its own; the largest value that glibc accepts
 
 
 def keep_freed_memory() -> None:
-    """Have freed memory used again in place of new pages, which the system would have to clear: images and fields of
-    some megabytes come and go all the time. Where the C library is not glibc nothing changes.
+    """Have the process reuse freed memory instead of getting new pages, which the system has to clear first.
 
-    To be called before there are threads.
+    Arrays of several megabytes are allocated and freed all the time, so this saves much of the system's time. Nothing
+    changes where the C library is not glibc. To be called before threads are started.
     """
     if not sys.platform.startswith("linux"):
         return
@@ -24,4 +24,4 @@ def keep_freed_memory() -> None:
     if mallopt is not None:
         mallopt(_ARENA_MAX, os.cpu_count() or 1)
         mallopt(_MMAP_THRESHOLD, _OWN_PAGES)
-        mallopt(_TRIM_THRESHOLD, _KEPT)
+        mallopt(_TRIM_THRESHOLD, _FREED)

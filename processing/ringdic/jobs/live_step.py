@@ -1,8 +1,8 @@
-"""One step of a session at once, while the capturing goes on: what is shown until the whole session is processed.
+"""Processes one step of a session at once, while the capturing goes on; its results are shown until those of a run.
 
-The step's matches are kept as those of a whole run are, so the run makes only what is missing. The surface that the
-steps are shown on is that of the reference, merged once and the same at every step. It is made by pairs of cameras,
-whatever the run is told: these alone need nothing of the steps between.
+The matches of the step are stored as those of a run are, so the run later computes only what is missing. All steps are
+shown on the surface of the reference, which is merged once. It is always measured by pairs of cameras, whatever the
+settings say, because only pairs need no matches of the steps in between.
 """
 
 from __future__ import annotations
@@ -21,51 +21,55 @@ from ringdic.progress import Report, Stages, silent
 from ringdic.results.writer import write_series
 from ringdic.session.folder import Capture, Session, new_live, open_session
 from ringdic.settings import CalibrationGroup, Settings
-from ringdic.tasks import Executor, digest, kept
+from ringdic.tasks import Executor, digest, process_memory
 
-_RING_BYTES = 1 << 20  # about what the cameras and their control points take
+_RIG_BYTES = 1 << 20  # approximate size of the calibrated cameras and their control points
 _WEIGHTS = {"prepare": 0.01, "calibrate": 0.02, "correlate": 0.8, "triangulate": 0.1, "deform": 0.07}
 
 
 def process_step(
     path: Path, capture_id: str, settings: Settings, report: Report = silent, executor: Executor | None = None
 ) -> Path:
-    """Process the reference and one step of the specimen; the folder of what is shown of it.
+    """Process the reference and one step of the specimen, and write their results to the session's live folder.
 
-    The reference itself may be the step: then its shape is shown, and what every step needs of it is found. Nothing
-    becomes a run; matches in images, what calibration and scatter add to uncertainty, and the summary are left to it.
-    Raises InputError or ComputationError.
+    The results have neither 2D matches, nor standard deviations of displacements and strains, nor a full summary.
+
+    path : the session folder. capture_id : the step; for the reference itself only its shape is computed.
+    report : called with the stage, the share done, the rate and the time left.
+    executor : runs the tasks; None runs them in this process.
+    Returns the folder with results.h5. Raises InputError or ComputationError with a sentence for the operator.
     """
     began = time.monotonic()
     stages = Stages(_WEIGHTS, report)
     session = open_session(path)
     settings = settings.model_copy(update={"surface": settings.surface.model_copy(update={"method": "pairs"})})
-    steps = _reference_and(session, capture_id)
+    steps = _with_reference(session, capture_id)
 
     def merging(pairs: Sequence[PairSurface], heuristic: str) -> Merged:
-        sheets = [pair.sheet_at_reference for pair in pairs]
-        key = digest("live surface", heuristic, [(each.vertices, each.faces, each.correlation) for each in sheets])
-        return kept.get(key, lambda: merge(sheets, heuristic), _bytes)
+        surfaces = [pair.sheet_at_reference for pair in pairs]
+        key = digest("live surface", heuristic, [(each.vertices, each.faces, each.correlation) for each in surfaces])
+        return process_memory.get(key, lambda: merge(surfaces, heuristic), _bytes)
 
-    tracked = match_session(session, settings, steps, stages, executor, _calibrated, merging)
-    found = {"warnings": list(tracked.warnings), "seconds": round(time.monotonic() - began, 2)}
+    matches = match_session(session, settings, steps, stages, executor, _calibrated, merging)
+    summary = {"warnings": list(matches.warnings), "seconds": round(time.monotonic() - began, 2)}
     stages.at("deform", 0.0)
     with new_live(path, capture_id) as folder:
-        shown = tracked.series.without_matches()
-        write_series(folder / "results.h5", shown, lambda done: stages.at("deform", done), {}, found)
+        series = matches.series.without_matches()
+        write_series(folder / "results.h5", series, lambda done: stages.at("deform", done), {}, summary)
     return session.path / "live" / capture_id
 
 
-def _calibrated(session: Session, settings: CalibrationGroup, told: Callable[[float, str], None]) -> CalibratedRig:
-    """The ring as calibrated, kept in memory while its images and settings stay."""
+def _calibrated(session: Session, settings: CalibrationGroup, progress: Callable[[float, str], None]) -> CalibratedRig:
+    """The calibrated rig, cached in memory as long as its images and settings stay the same."""
     captures = [capture for capture in session.captures if capture.kind in ("board", "target")]
     rig = (session.path / "rig.toml").read_text(encoding="utf-8")
     records = json.dumps([(each.id, each.record) for each in captures])
     key = digest("live calibration", str(session.path), rig, settings, records)
-    return kept.get(key, lambda: calibrate_rig(session, settings, told), lambda _: _RING_BYTES)
+    return process_memory.get(key, lambda: calibrate_rig(session, settings, progress), lambda _: _RIG_BYTES)
 
 
-def _reference_and(session: Session, capture_id: str) -> tuple[Capture, ...]:
+def _with_reference(session: Session, capture_id: str) -> tuple[Capture, ...]:
+    """The captures of the reference and of a step, or of the reference alone where it is the step."""
     specimen = session.of_kind("specimen")
     chosen = [capture for capture in specimen if capture.id == capture_id]
     if not chosen:
@@ -75,4 +79,5 @@ def _reference_and(session: Session, capture_id: str) -> tuple[Capture, ...]:
 
 
 def _bytes(merged: Merged) -> int:
+    """Size of a merged surface, bytes."""
     return int(merged.vertex.nbytes + merged.faces.nbytes + merged.pair.nbytes)

@@ -1,6 +1,6 @@
-"""The straight line from a session folder to results: calibrate, correlate_points, triangulate, deform, keep.
+"""Processes a session folder: calibrates, correlates, triangulates, computes deformation, writes the results.
 
-This is the only place where the stages meet.
+The stages do not import one another; this is the only module that calls them all.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from ringdic.calibration.quality import ReconstructionError
 from ringdic.correlation import CorrelationSettings
 from ringdic.correlation.correlate import load_kernels
 from ringdic.errors import ComputationError, InputError
+from ringdic.geometry.camera import Camera
 from ringdic.jobs import summary
 from ringdic.pairs.reconstruction import pair_shape
 from ringdic.pairs.surfaces import Merging, PairSurface, merge_surfaces, pairs_surface, reconstruct_pair
@@ -26,13 +27,13 @@ from ringdic.pairs.tasks import PairJob, ordered_tasks, pair_jobs
 from ringdic.progress import Report, Stages, silent
 from ringdic.results import noise_floor
 from ringdic.results.results import Results
-from ringdic.results.series import InMemory, Series, StepCache, join_steps
+from ringdic.results.series import InMemorySeries, Series, StepCache, join_steps
 from ringdic.results.uncertainty import StepUncertainty, camera_covariance
-from ringdic.results.writer import ResultsWriter, StepRecord, in_turn
+from ringdic.results.writer import ResultsWriter, StepRecord, map_in_order
 from ringdic.session.folder import Capture, Session, new_run, open_session
 from ringdic.settings import CalibrationGroup, Settings
 from ringdic.sweep.sweep import Search
-from ringdic.tasks import Executor, LocalExecutor, Ran, Task, tidy, work_folder
+from ringdic.tasks import Executor, LocalExecutor, Task, TaskReport, tidy, work_folder
 
 if TYPE_CHECKING:
     from ringdic.multiview.surface import RingSurface
@@ -46,10 +47,17 @@ _WEIGHTS = {"prepare": 0.03, "calibrate": 0.25, "correlate": 0.62, "triangulate"
 
 @dataclass(frozen=True)
 class SessionMatches:
-    """A surface through some steps, and what is told of it. errors : of the pairs' reconstruction of control points."""
+    """A session's surface at some steps, from matched images, and figures of its quality.
+
+    series : the surface, step by step. rig : the calibrated cameras.
+    errors : of the control points as each pair reconstructs them.
+    drift : (F,) px by pair or camera, mean vertical reprojection residual at each step.
+    agreement : of the pairs' surfaces, or of the cameras about common points, as JSON values.
+    warnings : sentences for the operator.
+    """
 
     series: Series
-    ring: CalibratedRig
+    rig: CalibratedRig
     errors: dict[tuple[str, str], ReconstructionError]
     drift: dict[str, Floats]
     agreement: dict[str, Any]
@@ -57,37 +65,39 @@ class SessionMatches:
 
     @property
     def calibration(self) -> dict[str, Any]:
-        """The cameras and how well they agree, as JSON values."""
+        """The calibrated cameras and figures of their quality, as JSON values: the contents of calibration.json."""
         return {
-            "cameras": [camera.to_dict() for camera in self.ring.cameras.values()],
+            "cameras": [camera.to_dict() for camera in self.rig.cameras.values()],
             "pairs": [
                 {"pair": list(pair), "mean_mm": error.mean, "rms_mm": error.rms, "points": error.points}
                 for pair, error in self.errors.items()
             ],
-            "bundle": None if self.ring.bundle is None else self.ring.bundle.to_dict(),
+            "bundle": None if self.rig.bundle is None else self.rig.bundle.to_dict(),
         }
 
 
 def process_session(path: Path, settings: Settings, report: Report = silent, executor: Executor | None = None) -> Path:
     """Process a session and return the folder of the new run; earlier runs stay as they are.
 
-    path : the session folder. report : is told the stage, the share done, the rate and the time left. executor : of
-    the tasks; None runs them in this process. What an interrupted run has matched is not matched again.
+    Matches that an interrupted run has computed are reused.
+
+    path : the session folder. report : called with the stage, the share done, the rate and the time left.
+    executor : runs the tasks; None runs them in this process.
     Raises InputError or ComputationError with a sentence for the operator.
     """
     began = time.monotonic()
     stages = Stages(_WEIGHTS, report)
     session = open_session(path)
     steps = _with_captures_at_rest(session)
-    tracked = match_session(session, settings, steps, stages, executor)
+    matches = match_session(session, settings, steps, stages, executor)
     stages.at("deform", 0.0)
     with new_run(session.path) as run:
         (run.folder / "settings.toml").write_text(settings.to_toml(), encoding="utf-8")
-        (run.folder / "calibration.json").write_text(json.dumps(tracked.calibration), encoding="utf-8")
-        found = _deform(tracked, steps, run.folder / "results.h5", stages, began)
-        (run.folder / "summary.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
+        (run.folder / "calibration.json").write_text(json.dumps(matches.calibration), encoding="utf-8")
+        figures = _deform(matches, steps, run.folder / "results.h5", stages, began)
+        (run.folder / "summary.json").write_text(json.dumps(figures, indent=1), encoding="utf-8")
     assert run.final is not None
-    for warning in found["warnings"]:
+    for warning in figures["warnings"]:
         log.warning("%s", warning)
     return run.final
 
@@ -101,68 +111,71 @@ def match_session(
     calibrate: Calibrate = calibrate_rig,
     merging: Merging = merge_surfaces,
 ) -> SessionMatches:
-    """The surface at the steps, the reference first.
+    """Calibrate the cameras of a session, match its images and triangulate the surface at some steps.
 
-    executor : of the tasks; None runs them in this process. calibrate, merging : what does these, where it is kept
-    from before.
+    steps : the captures, the reference first. executor : runs the tasks; None runs them in this process.
+    calibrate, merging : replace the functions that calibrate the rig and merge the pairs' surfaces, for callers that
+    cache their results.
     """
     stages, steps = stages or Stages(_WEIGHTS, silent), tuple(steps)
     stages.at("prepare", 0.0, "loading the correlation kernels (compiled at the first use)")
     load_kernels()
     stages.at("calibrate", 0.0)
-    ring = calibrate(session, settings.calibration, lambda done, who: stages.at("calibrate", done, who))
-    errors, warnings = _usable_pairs(session, ring, steps)
+    rig = calibrate(session, settings.calibration, lambda done, who: stages.at("calibrate", done, who))
+    errors, warnings = _usable_pairs(session, rig, steps)
+    matching = _Matching(session, rig, tuple(errors), steps, settings, stages, executor)
     series: Series
     if settings.surface.method == "global":
-        whole = _whole_ring(session, ring, tuple(errors), steps, settings, stages, executor)
-        series, drift, agreement, more_warnings = InMemory(whole.results), whole.drift, whole.agreement, whole.warnings
+        surface = _global_surface(matching)
+        series, drift, agreement = InMemorySeries(surface.results), surface.drift, surface.agreement
+        more_warnings = surface.warnings
     else:
-        pairs, more_warnings = _pairs(session, ring, tuple(errors), steps, settings, stages, executor)
-        cameras, names = [each.camera for each in ring.cameras.values()], [step.id for step in steps]
-        series, agreement = pairs_surface(session.rig.name, cameras, pairs, names, settings, merging)
+        pairs, more_warnings = _pair_surfaces(matching)
+        series, agreement = pairs_surface(session.rig.name, matching.cameras, pairs, matching.names, settings, merging)
         drift = {"-".join(pair.shape.ids): pair.drift for pair in pairs}
-    return SessionMatches(series, ring, errors, drift, agreement, (*ring.warnings, *warnings, *more_warnings))
+    return SessionMatches(series, rig, errors, drift, agreement, (*rig.warnings, *warnings, *more_warnings))
 
 
 def _deform(
-    tracked: SessionMatches, steps: tuple[Capture, ...], path: Path, stages: Stages, began: float
+    matches: SessionMatches, steps: tuple[Capture, ...], path: Path, stages: Stages, began: float
 ) -> dict[str, Any]:
-    """Deformation and uncertainty of every step, each written when it is found; the summary. path : of the results.
+    """Compute deformation and uncertainty of every step and write each to the results file; returns the summary.
 
-    Of captures at rest, which are not written, the summary tells the noise floor.
+    Captures at rest are not written; the summary has the noise floor that they show.
+    path : of the results file. began : start of the run on the monotonic clock, seconds.
     """
-    series = tracked.series
-    stated = StepUncertainty(series.reference, camera_covariance(tracked.ring.bundle), series.noise)
-    kept = [k for k, step in enumerate(steps) if step.kind != "static"]
-    reference = stated.of(series.reference, 0)
+    series = matches.series
+    uncertainty = StepUncertainty(series.reference, camera_covariance(matches.rig.bundle), series.noise)
+    written = [k for k, step in enumerate(steps) if step.kind != "static"]
+    reference = uncertainty.complete(series.reference, 0)
     at_rest = [replace(series.reference, matches=())]
     figures: list[summary.StepFigures] = []
-    with ResultsWriter(path, reference, [series.names[k] for k in kept]) as file:
+    with ResultsWriter(path, reference, [series.names[k] for k in written]) as file:
 
-        def made(k: int) -> Results | tuple[StepRecord, summary.StepFigures]:
+        def compute(k: int) -> Results | tuple[StepRecord, summary.StepFigures]:
             results = series.at(k) if k else reference
-            if k not in kept:
+            if k not in written:
                 return replace(results, matches=())
             last = len(results.steps) - 1
-            motion, found = results.motion(last), results.deformation(last)
-            results = stated.of(results, k, found) if k else reference
-            return file.made(results, motion, found), summary.step_figures(results, motion, found)
+            motion, deformation = results.motion(last), results.deformation(last)
+            results = uncertainty.complete(results, k, deformation) if k else reference
+            return file.record(results, motion, deformation), summary.step_figures(results, motion, deformation)
 
-        for k, one in enumerate(in_turn(made, range(len(steps)))):
+        for k, one in enumerate(map_in_order(compute, range(len(steps)))):
             if isinstance(one, Results):
                 at_rest.append(one)
             else:
                 file.write(len(figures), one[0])
                 figures.append(one[1])
             stages.at("deform", (k + 1) / len(steps))
-        drift = {who: values[kept] for who, values in tracked.drift.items()}
-        found = summary.summarise(
-            reference, figures, tracked.ring, tracked.errors, drift, tracked.agreement, tracked.warnings
+        drift = {who: values[written] for who, values in matches.drift.items()}
+        values = summary.summarise(
+            reference, figures, matches.rig, matches.errors, drift, matches.agreement, matches.warnings
         )
-        found["noise_floor"] = noise_floor.noise_floor(join_steps(at_rest)) if len(at_rest) > 1 else None
-        found["seconds"] = round(time.monotonic() - began, 2)
-        file.finish(tracked.calibration, found)
-    return found
+        values["noise_floor"] = noise_floor.noise_floor(join_steps(at_rest)) if len(at_rest) > 1 else None
+        values["seconds"] = round(time.monotonic() - began, 2)
+        file.finish(matches.calibration, values)
+    return values
 
 
 def _specimen_steps(session: Session) -> tuple[Capture, ...]:
@@ -173,19 +186,22 @@ def _specimen_steps(session: Session) -> tuple[Capture, ...]:
 
 
 def _with_captures_at_rest(session: Session) -> tuple[Capture, ...]:
-    """The steps, and right after the reference, where nothing has moved yet, the captures at rest."""
+    """The reference, then the captures at rest, which show the specimen unmoved, then the other steps."""
     steps = _specimen_steps(session)
     return (steps[0], *session.of_kind("static"), *steps[1:])
 
 
 def _usable_pairs(
-    session: Session, ring: CalibratedRig, steps: tuple[Capture, ...]
+    session: Session, rig: CalibratedRig, steps: tuple[Capture, ...]
 ) -> tuple[dict[tuple[str, str], ReconstructionError], tuple[str, ...]]:
-    """Pairs of calibrated cameras with a reference image and how well they agree; a sentence for each left out."""
+    """Pairs of calibrated cameras with a reference image, with their errors at the control points.
+
+    The second value has a sentence for each pair that cannot be used. Raises InputError where no pair can.
+    """
     usable: dict[tuple[str, str], ReconstructionError] = {}
     warnings: list[str] = []
     for pair in session.rig.pairs:
-        missing = [id_ for id_ in pair if id_ not in ring.cameras]
+        missing = [id_ for id_ in pair if id_ not in rig.cameras]
         blind = [id_ for id_ in pair if id_ not in steps[0].images]
         if missing:
             warnings.append(f"pair {pair[0]}-{pair[1]} is left out: camera {' and '.join(missing)} is not calibrated")
@@ -195,7 +211,7 @@ def _usable_pairs(
             )
         else:
             try:
-                usable[pair] = control_points(ring.cameras[pair[0]], ring.cameras[pair[1]])
+                usable[pair] = control_points(rig.cameras[pair[0]], rig.cameras[pair[1]])
             except ComputationError as error:
                 warnings.append(str(error))
     if not usable:
@@ -203,85 +219,97 @@ def _usable_pairs(
     return usable, tuple(warnings)
 
 
-def _pairs(
-    session: Session,
-    ring: CalibratedRig,
-    pairs: tuple[tuple[str, str], ...],
-    steps: tuple[Capture, ...],
-    settings: Settings,
-    stages: Stages,
-    executor: Executor | None,
-) -> tuple[list[PairSurface], list[str]]:
-    """Every pair matched at every step, as tasks, and triangulated; a sentence for each that gave no surface."""
-    cameras = {id_: each.camera for id_, each in ring.cameras.items()}
-    correlation = CorrelationSettings(**settings.correlation.keywords)
-    jobs = pair_jobs(session, cameras, pairs, steps, _search(session, settings), correlation)
-    _run(ordered_tasks(jobs), executor, stages, session)
-    shelf = StepCache(work_folder(session.path))
+@dataclass(frozen=True)
+class _Matching:
+    """A session whose rig is calibrated, with all that its matching needs.
 
-    def followed(job: PairJob) -> PairSurface | str:
+    pairs : camera ids of the pairs that can be used. steps : captures, the reference first.
+    """
+
+    session: Session
+    rig: CalibratedRig
+    pairs: tuple[tuple[str, str], ...]
+    steps: tuple[Capture, ...]
+    settings: Settings
+    stages: Stages
+    executor: Executor | None
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """All calibrated cameras."""
+        return [each.camera for each in self.rig.cameras.values()]
+
+    @property
+    def names(self) -> list[str]:
+        """Capture ids of the steps."""
+        return [step.id for step in self.steps]
+
+    @property
+    def search(self) -> Search:
+        """Where and how the surface is searched for, from the settings and the target."""
+        surface = self.settings.surface
+        return Search(
+            radius=surface.radius_mm or self.session.rig.target.radius_mm,
+            reach=surface.reach_mm,
+            incidence=surface.incidence_deg,
+        )
+
+    def run(self, tasks: Sequence[Task]) -> None:
+        """Run tasks and report their progress, then remove old outputs beyond the size limit of the work folder."""
+        total_cost = sum(task.cost for task in tasks)
+        began, cost, points = time.monotonic(), 0.0, 0
+
+        def report(task: Task, outcome: TaskReport, count: int, total: int) -> None:
+            nonlocal cost, points
+            cost += task.cost
+            points += outcome.points
+            rate = f"{points / max(time.monotonic() - began, 1e-3):,.0f} points/s" if points else ""
+            self.stages.at("correlate", cost / total_cost, f"{task.name} ({count} of {total})", rate)
+
+        self.stages.at("correlate", 0.0)
+        (self.executor or LocalExecutor()).run(tasks, report)
+        tidy(work_folder(self.session.path), tasks)
+
+
+def _pair_surfaces(matching: _Matching) -> tuple[list[PairSurface], list[str]]:
+    """Match every pair at every step, as tasks, and triangulate; a sentence for each pair without a surface."""
+    session, settings, steps = matching.session, matching.settings, matching.steps
+    cameras = {camera.id: camera for camera in matching.cameras}
+    correlation = CorrelationSettings(**settings.correlation.keywords)
+    jobs = pair_jobs(session, cameras, matching.pairs, steps, matching.search, correlation)
+    matching.run(ordered_tasks(jobs))
+    cache = StepCache(work_folder(session.path))
+
+    def reconstruct(job: PairJob) -> PairSurface | str:
         try:
-            grid, at_first = job.at_reference()
+            grid, reference = job.at_reference()
         except ComputationError as error:
             return str(error)
-        shape = pair_shape(job.cameras, grid.xy, grid.faces, at_first, correlation.step, settings.surface.sigma_max_px)
-        return reconstruct_pair(shape, lambda k: job.step(k, at_first) if k else at_first, len(steps), shelf)
+        shape = pair_shape(job.cameras, grid.xy, grid.faces, reference, correlation.step, settings.surface.sigma_max_px)
+        return reconstruct_pair(shape, lambda k: job.step(k, reference) if k else reference, len(steps), cache)
 
-    found: list[PairSurface] = []
+    surfaces: list[PairSurface] = []
     warnings: list[str] = []
-    for k, made in enumerate(in_turn(lambda k: followed(jobs[k]), range(len(jobs))), start=1):
-        stages.at("triangulate", k / len(jobs), f"pair {jobs[k - 1].name}")
-        if isinstance(made, str):
-            warnings.append(made)
+    for k, surface in enumerate(map_in_order(lambda k: reconstruct(jobs[k]), range(len(jobs))), start=1):
+        matching.stages.at("triangulate", k / len(jobs), f"pair {jobs[k - 1].name}")
+        if isinstance(surface, str):
+            warnings.append(surface)
         else:
-            found.append(made)
-    if not found:
+            surfaces.append(surface)
+    if not surfaces:
         raise ComputationError(f"{session.path}: no camera pair gave a surface: {'; '.join(warnings)}")
-    return found, warnings
+    return surfaces, warnings
 
 
-def _run(tasks: Sequence[Task], executor: Executor | None, stages: Stages, session: Session) -> None:
-    """Run the tasks and tell how far they are; outputs of long ago make room for theirs."""
-    whole = sum(task.cost for task in tasks)
-    began, done, points = time.monotonic(), 0.0, 0
-
-    def told(task: Task, ran: Ran, count: int, total: int) -> None:
-        nonlocal done, points
-        done += task.cost
-        points += ran.points
-        rate = f"{points / max(time.monotonic() - began, 1e-3):,.0f} points/s" if points else ""
-        stages.at("correlate", done / whole, f"{task.name} ({count} of {total})", rate)
-
-    stages.at("correlate", 0.0)
-    (executor or LocalExecutor()).run(tasks, told)
-    tidy(work_folder(session.path), tasks)
-
-
-def _whole_ring(
-    session: Session,
-    ring: CalibratedRig,
-    pairs: tuple[tuple[str, str], ...],
-    steps: tuple[Capture, ...],
-    settings: Settings,
-    stages: Stages,
-    executor: Executor | None,
-) -> RingSurface:
-    """One surface from all cameras that have a reference image, as tasks."""
-    from ringdic.multiview.surface import surface_of_tracks  # loaded where it is asked for: pairs need none of it
+def _global_surface(matching: _Matching) -> RingSurface:
+    """Match all cameras that have a reference image together, as tasks, and triangulate one surface."""
+    from ringdic.multiview.surface import surface_of_tracks  # imported here, since matching by pairs needs none of it
     from ringdic.multiview.tasks import ring_job
 
-    cameras = [each.camera for each in ring.cameras.values() if each.camera.id in steps[0].images]
-    job = ring_job(session, cameras, pairs, steps, _search(session, settings), settings)
-    _run(job.tasks, executor, stages, session)
+    session, settings, pairs, steps = matching.session, matching.settings, matching.pairs, matching.steps
+    cameras = [camera for camera in matching.cameras if camera.id in steps[0].images]
+    job = ring_job(session, cameras, pairs, steps, matching.search, settings)
+    matching.run(job.tasks)
     shape, tracks = job.found()
-    stages.at("triangulate", 0.0)
-    names = [step.id for step in steps]
-    return surface_of_tracks(session.rig.name, cameras, pairs, names, shape, tracks, settings)
-
-
-def _search(session: Session, settings: Settings) -> Search:
-    return Search(
-        radius=settings.surface.radius_mm or session.rig.target.radius_mm,
-        reach=settings.surface.reach_mm,
-        incidence=settings.surface.incidence_deg,
-    )
+    matching.stages.at("triangulate", 0.0)
+    return surface_of_tracks(session.rig.name, cameras, pairs, matching.names, shape, tracks, settings)

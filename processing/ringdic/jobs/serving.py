@@ -25,7 +25,7 @@ from ringdic.jobs.live_step import process_step
 from ringdic.jobs.pipeline import process_session
 from ringdic.progress import Progress, Report
 from ringdic.settings import load_settings
-from ringdic.tasks import kept
+from ringdic.tasks import process_memory
 
 Say = Callable[[dict[str, Any]], None]
 _MOST_KEPT, _USUAL_MEMORY = 4 << 30, 8 << 30  # bytes
@@ -38,7 +38,7 @@ def _memory() -> int:
         whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, OSError, ValueError):  # not told on this system
         whole = _USUAL_MEMORY
-    return int(min(_MOST_KEPT, max(kept.limit, whole // 4)))
+    return int(min(_MOST_KEPT, max(process_memory.limit, whole // 4)))
 
 
 class StoppedError(Exception):
@@ -49,7 +49,7 @@ def serve(lines: Iterable[str], say: Say) -> None:
     """Carry out the orders of ``lines``, warmed up before the first."""
     orders = _Orders(lines)
     began = time.monotonic()
-    kept.limit = _memory()
+    process_memory.limit = _memory()
     say({"worker": "warming"})
     compile_and_load()
     say({"worker": "ready", "seconds": round(time.monotonic() - began, 1)})

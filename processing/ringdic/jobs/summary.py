@@ -1,4 +1,4 @@
-"""The figures of a run that an operator reads first."""
+"""The summary of a run: counts, quality of the calibration, and figures of every step, as JSON values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ringdic.results.results import Results
 from ringdic.strain.deformation import Deformation
 from ringdic.strain.rigid_motion import RigidMotion
 
-#: Why nothing is stated of what the calibration adds.
+#: Why the uncertainty by the calibration is unknown where each camera was calibrated alone.
 ALONE = (
     "each camera was calibrated alone, which states no covariance: what the calibration adds to the uncertainty is not "
     "known; with calibration.method=bundle it is"
@@ -27,7 +27,10 @@ ALONE = (
 
 @dataclass(frozen=True)
 class StepFigures:
-    """What the summary tells of one step: its row, and the medians of its standard deviations, by cause."""
+    """The figures of one step in the summary.
+
+    row : counts and medians of the step. uncertainty : medians of its standard deviations by cause.
+    """
 
     row: dict[str, Any]
     uncertainty: dict[str, Any]
@@ -36,17 +39,24 @@ class StepFigures:
 def summarise(
     reference: Results,
     steps: Sequence[StepFigures],
-    ring: CalibratedRig,
+    rig: CalibratedRig,
     errors: dict[tuple[str, str], ReconstructionError],
     drift: Mapping[str, Floats],
     agreement: Mapping[str, Any],
     warnings: tuple[str, ...],
 ) -> dict[str, Any]:
-    """Counts, calibration quality and one row of figures a step, as JSON values; ``table`` is for the terminal.
+    """The summary of a run as JSON values; its ``table`` is what the terminal shows.
 
-    reference : the results of the reference alone. steps : all, the reference first.
-    drift : (F,) px by pair or camera, the mean vertical residual of each step: cameras that moved between frames.
-    agreement : of the surfaces of camera pairs, or of the cameras about the points that all measured together.
+    Parameters
+    ----------
+    reference : the results of the reference alone.
+    steps : figures of all steps, the reference first.
+    rig : the calibrated cameras.
+    errors : of the control points as each pair reconstructs them.
+    drift : (F,) px by pair or camera, the mean vertical reprojection residual at each step, which shows cameras that
+        moved between the steps.
+    agreement : of the surfaces of camera pairs, or of all cameras at the points that they measured together.
+    warnings : sentences for the operator.
     """
     control = {
         "mean_mm": _mean([error.mean for error in errors.values()]),
@@ -60,36 +70,39 @@ def summarise(
         "pairs": len(reference.pairs),
         "area_mm2": round(float(reference.mesh.areas.sum()), 1),
         "control_points": control,
-        "cameras": [asdict(row) for row in ring.quality],
-        "calibration": _calibration(ring),
+        "cameras": [asdict(row) for row in rig.quality],
+        "calibration": _calibration(rig),
         "drift_px": {who: _finite(values) for who, values in drift.items()},
         "agreement": dict(agreement),
         "strain": _strain(reference),
-        "uncertainty": {**last.uncertainty, "why": None if ring.bundle is not None else ALONE},
+        "uncertainty": {**last.uncertainty, "why": None if rig.bundle is not None else ALONE},
         "steps": [step.row for step in steps],
         "warnings": [*warnings, *drift_sentences(drift, names)],
     }
     return {**figures, "table": _table(figures)}
 
 
-def step_figures(results: Results, motion: RigidMotion, found: Deformation) -> StepFigures:
-    """The figures of the last step of some results, by its rigid motion back onto the reference and its deformation."""
+def step_figures(results: Results, motion: RigidMotion, deformation: Deformation) -> StepFigures:
+    """The figures of the last step of some results.
+
+    motion : takes this step back onto the reference. deformation : of this step since the reference.
+    """
     last = len(results.steps) - 1
-    return StepFigures(_row(results, last, motion, found), _uncertainty(results, last))
+    return StepFigures(_row(results, last, motion, deformation), _uncertainty(results, last))
 
 
-def _calibration(ring: CalibratedRig) -> dict[str, Any]:
-    """How the cameras were found and how well: the pairs, the target as adjusted, and what could be done better."""
+def _calibration(rig: CalibratedRig) -> dict[str, Any]:
+    """Method and quality of the calibration: figures of the pairs and of the adjustment, and advice."""
     return {
-        "method": "dlt" if ring.bundle is None else "bundle",
-        "pairs": [asdict(row) for row in ring.pairs],
-        "bundle": None if ring.bundle is None else ring.bundle.figures(ring.target),
-        "advice": list(ring.advice),
+        "method": "dlt" if rig.bundle is None else "bundle",
+        "pairs": [asdict(row) for row in rig.pairs],
+        "bundle": None if rig.bundle is None else rig.bundle.figures(rig.target),
+        "advice": list(rig.advice),
     }
 
 
 def _strain(results: Results) -> dict[str, float | None]:
-    """What a strain averages over, mm: each triangle alone, and the window if the run has one."""
+    """Gauge lengths of the strains, mm: of the triangles, and of the strain window where the run has one."""
     alone = gauge(results, 0.0)
     over = replace(alone, width=results.window_mm)
     return {
@@ -103,7 +116,7 @@ def _strain(results: Results) -> dict[str, float | None]:
 
 def _uncertainty(results: Results, step: int) -> dict[str, Any]:
     """Medians of the standard deviations at a step, by noise and by the calibration; None for what is not known."""
-    arrays = results.certainty(step).fields()
+    arrays = results.quality(step).fields()
     known = {entry.name: entry for entry in available(arrays.names)}
 
     def row(names: Mapping[str, str]) -> dict[str, float | None]:
@@ -122,7 +135,8 @@ def _uncertainty(results: Results, step: int) -> dict[str, Any]:
     }
 
 
-def _row(results: Results, step: int, motion: RigidMotion, found: Deformation) -> dict[str, Any]:
+def _row(results: Results, step: int, motion: RigidMotion, deformation: Deformation) -> dict[str, Any]:
+    """Counts, displacement, rigid motion and medians of the strains of a step."""
     current = results.vertices[step]
     measured = np.isfinite(current).all(axis=1)
     residual = np.linalg.norm(motion.apply(current) - results.vertices_ref, axis=1)
@@ -137,13 +151,14 @@ def _row(results: Results, step: int, motion: RigidMotion, found: Deformation) -
         else None,
         "rigid_rotation_deg": float(np.degrees(motion.angle)),
         "rigid_residual_rms_mm": _rms(residual),
-        "E_magnitude_median": _median(found.E_magnitude),
-        "lambda1_median": _median(found.lambda1),
-        "lambda2_median": _median(found.lambda2),
+        "E_magnitude_median": _median(deformation.E_magnitude),
+        "lambda1_median": _median(deformation.lambda1),
+        "lambda2_median": _median(deformation.lambda2),
     }
 
 
 def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
+    """The rows that the terminal and the web page show of a summary, as text."""
     control = figures["control_points"]
     rows = [
         {

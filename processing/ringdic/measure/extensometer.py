@@ -26,7 +26,7 @@ def extensometer(seen: EvaluatedResults, start: Place, end: Place) -> Table:
     path = shortest_path(mesh, start, end)
     rows: list[dict[str, Any]] = []
     for step, name in enumerate(seen.steps):
-        now, before = results.vertices[step], results.before(step, seen.evaluation.previous)
+        now, before = results.vertices[step], results.reference_positions(step, seen.evaluation.previous)
         row: dict[str, Any] = {"step": step, "capture": name}
         lengths = {
             "along_surface": [path.length(vertices, mesh.faces) for vertices in (now, before)],

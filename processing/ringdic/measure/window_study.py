@@ -52,7 +52,7 @@ def gauge(results: Results, width: float) -> Gauge:
         float(np.median(np.linalg.norm(np.diff(mesh.vertices[edges], axis=1)[:, 0], axis=1))) if len(edges) else np.nan
     )
     radius = _RADIUS_PX if results.radius_px is None else results.radius_px
-    return Gauge(float(width), step, (2 * radius + 1) / results.pixels_a_mm)
+    return Gauge(float(width), step, (2 * radius + 1) / results.pixels_per_mm)
 
 
 def _points(window: StrainWindow | None) -> float:

@@ -25,7 +25,7 @@ from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.multiview.lattice import Pieces
 from ringdic.multiview.warps import surface_stencil, warps_to
-from ringdic.uncertainty.matches import match_parts
+from ringdic.uncertainty.matches import match_uncertainty
 from ringdic.uncertainty.noise import flat_noise
 from ringdic.uncertainty.texture import Texture, TextureMap, texture_map
 
@@ -196,7 +196,7 @@ class _Parts:
         """
         a, b = cameras
         textures = ring.texture(a, found.xy), ring.texture(b, found.xy + found.uv)
-        parts = match_parts(found.sigma, found.c_ls, textures, (ring.noise(a), ring.noise(b)), found.gradient)
+        parts = match_uncertainty(found.sigma, found.c_ls, textures, (ring.noise(a), ring.noise(b)), found.gradient)
         self.noise[b, nodes], self.systematic[b, nodes] = parts.current**2, parts.systematic**2 / 2
         known = np.isfinite(parts.current).all(axis=1) & np.isfinite(parts.reference_systematic).all(axis=1)
         nodes = nodes[known]

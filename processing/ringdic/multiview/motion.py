@@ -18,7 +18,7 @@ from ringdic.multiview.matching import Image
 from ringdic.multiview.shape import ReferenceShape
 from ringdic.multiview.tracking import CameraTrack, Tracking, track
 from ringdic.multiview.weights import smooth_sigma
-from ringdic.uncertainty.matches import match_parts
+from ringdic.uncertainty.matches import match_uncertainty
 from ringdic.uncertainty.noise import camera_noise
 from ringdic.uncertainty.texture import Texture
 
@@ -132,7 +132,7 @@ def _parted(found: CameraTrack, texture: Texture, variance: float) -> tuple[Floa
     """Standard deviations (F, k, 2) px of the displacements by noise alone, and by all."""
     noise, total = np.zeros_like(found.sigma), np.zeros_like(found.sigma)
     for step in range(1, len(found.px)):
-        parts = match_parts(found.sigma[step], found.c_ls[step], (texture, texture), (variance, variance))
+        parts = match_uncertainty(found.sigma[step], found.c_ls[step], (texture, texture), (variance, variance))
         noise[step] = np.hypot(parts.reference, parts.current)
         total[step] = np.hypot(noise[step], parts.systematic)
     return noise, total

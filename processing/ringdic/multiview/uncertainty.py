@@ -19,7 +19,7 @@ from ringdic.uncertainty.position import (
     reference_covariance,
     step_covariance,
 )
-from ringdic.uncertainty.strain import corners_alike, stretch_sigma
+from ringdic.uncertainty.strain import corner_correlations, stretch_sigma
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def surface_uncertainty(
     position[0] = _sigma(reference_covariance(at_first, alone, reference, label))
     displacement[0], stretches[0] = 0.0, 0.0
     places = np.stack([camera.project(shape.xyz) for camera in cameras])
-    alike = corners_alike(places, shape.faces, radius, order)
+    alike = corner_correlations(places, shape.faces, radius, order)
     for step in range(1, steps):
         sigma, noise = _of_step(len(cameras), motion, step)
         gain = position_gain(cameras, motion.xyz[step], sigma)

@@ -30,7 +30,7 @@ from ringdic.pairs.tracking import (
 from ringdic.session.folder import Capture, Session
 from ringdic.session.images import read_mask
 from ringdic.sweep.sweep import Search
-from ringdic.tasks import Arrays, Task, code_stamp, digest, kept, read_output, work_folder
+from ringdic.tasks import Arrays, Task, code_stamp, digest, process_memory, read_output, work_folder
 from ringdic.tasks.step_images import Digests, step_image
 
 _REFERENCE_COST = 2.0  # of a pair, in steps of a camera
@@ -49,7 +49,8 @@ class CameraJob:
         task = self.steps[step - 1]
         if task is None:
             return None
-        found = kept.get(("followed", str(task.output)), lambda: _followed(task.output), _bytes)  # of two pairs
+        # Cached, since two pairs use it.
+        found = process_memory.get(("followed", str(task.output)), lambda: _followed(task.output), _bytes)
         return places(found, xy)
 
 
@@ -183,7 +184,7 @@ def _prepared(
         grid, reference = value
         return reference_bytes(reference, len(grid.xy), settings) + grid.region.nbytes + grid.xy.nbytes
 
-    return kept.get(("reference", camera.id, *map(str, pairs)), make, size)
+    return process_memory.get(("reference", camera.id, *map(str, pairs)), make, size)
 
 
 def _followed(output: Path) -> CameraMatches:

@@ -18,7 +18,7 @@ from ringdic.report.document import Document, figure
 from ringdic.report.gathered import Gathered, gather
 from ringdic.report.hardware import camera_facts
 from ringdic.report.noise import STATED, noise, noise_rows
-from ringdic.results.evaluation import EvaluatedResults, evaluated
+from ringdic.results.evaluation import EvaluatedResults, evaluate_results
 from ringdic.results.results import Results
 from ringdic.session.folder import Session, newest_results, open_session
 
@@ -51,7 +51,7 @@ def write_report(
     out = results_path.parent / "report.html" if out is None else Path(out)
     if out.is_dir() or not out.parent.is_dir():
         raise InputError(f"{out}: not a file in a folder that is there; give the name of an HTML file")
-    session, seen = open_session(session_path), evaluated(results_path)
+    session, seen = open_session(session_path), evaluate_results(results_path)
     results = seen.results
     document = Document(
         f"{session.name}: report of run {results_path.parent.name}",

@@ -1,1 +1,14 @@
-"""What a run of the processing found, the file that keeps it, and what can be evaluated from it."""
+"""The results of a run of the processing, the file that they are stored in, and what is evaluated from them.
+
+``results``        the results and the 2D matches, as arrays
+``series``         results of many steps, one step at a time
+``layout``         the layout of the file, results.h5, which ``writer`` writes and ``reader`` reads
+``vtkhdf``         the part of the file that ParaView opens
+``fields``         the table of fields, and their values at one step
+``ranges``         ranges of the fields over all steps, for colour scales
+``evaluation``     results with another reference step, strain window or family of strains than the run's
+``uncertainty``    completes results with the standard deviations that follow from their matches and cameras
+``noise_floor``    statistics of a specimen at rest
+``colours``        colours of field values
+``json_values``    arrays and numbers as JSON values
+"""

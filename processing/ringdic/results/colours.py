@@ -1,6 +1,7 @@
-"""Colours of field values: a sequential scale for magnitudes, a diverging one for what has a middle.
+"""Colours of field values: a sequential scale for magnitudes, a diverging one for values about a centre.
 
-The scales are those of the page, made in the perceptual space OKLCH (Ottosson 2020) so that equal steps look equal.
+The scales are those of the web page, built in the perceptual colour space OKLCH (Ottosson 2020), in which equal steps
+look equal.
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ _LINEAR_FROM_CUBES = np.array(
 
 
 def colours(values: Floats, low: float, high: float, diverging: bool = False) -> Floats:
-    """sRGB colours (..., 3) from 0 to 1 of values (...) between two limits; what is not finite is grey.
+    """sRGB colours of field values on a scale between two limits.
 
-    Sequential: dark violet over blue and green to light yellow. Diverging: blue over near-white to red.
+    values : (...) in any unit; values beyond the limits get the end colours. low, high : the limits.
+    diverging : from blue over near-white to red, instead of from dark violet over blue and green to light yellow.
+    Returns (..., 3) sRGB from 0 to 1; grey where a value is not finite.
     """
     values = np.asarray(values, dtype=float)
     share = np.clip((values - low) / max(high - low, 1e-300), 0.0, 1.0)
@@ -39,11 +42,12 @@ def colours(values: Floats, low: float, high: float, diverging: bool = False) ->
 
 
 def _linear(lightness: Floats, chroma: Floats, hue: Floats) -> Floats:
+    """Linear sRGB (..., 3) of OKLCH colours (...), hue in rad; clipped to 0 … 1."""
     plane = np.stack([chroma * np.cos(hue), chroma * np.sin(hue)], axis=-1)
     cubes = (lightness[..., None] + plane @ _FROM_OKLAB.T) ** 3
     return np.clip(cubes @ _LINEAR_FROM_CUBES.T, 0.0, 1.0)
 
 
 def _encoded(linear: Floats) -> Floats:
-    """sRGB's transfer curve (IEC 61966-2-1)."""
+    """sRGB values of linear ones, by the transfer curve of IEC 61966-2-1."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)

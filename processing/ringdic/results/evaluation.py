@@ -1,6 +1,6 @@
-"""Results looked at in another way than they were stored in: another reference, another window, another strain.
+"""Results evaluated with another reference step, another strain window or another family of strains than the run's.
 
-Everything follows from the stored positions; nothing is correlated again.
+Every field is computed from the stored positions; no image is correlated again.
 """
 
 from __future__ import annotations
@@ -9,24 +9,27 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Indices, Mask, Points
 from ringdic.errors import InputError
 from ringdic.mesh.mesh import Mesh
 from ringdic.results.fields import Field, StepFields, available, field, seth_hill_fields
 from ringdic.results.ranges import Ranges, even_limits
-from ringdic.results.results import Results, read_results
+from ringdic.results.reader import read_results
+from ringdic.results.results import Results
 from ringdic.strain.window import StrainWindow, strain_window
 from ringdic.uncertainty.window import WindowScatter
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How fields are made of positions.
+    """How the fields are computed from the positions.
 
-    previous : each step is compared with the one before it, not with the reference.
-    rigid_motion_removed : each step is first moved back onto what it is compared with.
-    window : width of the strain window, mm; 0 for none, None for the one that the run was told to use.
-    exponent : of a Seth-Hill family of strains that is wanted beside the others.
+    previous : each step is compared with the one before it, instead of with the reference.
+    rigid_motion_removed : each step is first moved back by its rigid motion.
+    window : width of the strain window, mm; 0 for none, None for that of the run's settings.
+    exponent : of a Seth-Hill family of strains to add to the others; None for none.
+
+    Raises InputError for a width outside 0 … 1000 mm or an exponent outside -20 … 20.
     """
 
     previous: bool = False
@@ -48,14 +51,17 @@ class Evaluation:
         window: float | None = None,
         exponent: float | None = None,
     ) -> Evaluation:
-        """The same by words: reference is "first" or "previous". Raises InputError for anything else."""
+        """The evaluation whose reference is given by a word: "first", or "previous" for the step before each step.
+
+        Raises InputError for any other word; the other arguments are those of the class.
+        """
         if reference not in ("first", "previous"):
             raise InputError(f"a step is compared with the 'first' or the 'previous' one, not with '{reference}'")
         return cls(reference == "previous", rigid_motion_removed, window, exponent)
 
 
 class EvaluatedResults:
-    """Results under an evaluation. Steps are computed when they are asked for, one at a time."""
+    """Results with the fields of an evaluation, which are computed a step at a time when they are asked for."""
 
     def __init__(self, results: Results, evaluation: Evaluation = Evaluation()) -> None:
         self.results = results
@@ -64,18 +70,18 @@ class EvaluatedResults:
 
     @property
     def steps(self) -> tuple[str, ...]:
-        """Names of the steps, the reference first."""
+        """Capture ids of the steps, the reference first."""
         return self.results.steps
 
     @cached_property
     def window(self) -> StrainWindow | None:
-        """The windows that strain is fitted over, if any."""
+        """The windows over which strain is fitted; None for strain of the triangles alone."""
         width = self.results.window_mm if self.evaluation.window is None else self.evaluation.window
         return strain_window(self.results.mesh, width) if width > 0 else None
 
     @cached_property
     def fields(self) -> tuple[Field, ...]:
-        """The fields there are."""
+        """All fields that these results have under this evaluation."""
         exponent = self.evaluation.exponent
         return (*available(self._names), *(() if exponent is None else seth_hill_fields(exponent)))
 
@@ -88,7 +94,7 @@ class EvaluatedResults:
         return self.step(0).names
 
     def field(self, name: str) -> Field:
-        """The field of a name. Raises InputError if these results, so evaluated, do not have it."""
+        """The field of a name; raises InputError if the results do not have it under this evaluation."""
         try:
             entry = field(name)
         except KeyError:
@@ -100,7 +106,7 @@ class EvaluatedResults:
         return entry
 
     def step(self, step: int) -> StepFields:
-        """The arrays of a step; those of the step asked for last are kept."""
+        """The arrays of a step from which every field follows; those of the last step asked for are cached."""
         if self._last is None or self._last[0] != step:
             how = self.evaluation
             self._last = (
@@ -109,22 +115,26 @@ class EvaluatedResults:
             )
         return self._last[1]
 
-    def positions(self, step: int) -> Floats:
-        """Positions of the vertices, (N, 3) mm, NaN where lost; moved back if the rigid motion is removed."""
+    def positions(self, step: int) -> Points:
+        """Positions of the vertices at a step, (N, 3) mm, NaN where lost; without the rigid motion if it is removed."""
         current = self.results.vertices[step]
         if self.evaluation.rigid_motion_removed:
             return self.results.motion(step, self.evaluation.previous).apply(current)
         return current
 
     def measured(self, step: int) -> tuple[Mesh, Indices, Mask]:
-        """The measured part of a step, the old index (K,) of its vertices, and which triangles (M,) it has."""
-        moved = Mesh(self.positions(step), self.results.faces)
-        whole = moved.whole_faces()
-        mesh, kept = Mesh(moved.vertices, moved.faces[whole]).compact()
-        return mesh, kept, whole
+        """The measured part of the surface at a step.
+
+        Returns its mesh of K vertices, mm; (K,) indices of these vertices in the results; and (M,) bool, which
+        triangles of the results it consists of.
+        """
+        surface = Mesh(self.positions(step), self.results.faces)
+        whole = surface.whole_faces()
+        mesh, index = Mesh(surface.vertices, surface.faces[whole]).compact()
+        return mesh, index, whole
 
     def limits(self, name: str) -> tuple[float, float]:
-        """Limits of a colour scale over all steps; even about the centre where the field has one."""
+        """Limits of a field's colour scale over all steps, symmetric about the field's centre where it has one."""
         entry = self.field(name)
         ranges = Ranges((entry,))
         for step in range(len(self.steps)):
@@ -132,6 +142,6 @@ class EvaluatedResults:
         return even_limits(ranges.table()[0]["range"], entry.centre)
 
 
-def evaluated(results_path: Path, evaluation: Evaluation = Evaluation()) -> EvaluatedResults:
-    """The results of a file under an evaluation, without the 2D matches."""
+def evaluate_results(results_path: Path, evaluation: Evaluation = Evaluation()) -> EvaluatedResults:
+    """The results in a file under an evaluation, read without the 2D matches."""
     return EvaluatedResults(read_results(results_path, matches=False), evaluation)

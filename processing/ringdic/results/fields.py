@@ -1,9 +1,10 @@
-"""The fields of a result: one table of what there is, and their values at one step.
+"""The table of scalar fields of a result, and the arrays of one step from which they are computed.
 
-Every strain is a function of the two principal values E1, E2 and of directions, so few arrays are kept and the table
-says how each field follows from them. A rigid motion changes displacements, the Euler-Almansi tensor and directions in
-the current configuration; stretches, J, principal strains, magnitudes, equivalent strain, shear and isotropy are the
-same with and without it. Linear strain would take a rotation for strain and is always that after the rigid motion.
+Every strain is a function of the two principal values E1, E2 of the Green-Lagrange strain and of their directions, so
+few arrays are stored and the table gives the function for each field. A rigid motion changes displacements, the
+Euler-Almansi tensor and directions in the current configuration; stretches, J, principal strains, magnitudes,
+equivalent strain, shear and isotropy do not depend on it. Linear strain would take a rotation for strain, so it is
+always computed after the rigid motion is removed.
 """
 
 from __future__ import annotations
@@ -15,12 +16,19 @@ from typing import Any
 
 import numpy as np
 
-from ringdic.arrays import Floats, Indices
+from ringdic.arrays import Floats, Indices, Points
 from ringdic.strain import families as strain
 from ringdic.strain.deformation import Deformation, deformation
 from ringdic.strain.rigid_motion import RigidMotion
 from ringdic.strain.window import StrainWindow
 from ringdic.uncertainty.window import WindowScatter
+
+#: Arrays of a result that not every run has. "point" : a number a vertex. "vector" : three numbers a vertex.
+#: "face" : two numbers a triangle.
+OPTIONAL_ARRAYS = {
+    "sigma_displacement": "vector", "sigma_lambda": "face", "chi2": "point", "sigma_calibration": "vector",
+    "sigma_displacement_calibration": "vector", "sigma_lambda_calibration": "face",
+}  # fmt: skip
 
 
 def _itself(values: Floats) -> Floats:
@@ -29,11 +37,12 @@ def _itself(values: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Field:
-    """One scalar field.
+    """A scalar field: its name, unit and location, and the function that computes it from arrays of a step.
 
-    location : "point" or "face". centre : where a diverging colour scale has its middle, None for a sequential one.
+    location : "point" or "face". centre : middle of the diverging colour scale, None for a sequential one.
     rigid : whether removing the rigid motion changes it. group : heading under which lists of fields show it.
-    of, value : the arrays that it follows from, by name, and how.
+    of : names of the arrays that it is computed from; its own name by default. value : the function of these arrays,
+        (N, ...) of the vertices or (M, ...) of the triangles, which returns (N,) or (M,).
     """
 
     name: str
@@ -53,12 +62,15 @@ class Field:
             object.__setattr__(self, "of", (self.name,))
 
     def row(self) -> dict[str, Any]:
-        """The field in a catalogue, as JSON values."""
+        """The field's description as JSON values: all but the function that computes it."""
         names = ("name", "label", "unit", "location", "centre", "rigid", "group")
         return {name: getattr(self, name) for name in names}
 
     def from_arrays(self, array: Callable[[str], Floats], rigid_motion_removed: bool = False) -> Floats:
-        """Its values, from what ``array`` knows under the names in ``of``."""
+        """Values of the field, (N,) or (M,) by its location, in its unit.
+
+        array : returns the array of a name in ``of``. rigid_motion_removed : the values after the rigid motion.
+        """
         suffix = "_without_rigid_motion" if self.rigid and rigid_motion_removed else ""
         with np.errstate(invalid="ignore", divide="ignore"):
             return self.value(*(array(name + suffix) for name in self.of))
@@ -77,16 +89,17 @@ def _stretch(E: Floats) -> Floats:
 
 
 def _seth_hill(m: float, E: Floats) -> Floats:
-    """Principal strain of the Seth-Hill family m from that of Green-Lagrange; small strains keep their digits."""
+    """Principal strain of the Seth-Hill family m from the Green-Lagrange one E, without cancellation at small E."""
     return strain.seth_hill_of_log(0.5 * np.log1p(2.0 * E), m)
 
 
 def _bazant(E: Floats) -> Floats:
-    """The same of Bažant's family with m = 1, ½ (λ - 1/λ)."""
+    """Principal strain of Bažant's family with m = 1, ½ (λ - 1/λ), from the Green-Lagrange one E."""
     return np.sinh(0.5 * np.log1p(2.0 * E))
 
 
 def _scalar(measure: Callable[[Floats, Floats], Floats], principal: Callable[[Floats], Floats], *two: Floats) -> Floats:
+    """A scalar measure of the two principal strains of a family, which follow from those of Green-Lagrange."""
     return measure(*(principal(values) for values in two))
 
 
@@ -102,6 +115,10 @@ _SCALARS: tuple[tuple[str, str, Callable[[Floats, Floats], Floats], float | None
 def _family(
     name: str, label: str, principal: Callable[[Floats], Floats], of: tuple[str, str] = ("E1", "E2")
 ) -> Iterator[Field]:
+    """The fields of a family of strains: both principal strains, magnitude, equivalent strain and largest shear.
+
+    principal : the family's principal strain from an array in ``of``.
+    """
     symbol = f"{label} {name}" if name in "Ee" else label
     for suffix, scalar, measure, centre in _SCALARS:
         text = f"{symbol}{suffix}, {scalar}" if name in "Ee" and suffix in "12" else f"{symbol}, {scalar}"
@@ -129,7 +146,7 @@ _OVER_WINDOW = ("J", "lambda1", "lambda2", "E1", "E2", "E_magnitude", "E_equival
 
 
 def _windowed(entry: Field) -> Field:
-    """The same field over the strain window."""
+    """The field computed from the deformation over the strain window instead of that of the triangle."""
     return replace(
         entry, name=f"window_{entry.name}", label=f"Window: {entry.label}", group="Over the strain window",
         of=("window_E1", "window_E2"), value=_OVER_STRETCHES.get(entry.name, entry.value),
@@ -189,15 +206,16 @@ FIELDS = (
 )  # fmt: skip
 
 _DIRECTIONS = ("direction1_reference", "direction2_reference", "direction1_current", "direction2_current")
-#: VTK's order of a symmetric tensor.
+#: Components of a symmetric tensor in the order of VTK.
 _SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 
 
 @dataclass(frozen=True)
 class StepFields:
-    """Arrays of one step by name, in full precision: ``point`` (N, ...) and ``face`` (M, ...).
+    """The arrays of one step from which every field follows, in full precision.
 
-    Vectors are (·, 3); symmetric tensors (·, 6) in the order xx yy zz xy yz xz.
+    point : (N, ...) of the vertices, by name. face : (M, ...) of the triangles, by name.
+    Scalars have no second axis; vectors are (·, 3), symmetric tensors (·, 6) in the order xx yy zz xy yz xz.
     """
 
     point: dict[str, Floats]
@@ -205,22 +223,22 @@ class StepFields:
 
     @property
     def names(self) -> set[str]:
-        """The arrays there are."""
+        """Names of all arrays."""
         return {*self.point, *self.face}
 
     def scalar(self, entry: Field, rigid_motion_removed: bool = False) -> Floats:
-        """The values of a field, (N,) or (M,)."""
+        """Values of a field in its unit, (N,) where its location is "point", (M,) where it is "face"."""
         arrays = self.point if entry.location == "point" else self.face
         return entry.from_arrays(arrays.__getitem__, rigid_motion_removed)
 
 
 @dataclass(frozen=True)
 class StepQuality:
-    """What is known of each point and triangle beside its place, at one step; None where it is not known.
+    """Correlation and standard deviations of the points and triangles at one step; None for what is not known.
 
-    correlation : (N,) C_LS. sigma_xyz, sigma_displacement : (N, 3) mm and sigma_lambda : (M, 2), by the noise of the
-    images. chi2 : (N,). sigma_calibration, sigma_displacement_calibration : (N, 3) mm and sigma_lambda_calibration :
-    (M, 2), by the covariance of the cameras.
+    correlation : (N,) C_LS. sigma_xyz, sigma_displacement : (N, 3) mm, and sigma_lambda : (M, 2), of λ1 and λ2, all by
+    the noise of the images. chi2 : (N,) χ² a degree of freedom. sigma_calibration, sigma_displacement_calibration :
+    (N, 3) mm, and sigma_lambda_calibration : (M, 2), by the covariance of the cameras' parameters.
     """
 
     correlation: Floats
@@ -233,24 +251,23 @@ class StepQuality:
     sigma_lambda_calibration: Floats | None = None
 
     def fields(self) -> StepFields:
-        """What is known, as arrays of the points and the triangles."""
-        on_points = (
-            "correlation", "sigma_xyz", "sigma_displacement", "chi2", "sigma_calibration",
-            "sigma_displacement_calibration",
-        )  # fmt: skip
-        point = {name: getattr(self, name) for name in on_points}
+        """The arrays that are known, by name; those of λ1 and λ2 with 1 and 2 appended to the name."""
+        point = {"correlation": self.correlation, "sigma_xyz": self.sigma_xyz}
         face: dict[str, Floats] = {}
-        for name in ("sigma_lambda", "sigma_lambda_calibration"):
-            if (sigma := getattr(self, name)) is not None:
-                face[f"{name}1"], face[f"{name}2"] = sigma.T
-        return StepFields({name: values for name, values in point.items() if values is not None}, face)
+        for name, kind in OPTIONAL_ARRAYS.items():
+            values = getattr(self, name)
+            if values is not None and kind == "face":
+                face[f"{name}1"], face[f"{name}2"] = values.T
+            elif values is not None:
+                point[name] = values
+        return StepFields(point, face)
 
 
 def field(name: str) -> Field:
-    """The field of a name; KeyError if there is none.
+    """The field of a name; raises KeyError where there is none.
 
-    Beside those of the table, ``seth_hill1:M``, ``seth_hill2:M``, ``seth_hill_magnitude:M``, … for any exponent M, and
-    every field of deformation as ``window_…``.
+    The names are those of the table ``FIELDS``; ``seth_hill1:M``, ``seth_hill2:M``, ``seth_hill_magnitude:M``, … with
+    any exponent M; and ``window_`` before the name of any field of strain, for that field over the strain window.
     """
     for entry in FIELDS:
         if entry.name == name:
@@ -267,77 +284,82 @@ def field(name: str) -> Field:
 
 
 def seth_hill_fields(exponent: float) -> tuple[Field, ...]:
-    """The fields of the Seth-Hill family with any exponent."""
+    """The fields of the Seth-Hill family of strains with one exponent."""
     fields = _family("seth_hill", f"Seth-Hill m = {exponent:g}", partial(_seth_hill, exponent))
     return tuple(replace(entry, name=f"{entry.name}:{exponent:g}") for entry in fields)
 
 
 def available(names: Collection[str]) -> tuple[Field, ...]:
-    """The fields of the table that follow from the arrays there are."""
+    """The fields of the table that can be computed from the arrays of some names."""
     return tuple(entry for entry in FIELDS if set(entry.of) <= set(names))
 
 
 def compute_fields(
-    reference: Floats,
-    current: Floats,
+    reference: Points,
+    current: Points,
     faces: Indices,
     to_reference: RigidMotion,
-    certainty: StepQuality,
+    quality: StepQuality,
     pair: Indices,
     window: StrainWindow | None = None,
     scatter: WindowScatter | None = None,
-    found: Deformation | None = None,
+    known_deformation: Deformation | None = None,
     both_tensors: bool = True,
 ) -> StepFields:
-    """All arrays of one step.
+    """All arrays of one step: displacements, deformation, strain over the windows, and quality.
 
     Parameters
     ----------
-    reference, current : (N, 3) mm, NaN where lost. faces : (M, 3). pair : (M,).
-    to_reference : the motion that takes the step back onto the reference.
-    window : the windows of the triangles, for strain over a window beside that of each triangle.
-    scatter : of the windows, for its standard deviations where those of the displacements are known.
-    found : the deformation from one to the other, where it is known.
-    both_tensors : the Euler-Almansi tensor too, which no field follows from.
+    reference, current : (N, 3) mm, positions of the vertices at the reference and at the step, NaN where lost.
+    faces : (M, 3) vertex indices.
+    to_reference : the rigid motion that takes the step back onto the reference.
+    quality : correlation and standard deviations at the step.
+    pair : (M,) index of the camera pair of each triangle.
+    window : adds strain over these windows to that of the triangles.
+    scatter : adds standard deviations of the strain over the windows, where those of the displacements are known.
+    known_deformation : from the reference to the step; computed where it is None.
+    both_tensors : whether to add the Euler-Almansi tensor, from which no field follows.
     """
-    found = deformation(reference, current, faces) if found is None else found
-    known = certainty.fields()
+    deformed = deformation(reference, current, faces) if known_deformation is None else known_deformation
+    known = quality.fields()
     point = {
         "displacement": current - reference,
         "displacement_without_rigid_motion": to_reference.apply(current) - reference,
         **known.point,
     }
     face = {
-        **_of_deformation(found, both_tensors),
-        **_linear(found, to_reference),
-        "isotropy": found.isotropy,
-        "area": found.area,
-        "face_correlation": certainty.correlation[faces].max(axis=1),
+        **_deformation_arrays(deformed, both_tensors),
+        **_linear(deformed, to_reference),
+        "isotropy": deformed.isotropy,
+        "area": deformed.area,
+        "face_correlation": quality.correlation[faces].max(axis=1),
         "pair": pair.astype(float),
         **known.face,
     }
     if window is not None:
         over = window.deformation(current, reference)
-        face |= {f"window_{name}": values for name, values in _of_deformation(over, both_tensors).items()}
-        if scatter is not None and certainty.sigma_displacement is not None:
-            sigma = scatter.stretch_sigma(over, certainty.sigma_displacement)
+        face |= {f"window_{name}": values for name, values in _deformation_arrays(over, both_tensors).items()}
+        if scatter is not None and quality.sigma_displacement is not None:
+            sigma = scatter.stretch_sigma(over, quality.sigma_displacement)
             face["window_sigma_lambda1"], face["window_sigma_lambda2"] = sigma.T
     return StepFields(point, face)
 
 
-def _of_deformation(found: Deformation, both_tensors: bool) -> dict[str, Floats]:
+def _deformation_arrays(deformed: Deformation, both_tensors: bool) -> dict[str, Floats]:
+    """Area ratio, stretches, principal strains, directions and strain tensors of a deformation, by name."""
     names = ("J", "lambda1", "lambda2", "E1", "E2", *_DIRECTIONS)
-    tensors = {"E_tensor": _six(found.E)} | ({"e_tensor": _six(found.e)} if both_tensors else {})
-    return {**{name: getattr(found, name) for name in names}, **tensors}
+    tensors = {"E_tensor": _six(deformed.E)} | ({"e_tensor": _six(deformed.e)} if both_tensors else {})
+    return {**{name: getattr(deformed, name) for name in names}, **tensors}
 
 
-def _linear(found: Deformation, to_reference: RigidMotion) -> dict[str, Floats]:
-    """Principal linear strains, after the rigid motion: what is left of the rotation counts as strain."""
-    values = strain.infinitesimal_principal(found.F, found.normal_reference, to_reference.R)
+def _linear(deformed: Deformation, to_reference: RigidMotion) -> dict[str, Floats]:
+    """Principal linear strains after the rigid motion; they count each triangle's remaining rotation as strain."""
+    values = strain.infinitesimal_principal(deformed.F, deformed.normal_reference, to_reference.R)
     return dict(zip(("linear1", "linear2"), values, strict=True))
 
 
 def _six(tensor: Floats) -> Floats:
+    """The components (..., 6) of symmetric tensors (..., 3, 3) in the order of VTK."""
     return np.take(tensor.reshape(*tensor.shape[:-2], 9), [3 * i + j for i, j in _SYMMETRIC], axis=-1)
 
 

@@ -1,4 +1,4 @@
-"""Values as JSON knows them."""
+"""Arrays and numbers of numpy as JSON values."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 
-def plain(value: Any) -> Any:
-    """The same as JSON knows it: arrays as lists, what is not finite as null."""
+def json_value(value: Any) -> Any:
+    """A value as nested dicts, lists and scalars: arrays become lists, numbers that are not finite become None."""
     if isinstance(value, dict):
-        return {str(key): plain(inner) for key, inner in value.items()}
+        return {str(key): json_value(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
-        return [plain(inner) for inner in value]
+        return [json_value(inner) for inner in value]
     if isinstance(value, np.generic):
-        return plain(value.item())
+        return json_value(value.item())
     return None if isinstance(value, float) and not math.isfinite(value) else value

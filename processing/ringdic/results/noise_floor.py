@@ -1,6 +1,6 @@
-"""The noise floor of a run: what it measures where nothing happens, from captures of the specimen at rest.
+"""The noise floor of a run: statistics of the motion and strain that it measures on captures of the specimen at rest.
 
-Captures of kind ``static`` are followed as steps right after the reference, then taken out of the results again.
+Captures of kind ``static`` are tracked as steps right after the reference and left out of the results.
 """
 
 from __future__ import annotations
@@ -15,24 +15,34 @@ from ringdic.strain.window import strain_window
 
 
 def noise_floor(at_rest: Results) -> dict[str, Any]:
-    """Statistics over all captures at rest, the steps after the reference, as JSON values.
+    """Statistics of displacement, stretch and strain over all captures at rest, as JSON values.
 
-    ``quantities`` : by name label, unit, mean, std, rms and median of the values and p95 of their magnitudes; None
-    where nothing was measured. ``moved_mm`` : the largest median displacement of a capture, which tells of a specimen
-    or of cameras that did move. ``displacement_rest`` is what stays after the rigid motion is taken out.
+    at_rest : results whose steps after the reference are the captures at rest.
+    Returns a dictionary: ``captures``, ``steps`` : their number and ids. ``moved_mm`` : the largest median displacement
+    of a capture, which shows whether the specimen or the cameras did move. ``quantities`` : by name the label, unit,
+    mean, std, rms and median of the values and p95 of their magnitudes, None where nothing was measured;
+    ``displacement_rest`` among them is the displacement after the rigid motion is removed.
     """
     steps = range(1, len(at_rest.steps))
-    moved = [at_rest.vertices[k] - at_rest.vertices_ref for k in steps]
-    rest = [at_rest.motion(k).apply(at_rest.vertices[k]) - at_rest.vertices_ref for k in steps]
-    alone = [at_rest.deformation(k) for k in steps]
-    lengths = [np.linalg.norm(each, axis=1) for each in moved]
+    displacements = [at_rest.vertices[k] - at_rest.vertices_ref for k in steps]
+    residuals = [at_rest.motion(k).apply(at_rest.vertices[k]) - at_rest.vertices_ref for k in steps]
+    deformations = [at_rest.deformation(k) for k in steps]
+    lengths = [np.linalg.norm(each, axis=1) for each in displacements]
     rows: list[tuple[str, str, str, list[Floats]]] = [
         ("displacement", "Displacement", "mm", lengths),
-        *((f"displacement_{a}", f"Displacement {a}", "mm", [d[:, i] for d in moved]) for i, a in enumerate("xyz")),
-        ("displacement_rest", "Displacement, rigid motion removed", "mm", [np.linalg.norm(d, axis=1) for d in rest]),
-        ("lambda1", "Smaller stretch λ1 − 1", "", [found.lambda1 - 1.0 for found in alone]),
-        ("lambda2", "Larger stretch λ2 − 1", "", [found.lambda2 - 1.0 for found in alone]),
-        ("E_magnitude", "Green-Lagrange strain, magnitude", "", [found.E_magnitude for found in alone]),
+        *(
+            (f"displacement_{a}", f"Displacement {a}", "mm", [d[:, i] for d in displacements])
+            for i, a in enumerate("xyz")
+        ),
+        (
+            "displacement_rest",
+            "Displacement, rigid motion removed",
+            "mm",
+            [np.linalg.norm(d, axis=1) for d in residuals],
+        ),
+        ("lambda1", "Smaller stretch λ1 − 1", "", [each.lambda1 - 1.0 for each in deformations]),
+        ("lambda2", "Larger stretch λ2 − 1", "", [each.lambda2 - 1.0 for each in deformations]),
+        ("E_magnitude", "Green-Lagrange strain, magnitude", "", [each.E_magnitude for each in deformations]),
     ]
     if at_rest.window_mm > 0:
         window = strain_window(at_rest.mesh, at_rest.window_mm)

@@ -1,4 +1,4 @@
-"""Ranges of the fields over the steps of a result, for colour scales."""
+"""Ranges of the fields over the steps of some results, for colour scales."""
 
 from __future__ import annotations
 
@@ -12,25 +12,26 @@ from numpy.typing import NDArray
 from ringdic.arrays import Floats
 from ringdic.results.fields import Field, StepFields
 
+#: Percentiles 0, 2, 98 and 100 of fields at one step, by name and whether the rigid motion is removed.
 Extent = dict[tuple[str, bool], Floats | None]
 
 _PERCENTILES = np.array([0.0, 2.0, 98.0, 100.0])
-_FEW = 4096  # numbers that are sorted sooner than counted
+_FEW = 4096  # so many numbers or fewer are sorted faster by comparing than by counting
 
 
 class Ranges:
-    """Gathers, step by step, the extremes and the 2nd and 98th percentiles of some fields."""
+    """The extremes and the 2nd and 98th percentiles of some fields, collected step by step."""
 
     def __init__(self, fields: Sequence[Field]) -> None:
         self._fields = tuple(fields)
-        self._seen: dict[tuple[str, bool], list[Floats | None]] = {}
+        self._extents: dict[tuple[str, bool], list[Floats | None]] = {}
 
     def add(self, fields: StepFields) -> None:
-        """Take one more step in; the reference comes first."""
+        """Add the fields of the next step; the reference comes first."""
         self.take(self.extent(fields))
 
     def extent(self, fields: StepFields) -> Extent:
-        """What :meth:`take` wants to know of a step; it can be found for several steps at a time."""
+        """The percentiles of one step, for :meth:`take`; several threads may compute those of several steps."""
         return {
             (entry.name, removed): percentiles(fields.scalar(entry, removed).astype(np.float32))
             for entry in self._fields
@@ -38,12 +39,12 @@ class Ranges:
         }
 
     def take(self, extent: Extent) -> None:
-        """Take the extent of one more step in; that of the reference comes first."""
+        """Add the percentiles of the next step; the reference comes first."""
         for key, values in extent.items():
-            self._seen.setdefault(key, []).append(values)
+            self._extents.setdefault(key, []).append(values)
 
     def table(self) -> list[dict[str, Any]]:
-        """The catalogue of fields with their ranges, as JSON values."""
+        """The table of fields with their ranges, as JSON values: a dictionary for each field."""
         rows: list[dict[str, Any]] = []
         for entry in self._fields:
             row = entry.row()
@@ -55,17 +56,24 @@ class Ranges:
         return rows
 
     def _spans(self, key: tuple[str, bool]) -> tuple[list[float] | None, list[list[float] | None]]:
-        """The range over all steps (without the reference, where nothing moves, if there are more) and of each step."""
-        seen = self._seen.get(key, [])
-        spans = [None if step is None else [float(step[0]), float(step[3])] for step in seen]
-        moving = [step for step in (seen[1:] or seen) if step is not None]
+        """The range over all steps, and [least, greatest] of each step; None where nothing was measured.
+
+        The reference, in which nothing moves, counts only where it is the only step.
+        """
+        extents = self._extents.get(key, [])
+        spans = [None if step is None else [float(step[0]), float(step[3])] for step in extents]
+        moving = [step for step in (extents[1:] or extents) if step is not None]
         if not moving:
             return None, spans
         return [float(min(step[1] for step in moving)), float(max(step[2] for step in moving))], spans
 
 
 def even_limits(span: Sequence[float] | None, centre: float | None) -> tuple[float, float]:
-    """Limits of a colour scale that shows a span: even about the centre where there is one, and never of no width."""
+    """Limits (low, high) of a colour scale for a range of values.
+
+    span : [low, high], None for an unknown range. centre : the limits are symmetric about it; None for none.
+    Limits that would be equal are set 1 apart.
+    """
     low, high = (0.0, 1.0) if span is None else (float(span[0]), float(span[1]))
     if centre is not None:
         reach = max(abs(low - centre), abs(high - centre), 1e-6)
@@ -74,7 +82,10 @@ def even_limits(span: Sequence[float] | None, centre: float | None) -> tuple[flo
 
 
 def percentiles(values: NDArray[np.float32]) -> Floats | None:
-    """The least, the 2nd and 98th percentile and the greatest of what is finite; None where nothing is."""
+    """Percentiles 0, 2, 98 and 100 of the finite values, with linear interpolation between ranks.
+
+    values : (...) in any unit, of any shape. Returns (4,) in the unit of the values; None where no value is finite.
+    """
     keys = np.empty(values.size, np.uint32)
     count = _ordered_keys(np.ascontiguousarray(values).reshape(-1).view(np.uint32), keys)
     if not count:
@@ -82,14 +93,17 @@ def percentiles(values: NDArray[np.float32]) -> Floats | None:
     place = _PERCENTILES / 100.0 * (count - 1)
     below = np.floor(place).astype(np.int64)
     above = np.minimum(below + 1, count - 1)
-    found = _of_ranks(keys[:count], np.stack([below, above], axis=1).ravel()).view(np.float32)
+    found = _bits_at_ranks(keys[:count], np.stack([below, above], axis=1).ravel()).view(np.float32)
     first, second = found.reshape(-1, 2).T.astype(float)
     return np.asarray(first + (second - first) * (place - below))
 
 
 @nb.njit(cache=True, nogil=True)
 def _ordered_keys(bits, keys):  # type: ignore[no-untyped-def]
-    """Whole numbers in the order of the finite ones of single-precision numbers, from their bits; their count."""
+    """Keys whose order as whole numbers is that of the finite single-precision numbers with these bits; their count.
+
+    bits : (n,) uint32. keys : (n,) uint32, filled from the start. Numbers that are not finite get no key.
+    """
     count = 0
     for one in bits:
         if one & np.uint32(0x7F800000) != np.uint32(0x7F800000):
@@ -99,8 +113,11 @@ def _ordered_keys(bits, keys):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def _of_ranks(keys, ranks):  # type: ignore[no-untyped-def]
-    """The bits of the numbers of these ranks, which ascend: by counts of the upper halves, then among those alike."""
+def _bits_at_ranks(keys, ranks):  # type: ignore[no-untyped-def]
+    """Bits (k,) uint32 of the numbers whose keys have these ascending ranks (k,), by a radix selection.
+
+    Keys (n,) are counted by their upper 16 bits; only those in the slots that hold a wanted rank are sorted.
+    """
     upper = np.zeros(1 << 16, np.int32)
     for key in keys:
         upper[key >> np.uint32(16)] += 1
@@ -133,7 +150,7 @@ def _of_ranks(keys, ranks):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _sort(keys):  # type: ignore[no-untyped-def]
-    """Sort keys with the same upper half: the few of a wide range as they are, many by counts of the lower halves."""
+    """Sort keys (n,) with equal upper 16 bits in place: few by comparison, many by counting their lower 16 bits."""
     if len(keys) < _FEW:
         keys.sort()
         return

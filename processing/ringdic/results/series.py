@@ -1,4 +1,7 @@
-"""The results of many steps without all of them in memory: the reference, and any step as results of the two alone."""
+"""Results of many steps, one step at a time: the whole need not fit into memory.
+
+A step is given as results of two steps, the reference and the step itself.
+"""
 
 from __future__ import annotations
 
@@ -15,39 +18,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats
-from ringdic.results.results import WHERE_KNOWN, Results
+from ringdic.results.fields import OPTIONAL_ARRAYS
+from ringdic.results.results import MATCH_ARRAYS, Results
 
 
 class Series(Protocol):
-    """F steps of a surface, the reference first.
-
-    names : (F,) captures. reference : the results of the reference alone. noise : of each matches, (F, C) px, the usual
-    standard deviation that a step's matches state of each camera.
-    """
+    """The surface at F steps, the reference first, read or computed a step at a time."""
 
     @property
-    def names(self) -> tuple[str, ...]: ...
+    def names(self) -> tuple[str, ...]:
+        """Capture ids (F,) of the steps."""
+        ...
+
     @property
-    def reference(self) -> Results: ...
+    def reference(self) -> Results:
+        """The results of the reference alone."""
+        ...
+
     @property
-    def noise(self) -> Sequence[Floats]: ...
+    def noise(self) -> Sequence[Floats]:
+        """For each of the matches, (F, C) px: medians of the standard deviations at each step in each camera."""
+        ...
 
     def at(self, step: int) -> Results:
-        """The results of the reference and a later step; of step 0 those of the reference alone."""
+        """The results of the reference and of a later step; for step 0 those of the reference alone."""
+        ...
 
     def without_matches(self) -> Series:
-        """The same without the matches in the images."""
+        """The series without the matches in the images."""
+        ...
 
 
 @dataclass(frozen=True)
-class InMemory:
-    """Results that are all there, as a series."""
+class InMemorySeries:
+    """Results of all steps, held in memory, as a series."""
 
     results: Results
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The captures."""
+        """Capture ids (F,) of the steps."""
         return self.results.steps
 
     @property
@@ -57,29 +67,35 @@ class InMemory:
 
     @property
     def noise(self) -> list[Floats]:
-        """See `Series`."""
+        """For each of the matches, (F, C) px: medians of the standard deviations at each step in each camera."""
         return [
             np.array([median_deviations(*step) for step in zip(matches.sigma, matches.status, strict=True)])
             for matches in self.results.matches
         ]
 
     def at(self, step: int) -> Results:
-        """See `Series`."""
+        """The results of the reference and of a later step; for step 0 those of the reference alone."""
         return select_steps(self.results, [0, step] if step else [0])
 
-    def without_matches(self) -> InMemory:
-        """See `Series`."""
-        return InMemory(replace(self.results, matches=()))
+    def without_matches(self) -> InMemorySeries:
+        """The series without the matches in the images."""
+        return InMemorySeries(replace(self.results, matches=()))
 
 
 def median_deviations(sigma: NDArray[Any], status: NDArray[np.int8]) -> Floats:
-    """The medians (C,) of the standard deviations (C, n, 2) px of good matches (n,); NaN where there are none."""
+    """Median standard deviation of the good matches in each of C cameras.
+
+    sigma : (C, n, 2) px. status : (n,), 0 for a good match. Returns (C,) px, NaN where a camera has no good match.
+    """
     good = [each[np.isfinite(each)] for each in sigma[:, status == 0]]
     return np.array([np.median(each) if len(each) else np.nan for each in good], dtype=float)
 
 
 def select_steps(results: Results, steps: Sequence[int]) -> Results:
-    """The same results with some of their steps only, in the order given; the reference, 0, must be the first."""
+    """Results of some of the steps, in the order given.
+
+    Raises ValueError where the first is not step 0, the reference.
+    """
     index = list(steps)
     if not index or index[0] != 0:
         raise ValueError("results keep their reference, step 0, as the first")
@@ -87,26 +103,31 @@ def select_steps(results: Results, steps: Sequence[int]) -> Results:
 
 
 def join_steps(parts: Sequence[Results]) -> Results:
-    """The results of the steps of all parts, each with the reference and a step of its own, the first perhaps alone."""
+    """Results of all steps of a series from the results of its single steps.
+
+    parts : as `Series.at` gives them for steps 0, 1, 2, … or for 1, 2, …
+    """
     first, *others = parts
     return _with_steps(first, [(first, range(len(first.steps))), *((other, [1]) for other in others)])
 
 
 def _with_steps(like: Results, chosen: Sequence[tuple[Results, Sequence[int]]]) -> Results:
-    """Results like others, with chosen steps of some that differ in their steps only."""
+    """Results with chosen steps of several results that differ in their steps only.
 
-    def gathered(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    like : gives what does not depend on the step. chosen : results and the indices of the steps to take from them.
+    """
+
+    def join(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
         return np.concatenate([array[list(index)] for array, (_, index) in zip(arrays, chosen, strict=True)])
 
     def of(name: str) -> NDArray[Any]:
-        return gathered([getattr(one, name) for one, _ in chosen])
+        return join([getattr(one, name) for one, _ in chosen])
 
-    known: dict[str, Any] = {name: of(name) for name in WHERE_KNOWN if getattr(like, name) is not None}
+    optional: dict[str, Any] = {name: of(name) for name in OPTIONAL_ARRAYS if getattr(like, name) is not None}
     matches = []
     for m, own in enumerate(like.matches):
         arrays: dict[str, Any] = {
-            name: gathered([getattr(one.matches[m], name) for one, _ in chosen])
-            for name in ("px", "c_ls", "sigma", "status")
+            name: join([getattr(one.matches[m], name) for one, _ in chosen]) for name in MATCH_ARRAYS
         }
         matches.append(replace(own, **arrays))
     return replace(
@@ -117,35 +138,35 @@ def _with_steps(like: Results, chosen: Sequence[tuple[Results, Sequence[int]]]) 
         sigma_xyz=of("sigma_xyz"),
         status=of("status"),
         matches=tuple(matches),
-        **known,
+        **optional,
     )
 
 
 class StepCache:
-    """Values laid aside in a file that nobody else sees and that goes with the process. Safe to be used from threads.
+    """A cache of values on disk, in a temporary file that is removed at the latest when the process ends.
 
-    folder : where the file lies.
+    Several threads may use it at a time. folder : of the file; created where it is missing.
     """
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115, closed with the shelf
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115, closed with the cache
         self._at: dict[Hashable, int] = {}
         self._lock = Lock()
         finalize(self, self._file.close)
 
     def put(self, key: Hashable, value: object) -> None:
-        """Lay a value aside under a key."""
+        """Store a value under a key."""
         with self._lock:
             self._at[key] = self._file.seek(0, 2)
             pickle.dump(value, self._file, protocol=5)
 
     def get(self, key: Hashable) -> Any:
-        """The value of a key; KeyError where there is none."""
+        """The value stored under a key; raises KeyError where there is none."""
         with self._lock:
             self._file.seek(self._at[key])
             return pickle.load(self._file)
 
     def close(self) -> None:
-        """Forget everything; what is not closed goes with the shelf."""
+        """Remove the file. It is also removed when the cache is garbage-collected."""
         self._file.close()

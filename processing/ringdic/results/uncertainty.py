@@ -1,12 +1,15 @@
-"""What the results of a run say of their own uncertainty, completed from the matches that they rest on.
+"""Completes results with the standard deviations of displacements and stretches.
 
-Two parts that never mix: the noise of the images, which another exposure would draw anew, and the calibration, which
-all points and steps share. Of the global way the first is known before; of camera pairs it is found here.
+They are stored by cause, in two separate parts: the noise of the images, which another exposure would draw anew, and
+the calibration, whose error all points and steps share. The surface measured by all cameras together comes with the
+part of the noise; for surfaces of camera pairs it is computed here, from the matches.
 
-Each camera of a pair is followed in its own images. With δ what noise makes of a subset in the reference image and ε of
-the same in a later one, the displacement is off by ``A₁ (ε₁ - δ₁) + A₂ ε₂ - A₂⁰ δ₂``. The second camera's place rests
-on the match between the cameras too: it was found with δ₂ in the reference image and is followed from there, so of δ₂
-the reference position alone holds a part; and what else that match is off by moves along with the point.
+Each camera of a pair is tracked in its own images, from its reference image to that of the step. Let δ_c be the error
+that noise gives the subset in camera c's reference image, ε_c the error in the step's image, and A_c the gain from the
+camera's pixels to the position at the step, A_c⁰ that at the reference. The displacement then has the error
+``A₁ (ε₁ - δ₁) + A₂ ε₂ - A₂⁰ δ₂``. The two cameras differ because the second one's pixel at the reference comes from the
+match between the cameras. That match contains δ₂ and tracking from it subtracts δ₂ again, so of the two positions only
+the reference one has the error δ₂. Any other error of that match shifts the point at both steps and cancels.
 """
 
 from __future__ import annotations
@@ -21,31 +24,33 @@ from typing import Any
 
 import numpy as np
 
-from ringdic.arrays import Floats, Indices
+from ringdic.arrays import Floats, Indices, Pixels, Points
 from ringdic.calibration.bundle import BundleFit
 from ringdic.calibration.parameters import PER_CAMERA
 from ringdic.geometry.camera import Camera
 from ringdic.results.results import Matches, Results
-from ringdic.results.series import InMemory, join_steps
+from ringdic.results.series import InMemorySeries, join_steps
 from ringdic.strain.deformation import Deformation
 from ringdic.uncertainty.calibration import (
     CameraCovariance,
-    Shares,
-    shares,
-    sigma_of,
+    Sensitivity,
+    position_sensitivity,
+    sensitivity_sigma,
     stretch_sigma_by_cameras,
 )
+from ringdic.uncertainty.matches import INTERPOLATED_NOISE
 from ringdic.uncertainty.position import covariance, position_gain
-from ringdic.uncertainty.strain import corners_alike, stretch_sigma
+from ringdic.uncertainty.strain import corner_correlations, stretch_sigma
 
-# The square of a stated deviation counts the noise of the reference and what the interpolation leaves of the other's.
-_BOTH = 1.85
-# Places in the reference images of different pairs are this far apart, px: their subsets have nothing in common.
+# The variance that a correlation states, in units of the variance by the noise of one image: it contains the noise of
+# the reference image and that of the interpolated current one.
+_BOTH_IMAGES = 1.0 + INTERPOLATED_NOISE
+# Shift between the pixel coordinates of different reference images, px: their subsets share no pixels.
 _APART = 1e6
 
 
 def camera_covariance(fit: BundleFit | None) -> CameraCovariance | None:
-    """What a bundle adjustment knows of the cameras; None where each camera was calibrated alone."""
+    """Covariance of the camera parameters after a bundle adjustment; None where each camera was calibrated alone."""
     if fit is None:
         return None
     size = PER_CAMERA * len(fit.cameras)
@@ -53,96 +58,111 @@ def camera_covariance(fit: BundleFit | None) -> CameraCovariance | None:
 
 
 def add_uncertainty(results: Results, known: CameraCovariance | None) -> Results:
-    """The same results with every standard deviation that can be stated of them.
+    """Complete results with the standard deviations of all steps.
 
-    known : of the cameras; None where nothing is: then nothing is stated of what the calibration adds.
+    known : covariance of the cameras; None where it is unknown, then the part of the calibration is left out.
     """
-    series = InMemory(results)
-    stated = StepUncertainty(series.reference, known, series.noise)
+    series = InMemorySeries(results)
+    uncertainty = StepUncertainty(series.reference, known, series.noise)
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        parts = pool.map(lambda k: stated.of(series.at(k), k), range(len(results.steps)))
+        parts = pool.map(lambda k: uncertainty.complete(series.at(k), k), range(len(results.steps)))
         return join_steps(list(parts))
 
 
 class StepUncertainty:
-    """What can be stated of the uncertainty of a run's results, a step at a time.
+    """The standard deviations of a run's results, computed a step at a time.
 
-    reference : the results of the reference alone. known : of the cameras, None where nothing is. noise : of `Series`.
+    reference : the results of the reference alone. known : covariance of the cameras, None where it is unknown.
+    noise : for each of the matches, (F, C) px, as `Series.noise` gives it.
     """
 
     def __init__(self, reference: Results, known: CameraCovariance | None, noise: Sequence[Floats]) -> None:
         pairwise = any(len(matches.cameras) == 2 for matches in reference.matches)
         scattered = pairwise and reference.sigma_displacement is None
-        self._scatter = _Scatter(reference, noise) if scattered else None
-        self._calibration = None if known is None else _ByCalibration(reference, known, followed=not pairwise)
+        self._noise = _NoiseUncertainty(reference, noise) if scattered else None
+        self._calibration = None if known is None else _CalibrationUncertainty(reference, known, tracked=not pairwise)
 
-    def of(self, results: Results, step: int, found: Deformation | None = None) -> Results:
-        """The same results of a step, see `Series`, completed. found : its deformation, where it is known."""
+    def complete(self, results: Results, step: int, deformation: Deformation | None = None) -> Results:
+        """Complete the results of one step with its standard deviations.
+
+        results : of the reference and this step, as `Series.at` gives them. step : its number in the series.
+        deformation : of the step since the reference; computed where it is None.
+        """
         last = len(results.steps) - 1
-        found = results.deformation(last) if found is None else found
+        deformed = results.deformation(last) if deformation is None else deformation
         added: dict[str, Any] = {}
-        if self._scatter is not None:
-            added |= self._scatter.of(results, step, found)
+        if self._noise is not None:
+            added |= self._noise.arrays(results, step, deformed)
         if self._calibration is not None:
-            added |= self._calibration.of(results, found)
+            added |= self._calibration.arrays(results, deformed)
         return replace(results, **added)
 
 
-class _ByCalibration:
-    """What the uncertain cameras add. followed : cameras followed the points from the projection of the reference."""
+class _CalibrationUncertainty:
+    """Standard deviations by the covariance of the cameras.
 
-    def __init__(self, reference: Results, known: CameraCovariance, followed: bool) -> None:
-        self._known, self._followed = known, followed
-        places = reference.vertices_ref
-        self._at_first: Shares = shares(reference.cameras, places, _gain(reference, 0), known)
-        self._position = sigma_of(self._at_first)
+    tracked : whether each camera tracked the points from the projection of their reference position.
+    """
 
-    def of(self, results: Results, found: Deformation) -> dict[str, Floats]:
-        """The standard deviations at the reference and at the step of some results, by their names."""
+    def __init__(self, reference: Results, known: CameraCovariance, tracked: bool) -> None:
+        self._known, self._tracked = known, tracked
+        self._at_reference: Sensitivity = position_sensitivity(
+            reference.cameras, reference.vertices_ref, _gain(reference, 0), known
+        )
+        self._position = sensitivity_sigma(self._at_reference)
+
+    def arrays(self, results: Results, deformed: Deformation) -> dict[str, Floats]:
+        """The standard deviations at the reference and at the step, by the names of the arrays of `Results`."""
         N, M = len(results.vertices_ref), len(results.faces)
         rows = [(self._position, np.zeros((N, 3)), np.zeros((M, 2)))]
         if len(results.steps) > 1:
-            anchor = (results.vertices_ref, self._at_first) if self._followed else None
-            now = shares(results.cameras, results.vertices[1], _gain(results, 1), self._known, anchor)
-            stretches = stretch_sigma_by_cameras(found, results.vertices_ref, results.faces, self._at_first, now)
-            rows.append((sigma_of(now), sigma_of(now - self._at_first), stretches))
+            reference = (results.vertices_ref, self._at_reference)
+            at_step = position_sensitivity(
+                results.cameras, results.vertices[1], _gain(results, 1), self._known,
+                reference if self._tracked else None,
+            )  # fmt: skip
+            displacement = sensitivity_sigma(at_step - self._at_reference)
+            stretches = stretch_sigma_by_cameras(
+                deformed, results.vertices_ref, results.faces, self._at_reference, at_step
+            )
+            rows.append((sensitivity_sigma(at_step), displacement, stretches))
         names = ("sigma_calibration", "sigma_displacement_calibration", "sigma_lambda_calibration")
         return {name: np.stack(values) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
 
 
 def _gain(results: Results, step: int) -> Floats:
-    """How the points of a step move with each pixel of each camera, (C, N, 3, 2) mm a px."""
+    """Gain from the pixels of each camera to the positions at a step, (C, N, 3, 2) mm a px."""
     index = {camera.id: k for k, camera in enumerate(results.cameras)}
     sigma = np.full((len(results.cameras), len(results.vertices_ref), 2), np.nan)
     for matches in results.matches:
         used = (matches.vertex >= 0) & (matches.status[step] == 0)
         for view, id_ in enumerate(matches.cameras):
-            # A pair's points are triangulated with all pixels alike.
-            alike = 1.0 if len(matches.cameras) == 2 else matches.sigma[step, view, used]
-            sigma[index[id_], matches.vertex[used]] = alike
+            # The points of a pair are triangulated with equal weights.
+            weight = 1.0 if len(matches.cameras) == 2 else matches.sigma[step, view, used]
+            sigma[index[id_], matches.vertex[used]] = weight
     return position_gain(results.cameras, results.vertices[step], sigma)
 
 
 @dataclass(frozen=True)
 class _Sources:
-    """Independent errors: of a pair's two reference images, and of the step's two images.
+    """The four independent errors of a pair's points: of its two reference images, then of the step's two images.
 
-    gain : (4, N, 3, 2) mm a px. sigma : (4, N, 2) px.
+    gain : (4, N, 3, 2) mm a px, from each error to the displacement. sigma : (4, N, 2) px, of each error.
     """
 
     gain: Floats
     sigma: Floats
 
 
-class _Scatter:
-    """Standard deviations of displacements and stretches of camera pairs over repeated noise.
+class _NoiseUncertainty:
+    """Standard deviations of displacements and stretches measured by camera pairs, by the noise of the images.
 
-    noise : of each pair (F, 2) px, see `Series`. What a camera's own images leave over in the quietest step is noise;
-    motion and light add to the others.
+    noise : for each pair (F, 2) px, as `Series.noise` gives it. The residual of the step where it is smallest is taken
+    as noise; what other steps have more is due to motion and light.
     """
 
     def __init__(self, reference: Results, noise: Sequence[Floats]) -> None:
-        self._shares = [_share_of_noise(level) for level in noise]
+        self._noise_shares = [_share_of_noise(level) for level in noise]
         group = tomllib.loads(reference.settings).get("correlation", {})
         radius, order = int(group.get("radius_px", 20)), int(group.get("order", 1))
         cameras = {camera.id: camera for camera in reference.cameras}
@@ -150,66 +170,74 @@ class _Scatter:
             self._pairs = list(pool.map(partial(_Pair.of, reference, cameras), range(len(reference.matches))))
         px = np.full((2, len(reference.vertices_ref), 2), np.nan)
         for pair in self._pairs:
-            px[:, pair.vertex[pair.held]] = pair.px
-        alike = corners_alike(px, reference.faces, radius, order)
-        self._alike = np.concatenate([alike, alike])
+            px[:, pair.vertex[pair.rows]] = pair.px
+        correlation = corner_correlations(px, reference.faces, radius, order)
+        self._correlation = np.concatenate([correlation, correlation])
 
-    def of(self, results: Results, step: int, found: Deformation) -> dict[str, Floats]:
-        """The standard deviations at the reference and at the step of some results, by their names."""
+    def arrays(self, results: Results, step: int, deformed: Deformation) -> dict[str, Floats]:
+        """The standard deviations at the reference and at the step, by the names of the arrays of `Results`."""
         N = len(results.vertices_ref)
         displacement, stretches = [np.zeros((N, 3))], [np.zeros((len(results.faces), 2))]
         if len(results.steps) > 1:
-            parts = _Sources(np.zeros((4, N, 3, 2)), np.full((4, N, 2), np.nan))
-            for pair, matches, shares_of in zip(self._pairs, results.matches, self._shares, strict=True):
-                _fill(parts, results.vertices[1], pair, matches, shares_of[step])
-            one = np.sqrt(np.einsum("nii->ni", covariance(parts.gain, parts.sigma)))
-            two = stretch_sigma(found, results.vertices_ref, results.faces, parts.gain, self._alike, parts.sigma)
-            one[~np.isfinite(results.vertices[1]).all(axis=1)] = np.nan
-            two[~np.isfinite(found.J)] = np.nan
-            displacement.append(one)
-            stretches.append(two)
+            sources = _Sources(np.zeros((4, N, 3, 2)), np.full((4, N, 2), np.nan))
+            for pair, matches, share in zip(self._pairs, results.matches, self._noise_shares, strict=True):
+                _fill(sources, results.vertices[1], pair, matches, share[step])
+            of_points = np.sqrt(np.einsum("nii->ni", covariance(sources.gain, sources.sigma)))
+            of_triangles = stretch_sigma(
+                deformed, results.vertices_ref, results.faces, sources.gain, self._correlation, sources.sigma
+            )
+            of_points[~np.isfinite(results.vertices[1]).all(axis=1)] = np.nan
+            of_triangles[~np.isfinite(deformed.J)] = np.nan
+            displacement.append(of_points)
+            stretches.append(of_triangles)
         return {"sigma_displacement": np.stack(displacement), "sigma_lambda": np.stack(stretches)}
 
 
 @dataclass(frozen=True)
 class _Pair:
-    """What the steps of a pair have in common.
+    """The points of a camera pair at the reference.
 
-    cameras : of n points. vertex : (n,), -1 where one has none. held : (k,) rows of those that have one, and px
-    (2, k, 2) their places in the reference images, apart from other pairs'. gain : (2, k, 3, 2) mm a px at the
-    reference.
+    cameras : the two. vertex : (n,) vertex index of each matched point, -1 where it has none. rows : (k,) indices of
+    the points that have one. px : (2, k, 2) px, these points in the reference images, shifted so that points of
+    different images are far apart. gain : (2, k, 3, 2) mm a px, from the pixels to the reference positions.
     """
 
     cameras: tuple[Camera, ...]
     vertex: Indices
-    held: Indices
-    px: Floats
+    rows: Indices
+    px: Pixels
     gain: Floats
 
     @classmethod
     def of(cls, results: Results, cameras: Mapping[str, Camera], k: int) -> _Pair:
-        """Of the k-th matches of the results of the reference."""
+        """The pair of the k-th matches of the reference's results."""
         matches = results.matches[k]
         own = tuple(cameras[id_] for id_ in matches.cameras)
-        held = np.flatnonzero(matches.vertex >= 0)
-        gain = position_gain(own, results.vertices_ref[matches.vertex[held]], np.ones((2, len(held), 2)))
-        px = matches.px[0][:, held] + np.array([[2 * k * _APART, 0.0], [(2 * k + 1) * _APART, 0.0]])[:, None]
-        return cls(own, matches.vertex, held, px, gain)
+        rows = np.flatnonzero(matches.vertex >= 0)
+        gain = position_gain(own, results.vertices_ref[matches.vertex[rows]], np.ones((2, len(rows), 2)))
+        px = matches.px[0][:, rows] + np.array([[2 * k * _APART, 0.0], [(2 * k + 1) * _APART, 0.0]])[:, None]
+        return cls(own, matches.vertex, rows, px, gain)
 
 
 def _share_of_noise(level: Floats) -> Floats:
-    """Of what each step's matches state, (F, 2) px, the share that is noise, (F, 2); NaN where nothing is stated."""
+    """Share of the noise in the standard deviations of the matches, (F, 2); NaN where these are unknown.
+
+    level : (F, 2) px, median standard deviation of each step's matches in each camera.
+    """
     later = level.copy()
-    later[0] = np.nan  # the grid itself, or the match between the cameras
+    later[0] = np.nan  # no match in time: the grid itself, or the match between the cameras
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.fmin.reduce(later, axis=0) / later)
 
 
-def _fill(parts: _Sources, xyz: Floats, pair: _Pair, matches: Matches, share: Floats) -> None:
-    """Add the points of one pair. xyz : (N, 3) mm at the step. share : (2,) of what is stated, that is noise."""
-    noise = matches.sigma[1][:, pair.held] / np.sqrt(_BOTH) * share[:, None, None]
-    usable = (matches.status[1, pair.held] == 0) & np.isfinite(noise).all(axis=(0, 2))
-    noise, who = noise[:, usable], pair.vertex[pair.held[usable]]
-    now = position_gain(pair.cameras, xyz[who], np.ones((2, len(who), 2)))
-    parts.gain[:, who] = np.concatenate([now[:1], pair.gain[1:, usable], now])
-    parts.sigma[:, who] = np.concatenate([noise, noise])
+def _fill(sources: _Sources, xyz: Points, pair: _Pair, matches: Matches, share: Floats) -> None:
+    """Fill in the errors of one pair's points.
+
+    xyz : (N, 3) mm at the step. share : (2,) of the noise in the matches' standard deviations, of each camera.
+    """
+    noise = matches.sigma[1][:, pair.rows] / np.sqrt(_BOTH_IMAGES) * share[:, None, None]
+    usable = (matches.status[1, pair.rows] == 0) & np.isfinite(noise).all(axis=(0, 2))
+    noise, vertex = noise[:, usable], pair.vertex[pair.rows[usable]]
+    gain = position_gain(pair.cameras, xyz[vertex], np.ones((2, len(vertex), 2)))
+    sources.gain[:, vertex] = np.concatenate([gain[:1], pair.gain[1:, usable], gain])
+    sources.sigma[:, vertex] = np.concatenate([noise, noise])

@@ -1,7 +1,7 @@
-"""The VTKHDF group of a results file: triangles that move in time, as ParaView and VTK read it.
+"""The VTKHDF group of a results file: triangles that move in time, as ParaView and VTK read them.
 
-Layout after the VTK file format specification, "VTKHDF", version 2.0, type PolyData: the steps of every array lie one
-after the other; connectivity and arrays that stay the same are stored once and all steps point to them.
+The layout follows the VTK file format specification, "VTKHDF", version 2.0, type PolyData: the steps of every array lie
+one after the other; connectivity and constant arrays are stored once and all steps point to them.
 """
 
 from __future__ import annotations
@@ -12,13 +12,16 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Indices
+from ringdic.arrays import Floats, Indices, Points
 
 _CELL_GROUPS = ("Vertices", "Lines", "Polygons", "Strips")
 
 
 def create_group(file: h5py.File, faces: Indices, points: int, steps: int) -> h5py.Group:
-    """A new group for ``steps`` steps of constant triangles (M, 3); :func:`write_step` fills its arrays."""
+    """Create the group for a surface with constant triangles; its arrays are filled by `write_step`.
+
+    faces : (M, 3) vertex indices. points : number of vertices. steps : number of steps.
+    """
     group = file.create_group("VTKHDF", track_order=True)
     group.attrs["Version"] = np.array([2, 0], dtype=np.int64)
     group.attrs["Type"] = np.bytes_("PolyData")
@@ -49,11 +52,15 @@ def create_group(file: h5py.File, faces: Indices, points: int, steps: int) -> h5
 def write_step(
     group: h5py.Group,
     step: int,
-    positions: Floats,
+    positions: Points,
     point: Mapping[str, NDArray[np.generic]],
     cell: Mapping[str, NDArray[np.generic]],
 ) -> None:
-    """Fill one step. positions : (N, 3) mm, all finite; arrays of points (N, ...) and of faces (M, ...)."""
+    """Write the positions and the arrays of one step.
+
+    positions : (N, 3) mm, all finite. point : arrays (N, ...) of the vertices by name. cell : arrays (M, ...) of the
+    triangles by name.
+    """
     rows = len(positions)
     group["Points"][step * rows : (step + 1) * rows] = positions
     for place, arrays in (("PointData", point), ("CellData", cell)):
@@ -62,21 +69,32 @@ def write_step(
 
 
 def write_constant(group: h5py.Group, place: str, name: str, values: NDArray[np.generic]) -> None:
-    """An array of points or cells that is the same at every step; ``place`` is "PointData" or "CellData"."""
+    """Write an array that is the same at every step.
+
+    place : "PointData" for an array of the vertices, "CellData" for one of the triangles.
+    values : (N, ...) or (M, ...), in the unit of the field of this name.
+    """
     group[place].create_dataset(name, data=values)
     steps = int(group["Steps"].attrs["NSteps"])
     group["Steps"][f"{place}Offsets"].create_dataset(name, data=np.zeros(steps, dtype=np.int64))
 
 
 def read_step(group: h5py.Group, place: str, name: str, step: int) -> NDArray[np.generic]:
-    """One array of one step; ``place`` is "PointData" or "CellData"."""
+    """Read one array at one step: (N, ...) or (M, ...), in the unit of the field of this name.
+
+    place : "PointData" for an array of the vertices, "CellData" for one of the triangles.
+    """
     rows = int(group["NumberOfPoints" if place == "PointData" else "Polygons/NumberOfCells"][0])
     start = int(group["Steps"][f"{place}Offsets"][name][step])
     return np.asarray(group[place][name][start : start + rows])
 
 
 def read_steps(group: h5py.Group, name: str, kind: str, steps: int) -> Floats | None:
-    """An array of all steps, None where there is none: kind "point" (F, N), "vector" (F, N, 3), "face" (F, M, 2)."""
+    """Read one array at all steps, in the unit of the field of this name; None where the group does not have it.
+
+    kind : "point" for an array (F, N), "vector" for (F, N, 3), "face" for (F, M, 2), whose two components are stored
+    under the name with 1 and 2 appended. steps : their number F.
+    """
     places = [f"CellData/{name}{k}" for k in (1, 2)] if kind == "face" else [f"PointData/{name}"]
     if not all(place in group for place in places):
         return None
@@ -86,6 +104,7 @@ def read_steps(group: h5py.Group, name: str, kind: str, steps: int) -> Floats | 
 
 
 def _array(group: h5py.Group, place: str, name: str, values: NDArray[np.generic]) -> h5py.Dataset:
+    """The dataset of an array at all steps, created when its first step is written."""
     if name not in group[place]:
         steps = int(group["Steps"].attrs["NSteps"])
         group[place].create_dataset(name, shape=(steps * len(values), *values.shape[1:]), dtype=values.dtype)

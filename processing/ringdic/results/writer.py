@@ -1,4 +1,7 @@
-"""The file of the results, see `ringdic.results.results`, written a step at a time."""
+"""Writes results.h5, a step at a time.
+
+The layout of the file is drawn in `ringdic.results.layout`.
+"""
 
 from __future__ import annotations
 
@@ -16,36 +19,27 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats
+from ringdic.arrays import Floats, Points
 from ringdic.results import vtkhdf
 from ringdic.results.fields import StepFields, available, compute_fields
-from ringdic.results.json_values import plain
+from ringdic.results.json_values import json_value
+from ringdic.results.layout import CONSTANT_ARRAYS, SCHEMA, STEP_ARRAYS
 from ringdic.results.ranges import Extent, Ranges
-from ringdic.results.results import SCHEMA, Matches, Results
-from ringdic.results.series import InMemory, Series
+from ringdic.results.results import MATCH_ARRAYS, Matches, Results
+from ringdic.results.series import InMemorySeries, Series
 from ringdic.strain.deformation import Deformation
 from ringdic.strain.rigid_motion import RigidMotion
 from ringdic.strain.window import strain_window
 
 T = TypeVar("T")
 
-#: Arrays kept for every step as they are; the other fields follow from them and from the positions.
-_KEPT = (
-    "displacement", "correlation", "sigma_xyz", "sigma_displacement", "chi2",
-    "J", "lambda1", "lambda2", "E1", "E2", "E_tensor", "direction1_reference", "direction1_current", "isotropy",
-    "linear1", "linear2",
-    "sigma_calibration", "sigma_displacement_calibration", "sigma_lambda_calibration1", "sigma_lambda_calibration2",
-    "face_correlation", "sigma_lambda1", "sigma_lambda2", "window_lambda1", "window_lambda2", "window_E1", "window_E2",
-    "window_sigma_lambda1", "window_sigma_lambda2",
-)  # fmt: skip
-#: Arrays that are the same at every step.
-_CONSTANT = ("area", "pair")
-_OF_MATCHES = ("px", "c_ls", "sigma", "status")
-
 
 def write_results(path: Path, results: Results, progress: Callable[[float], None] = lambda _: None) -> None:
-    """Compute all fields and write the file; ``path`` must not exist. ``progress`` is told the share done."""
-    write_series(path, InMemory(results), progress, results.calibration, results.summary)
+    """Compute the fields of all steps and write the file.
+
+    path : of the new file; FileExistsError where there is one. progress : called with the share done, 0 to 1.
+    """
+    write_series(path, InMemorySeries(results), progress, results.calibration, results.summary)
 
 
 def write_series(
@@ -55,26 +49,33 @@ def write_series(
     calibration: dict[str, Any],
     summary: dict[str, Any],
 ) -> None:
-    """The same of results that are not all in memory. calibration, summary : JSON values."""
+    """Compute the fields of a series of steps and write the file, with no more than a few steps in memory at a time.
+
+    path : of the new file; FileExistsError where there is one. progress : called with the share done, 0 to 1.
+    calibration, summary : JSON values.
+    """
     with ResultsWriter(path, series.reference, series.names) as file:
 
-        def made(step: int) -> StepRecord:
-            only = series.at(step)
-            last = len(only.steps) - 1
-            return file.made(only, only.motion(last), only.deformation(last))
+        def step_record(step: int) -> StepRecord:
+            results = series.at(step)
+            last = len(results.steps) - 1
+            return file.record(results, results.motion(last), results.deformation(last))
 
-        for step, one in enumerate(in_turn(made, range(len(series.names)))):
-            file.write(step, one)
+        for step, record in enumerate(map_in_order(step_record, range(len(series.names)))):
+            file.write(step, record)
             progress((step + 1) / len(series.names))
         file.finish(calibration, summary)
 
 
-def in_turn(made: Callable[[int], T], steps: Sequence[int]) -> Iterator[T]:
-    """What is made of each step, in order; as many at once as there are cores, which bounds the memory."""
+def map_in_order(compute: Callable[[int], T], steps: Sequence[int]) -> Iterator[T]:
+    """Values of a function at some steps, in their order; computed in threads.
+
+    Only a few more values than there are cores are held at a time, which bounds the memory.
+    """
     waiting: deque[Future[T]] = deque()
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for step in steps:
-            waiting.append(pool.submit(made, step))
+            waiting.append(pool.submit(compute, step))
             if len(waiting) > (os.cpu_count() or 1):
                 yield waiting.popleft().result()
         while waiting:
@@ -83,13 +84,14 @@ def in_turn(made: Callable[[int], T], steps: Sequence[int]) -> Iterator[T]:
 
 @dataclass(frozen=True)
 class StepRecord:
-    """What the file keeps of one step.
+    """The contents of the file for one step.
 
-    positions : (N, 3) mm, finite. point, face : arrays of the points and of the triangles. extent : of the fields.
-    motion : back onto the reference. matches : of the step alone.
+    positions : (N, 3) mm, finite: a lost point has its reference position. point : arrays (N, ...) of the vertices by
+    name. face : arrays (M, ...) of the triangles by name. extent : percentiles of the fields.
+    motion : takes the step back onto the reference. matches : of each matches the arrays of this step by name.
     """
 
-    positions: Floats
+    positions: Points
     point: dict[str, NDArray[Any]]
     face: dict[str, NDArray[Any]]
     extent: Extent
@@ -98,10 +100,10 @@ class StepRecord:
 
 
 class ResultsWriter:
-    """A file of results while its steps are written.
+    """A results file that is being written, the reference first.
 
-    path : must not exist. reference : the results of the reference alone, with all that will be known of every step.
-    names : (F,) captures.
+    path : of the new file; FileExistsError where there is one. names : (F,) capture ids of the steps.
+    reference : the results of the reference alone; they have the same optional arrays as every later step.
     """
 
     def __init__(self, path: Path, reference: Results, names: Sequence[str]) -> None:
@@ -113,7 +115,7 @@ class ResultsWriter:
         self._motions: list[RigidMotion] = []
         self._file = h5py.File(path, "x")
         self._group = vtkhdf.create_group(self._file, reference.faces, len(reference.vertices_ref), len(self._names))
-        for name in _CONSTANT:
+        for name in CONSTANT_ARRAYS:
             vtkhdf.write_constant(self._group, "CellData", name, first.face[name].astype(np.float32))
         self._own = self._file.create_group("ringdic")
         for k, matches in enumerate(reference.matches):
@@ -128,31 +130,34 @@ class ResultsWriter:
     ) -> None:
         self._file.close()
 
-    def made(self, results: Results, motion: RigidMotion, found: Deformation) -> StepRecord:
-        """What is written of the last step of some results; of several steps at once, from several threads.
+    def record(self, results: Results, motion: RigidMotion, deformation: Deformation) -> StepRecord:
+        """The contents of the file for the last step of some results. Several threads may call it at a time.
 
-        motion, found : its rigid motion back onto the reference and its deformation.
+        motion : takes this step back onto the reference. deformation : of this step since the reference.
         """
         last = len(results.steps) - 1
-        fields = self._fields(results, motion, found)
+        fields = self._fields(results, motion, deformation)
         measured = np.isfinite(results.vertices[last]).all(axis=1)
         positions = np.where(measured[:, None], results.vertices[last], results.vertices_ref)
         flags = {"measured": measured.astype(np.uint8), "status": results.status[last].astype(np.int8)}
-        matches = tuple({name: getattr(each, name)[last] for name in _OF_MATCHES} for each in results.matches)
+        matches = tuple({name: getattr(each, name)[last] for name in MATCH_ARRAYS} for each in results.matches)
         extent = self._ranges.extent(fields)
-        return StepRecord(positions, {**_kept(fields.point), **flags}, _kept(fields.face), extent, motion, matches)
+        return StepRecord(positions, {**_stored(fields.point), **flags}, _stored(fields.face), extent, motion, matches)
 
-    def write(self, step: int, one: StepRecord) -> None:
-        """Write one step; they come in order."""
-        vtkhdf.write_step(self._group, step, one.positions, one.point, one.face)
-        for k, matches in enumerate(one.matches):
+    def write(self, step: int, record: StepRecord) -> None:
+        """Write the next step; the steps are written in order."""
+        vtkhdf.write_step(self._group, step, record.positions, record.point, record.face)
+        for k, matches in enumerate(record.matches):
             for name, values in matches.items():
                 self._own[f"matches/{k}/{name}"][step] = values
-        self._ranges.take(one.extent)
-        self._motions.append(one.motion)
+        self._ranges.take(record.extent)
+        self._motions.append(record.motion)
 
     def finish(self, calibration: dict[str, Any], summary: dict[str, Any]) -> None:
-        """Write what is not of a single step. calibration, summary : JSON values."""
+        """Write what belongs to the whole run; a file without it is refused by the reader.
+
+        calibration, summary : JSON values.
+        """
         own, reference = self._own, self._reference
         own.attrs["schema"] = SCHEMA
         own.attrs["rig"] = reference.rig
@@ -166,8 +171,8 @@ class ResultsWriter:
         own["rigid_motion/R"] = np.array([motion.R for motion in self._motions])
         own["rigid_motion/t"] = np.array([motion.t for motion in self._motions])
         own["settings"] = reference.settings
-        own["calibration"] = json.dumps(plain(calibration), allow_nan=False)
-        own["summary"] = json.dumps(plain(summary), allow_nan=False)
+        own["calibration"] = json.dumps(json_value(calibration), allow_nan=False)
+        own["summary"] = json.dumps(json_value(summary), allow_nan=False)
         cameras = own.create_group("cameras")
         for camera in reference.cameras:
             group = cameras.create_group(camera.id)
@@ -175,21 +180,24 @@ class ResultsWriter:
             if camera.intrinsics is not None:
                 group["K"], group["distortion"] = camera.intrinsics.K, camera.intrinsics.distortion
 
-    def _fields(self, results: Results, motion: RigidMotion, found: Deformation) -> StepFields:
+    def _fields(self, results: Results, motion: RigidMotion, deformation: Deformation) -> StepFields:
+        """The fields of the last step of some results."""
         last = len(results.steps) - 1
         return compute_fields(
-            results.vertices_ref, results.vertices[last], results.faces, motion, results.certainty(last), results.pair,
-            self._window, self._scatter, found, both_tensors=False,
+            results.vertices_ref, results.vertices[last], results.faces, motion, results.quality(last), results.pair,
+            self._window, self._scatter, deformation, both_tensors=False,
         )  # fmt: skip
 
     def _begin(self, group: h5py.Group, matches: Matches) -> None:
+        """Create the arrays of some matches; those with one entry a step are filled step by step."""
         group.attrs["cameras"] = json.dumps(matches.cameras)
         group.attrs["seconds"] = json.dumps(matches.seconds)
         group["xy"], group["vertex"] = matches.xy, matches.vertex
-        for name in _OF_MATCHES:
+        for name in MATCH_ARRAYS:
             values = getattr(matches, name)
             group.create_dataset(name, shape=(len(self._names), *values.shape[1:]), dtype=values.dtype)
 
 
-def _kept(arrays: dict[str, Floats]) -> dict[str, NDArray[np.float32]]:
-    return {name: values.astype(np.float32) for name, values in arrays.items() if name in _KEPT}
+def _stored(arrays: dict[str, Floats]) -> dict[str, NDArray[np.float32]]:
+    """Those of the arrays that the file holds, in single precision."""
+    return {name: values.astype(np.float32) for name, values in arrays.items() if name in STEP_ARRAYS}

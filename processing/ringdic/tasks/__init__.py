@@ -1,20 +1,31 @@
-"""A job as a set of tasks, each with one output file, so that a job started again makes only what is missing.
+"""A job as a set of tasks with one output file each, so that a job started again computes only missing outputs.
 
-A task is a pure function of file paths and small values. Its output lies in ``SESSION/work`` under a key of everything
-that it depends on; where the file is there, the task is done. An executor runs those that are not: ``LocalExecutor``
-in threads of this process, others elsewhere, all of them the same tasks.
+A task is a pure function of file paths and small values. Its output file lies in ``SESSION/work``, named by a key: a
+digest of everything that the output depends on. A task whose output file exists is done. An executor runs the others:
+`LocalExecutor` in threads of this process, other executors on other machines.
 
-``task``    a task, its key and its output file
-``agenda``  which tasks may start and which have ended
-``local``   the executor of one machine
-``memory``  what a process keeps between tasks: decoded images, prepared references
-``work``    the folder of the outputs, kept within a size
+``task``         a task, its key and its output file
+``agenda``       which tasks may start and which have ended
+``local``        the executor of one machine
+``memory``       the cache of a process between tasks: decoded images, prepared references
+``step_images``  the images of a session as the tasks read them, and their digests
+``work``         the folder of the output files, and the limit of its size
 """
 
 from ringdic.tasks.agenda import Agenda
 from ringdic.tasks.local import LocalExecutor, kernels_side_by_side
-from ringdic.tasks.memory import Memory, kept
-from ringdic.tasks.task import Arrays, Executor, Ran, Task, Told, code_stamp, digest, file_digest, read_output
+from ringdic.tasks.memory import Memory, process_memory
+from ringdic.tasks.task import (
+    Arrays,
+    Executor,
+    OnTaskEnd,
+    Task,
+    TaskReport,
+    code_stamp,
+    digest,
+    file_digest,
+    read_output,
+)
 from ringdic.tasks.work import tidy, work_folder
 
 __all__ = [
@@ -23,14 +34,14 @@ __all__ = [
     "Executor",
     "LocalExecutor",
     "Memory",
-    "Ran",
+    "OnTaskEnd",
     "Task",
-    "Told",
+    "TaskReport",
     "code_stamp",
     "digest",
     "file_digest",
-    "kept",
     "kernels_side_by_side",
+    "process_memory",
     "read_output",
     "tidy",
     "work_folder",

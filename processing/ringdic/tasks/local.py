@@ -1,4 +1,4 @@
-"""The executor of one machine: tasks side by side in threads of this process, as many as there are cores."""
+"""The executor of one machine: runs tasks in threads of this process, one for each core."""
 
 from __future__ import annotations
 
@@ -11,29 +11,32 @@ import cv2
 import numba
 
 from ringdic.tasks.agenda import Agenda
-from ringdic.tasks.task import Ran, Task, Told
+from ringdic.tasks.task import OnTaskEnd, Task, TaskReport
 
-_TOGETHER = ("omp", "tbb")  # layers of numba whose kernels may be started from several threads at once
+_THREAD_SAFE = ("omp", "tbb")  # threading layers of numba whose kernels several threads may start at a time
 
 
 class LocalExecutor:
     """Runs tasks in threads of this process.
 
-    workers : tasks at a time; None for one a core. A task's kernels share the cores with those it starts beside: one
-    that all others wait for has all of them.
+    workers : tasks at a time; None for one a core. The kernels of tasks that run at a time share the cores; those of a
+    task that all others wait for use all cores.
     """
 
     def __init__(self, workers: int | None = None) -> None:
         self._workers = workers
 
-    def run(self, tasks: Sequence[Task], told: Told) -> None:
-        """See ``Executor.run``. Tasks start in the order given as soon as what they need is there."""
-        agenda = Agenda(tasks, told)
+    def run(self, tasks: Sequence[Task], on_end: OnTaskEnd) -> None:
+        """Run every task that is not done, in the order given; each starts when the tasks that it needs have ended.
+
+        on_end : called in the calling thread for each task that has ended. InputError of a task ends the run.
+        """
+        agenda = Agenda(tasks, on_end)
         if not agenda:
             return
         cores = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
         workers = min(self._workers or (os.cpu_count() or 1), len(agenda)) if kernels_side_by_side() else 1
-        running: dict[Future[Ran], Task] = {}
+        running: dict[Future[TaskReport], Task] = {}
         with _single_threaded_filters(workers > 1), ThreadPoolExecutor(workers, "task") as pool:
             while agenda:
                 while len(running) < workers and (task := agenda.start()) is not None:
@@ -44,22 +47,22 @@ class LocalExecutor:
                     agenda.ended(running.pop(future), future.result())
 
 
-def _run(task: Task, threads: int) -> Ran:
-    numba.set_num_threads(threads)  # of this thread
+def _run(task: Task, threads: int) -> TaskReport:
+    numba.set_num_threads(threads)  # the setting holds for this thread alone
     return task.run()
 
 
 def kernels_side_by_side() -> bool:
-    """Whether kernels may run in several threads of this process at once; False before the first has run."""
+    """Whether several threads of this process may run kernels at a time; False before the first kernel has run."""
     try:
-        return numba.threading_layer() in _TOGETHER
+        return numba.threading_layer() in _THREAD_SAFE
     except ValueError:  # no kernel has run yet
         return False
 
 
 @contextmanager
 def _single_threaded_filters(alone: bool) -> Iterator[None]:
-    """OpenCV without threads of its own while tasks fill the cores."""
+    """Have OpenCV use one thread for the time of the context, if ``alone``: the tasks already use all cores."""
     before = cv2.getNumThreads()
     if alone:
         cv2.setNumThreads(1)

@@ -1,4 +1,4 @@
-"""What a process keeps between tasks: decoded images, prepared references. Bounded by bytes, whatever the job."""
+"""The cache of a process between tasks: decoded images, prepared references. Its size is bounded."""
 
 from __future__ import annotations
 
@@ -9,70 +9,74 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from numpy.typing import NDArray
-
+from ringdic.arrays import Image
 from ringdic.session.images import read_gray
 
 T = TypeVar("T")
 
-# Bytes. A run takes camera after camera and asks for none again; memory not used before is dear, the system clears it.
+# Bytes. A run processes one camera after the other and needs none again, so more would be of no use; and memory that
+# the process has not used before is slow, because the system clears it first.
 _LIMIT = 256 << 20
 
 
 @dataclass
 class _Entry:
-    """One value, made by the first who asks while the others wait."""
+    """One value, computed by the first thread that asks for it while the others wait."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     value: Any = None
-    bytes: int = -1  # until it is made
+    bytes: int = -1  # until the value is computed
 
 
 class Memory:
-    """Values under keys, those not used for longest dropped when they take more than ``limit`` bytes together.
+    """A cache of values by key, which drops the least recently used ones beyond a limit of bytes.
 
-    Safe to be asked from several threads; a value is made once. ``made`` counts how many were.
+    Several threads may use it at a time; each value is computed once. limit : of all values together, bytes.
+    ``computations`` counts the values that were computed.
     """
 
     def __init__(self, limit: int = _LIMIT) -> None:
         self.limit = limit
-        self.made = 0
+        self.computations = 0
         self._entries: OrderedDict[Hashable, _Entry] = OrderedDict()
         self._lock = threading.Lock()
 
     @property
     def bytes(self) -> int:
-        """What is kept now."""
+        """Size of all values now."""
         with self._lock:
             return sum(max(entry.bytes, 0) for entry in self._entries.values())
 
-    def get(self, key: Hashable, make: Callable[[], T], size: Callable[[T], int]) -> T:
-        """The value of a key, made if it is not there; size : its bytes. What ``make`` raises is raised, not kept."""
+    def get(self, key: Hashable, compute: Callable[[], T], size: Callable[[T], int]) -> T:
+        """The value of a key, computed where it is not in the cache.
+
+        compute : gives the value; an exception that it raises is raised and not cached. size : bytes of a value.
+        """
         with self._lock:
             entry = self._entries.setdefault(key, _Entry())
             self._entries.move_to_end(key)
         with entry.lock:
             if entry.bytes < 0:
                 try:
-                    entry.value = make()
+                    entry.value = compute()
                     entry.bytes = size(entry.value)
                 except BaseException:
                     with self._lock:
                         self._entries.pop(key, None)
                     raise
-                self.made += 1
+                self.computations += 1
                 self._drop()
             value: T = entry.value
         return value
 
-    def image(self, path: Path) -> NDArray:
-        """The grey image of a file as it is now."""
+    def image(self, path: Path) -> Image:
+        """The grey levels, (height, width), of an image file; read again when its size or time of change differs."""
         stat = path.stat()
         key = (str(path), stat.st_size, stat.st_mtime_ns)
         return self.get(key, lambda: read_gray(path), lambda image: int(image.nbytes))
 
     def clear(self) -> None:
-        """Keep nothing."""
+        """Drop all values."""
         with self._lock:
             self._entries.clear()
 
@@ -85,5 +89,5 @@ class Memory:
                 total -= self._entries.pop(key).bytes
 
 
-#: Of this process.
-kept = Memory()
+#: The cache of this process.
+process_memory = Memory()

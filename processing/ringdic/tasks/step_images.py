@@ -1,4 +1,4 @@
-"""The images of a session's steps as the tasks read them, kept in memory between tasks, and what tells them apart."""
+"""The images of a session's steps as the tasks read them, cached between tasks, and digests of the image files."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ from ringdic.arrays import Image
 from ringdic.errors import InputError
 from ringdic.geometry.camera import Camera
 from ringdic.session.folder import Capture, Session
-from ringdic.tasks import file_digest, kept
+from ringdic.tasks import file_digest, process_memory
 
 
 def step_image(path: Path, camera: Camera) -> Image:
-    """The grey image of a file. InputError where it has not the size that the camera was calibrated at."""
-    grey: Image = kept.image(path)
+    """The grey levels, (height, width), of an image file of a camera.
+
+    Raises InputError where its size is not the one at which the camera was calibrated.
+    """
+    grey = process_memory.image(path)
     width, height = camera.size
     if grey.shape != (height, width):
         raise InputError(
@@ -26,13 +29,13 @@ def step_image(path: Path, camera: Camera) -> Image:
 
 @dataclass(frozen=True)
 class Digests:
-    """Digests of a session's images and masks, each taken once."""
+    """Digests of a session's images and masks, each computed once. known : the digests so far, by path."""
 
     session: Session
     known: dict[Path, str] = field(default_factory=dict)
 
     def image(self, capture: Capture, id_: str) -> str | None:
-        """Of a camera's image in a capture; None where it has none."""
+        """Digest of a camera's image in a capture; None where the capture has none of this camera."""
         path = capture.images.get(id_)
         if path is None:
             return None
@@ -41,7 +44,7 @@ class Digests:
         return self.known[path]
 
     def mask(self, id_: str) -> str | None:
-        """Of the region drawn for a camera; None where there is none."""
+        """Digest of the region of interest drawn for a camera; None where none was drawn."""
         path = self.session.mask(id_)
         if path is None:
             return None

@@ -1,4 +1,4 @@
-"""A task, the key of what it depends on, and its output file."""
+"""A task, the key of everything that its output depends on, and its output file."""
 
 from __future__ import annotations
 
@@ -20,29 +20,36 @@ from pydantic import BaseModel
 from ringdic.errors import ComputationError, InputError
 
 Arrays = Mapping[str, NDArray[Any]]
-#: Told of a task that has ended, what came of it, and how many of how many have.
-Told = Callable[["Task", "Ran", int, int], None]
+#: Called when a task has ended, with the task, its report, and how many tasks of how many have ended.
+OnTaskEnd = Callable[["Task", "TaskReport", int, int], None]
 
-_ERROR = "error"  # the name under which an output keeps why there is nothing else in it
+_ERROR = "error"  # name of the only array in the output of a task that ended with a ComputationError: its sentence
 
 
 @dataclass(frozen=True)
-class Ran:
-    """What came of a task. made : computed now, not found. points : matches made. seconds : time it took."""
+class TaskReport:
+    """How a task ended.
 
-    made: bool
+    computed : whether its output was computed now, rather than there already. points : number of matches. seconds :
+    time it took.
+    """
+
+    computed: bool
     points: int = 0
     seconds: float = 0.0
 
 
 @dataclass(frozen=True)
 class Task:
-    """A function of paths and small values whose result is kept in ``folder`` under ``key``.
+    """A function of paths and small values, whose result is stored in a folder under a key.
 
-    key : of everything that the output depends on, see ``digest``. name : for people. function : of a module, called
-    with ``arguments`` and with ``inputs``, the output files of ``needs``; gives arrays by name, of which "points", if
-    there, counts matches. needs : keys of tasks whose outputs lie in the same folder. cost : how long it takes beside
-    others. All of it can be pickled; the function runs wherever the session folder is seen under the same path.
+    key : digest of everything that the output depends on. name : for the operator.
+    function : a function of a module, called with ``arguments`` and with ``inputs``, the output files of the tasks in
+        ``needs``; returns arrays by name. The array "points", where there is one, is the number of matches.
+    folder : of the output file. needs : keys of tasks whose outputs lie in the same folder.
+    cost : expected time relative to the other tasks.
+
+    A task can be pickled and runs on every machine that sees the session folder under the same path.
     """
 
     key: str
@@ -55,46 +62,50 @@ class Task:
 
     @property
     def output(self) -> Path:
-        """The file of the result."""
+        """Path of the output file."""
         return self.folder / f"{self.key}.npz"
 
     @property
     def done(self) -> bool:
-        """Whether the output is there, and whole: its end is written last."""
+        """Whether the output file exists and is complete; the end of a zip file is written last."""
         return self.output.is_file() and zipfile.is_zipfile(self.output)
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """The output files of the tasks it needs."""
+        """Output files of the tasks that it needs."""
         return tuple(self.folder / f"{key}.npz" for key in self.needs)
 
-    def run(self) -> Ran:
-        """Make the output unless it is there. A ComputationError is an outcome: it is kept as such."""
+    def run(self) -> TaskReport:
+        """Compute the output unless it is there. A ComputationError of the function is stored as the output."""
         if self.done:
             os.utime(self.output)
-            return Ran(made=False)
+            return TaskReport(computed=False)
         began = time.monotonic()
         try:
             arrays = dict(self.function(*self.arguments, inputs=self.inputs))
         except ComputationError as error:
             arrays = {_ERROR: np.array(str(error))}
         _write(self.output, arrays)
-        return Ran(True, int(arrays.get("points", 0)), time.monotonic() - began)
+        return TaskReport(True, int(arrays.get("points", 0)), time.monotonic() - began)
 
 
 class Executor(Protocol):
-    """Whatever runs tasks."""
+    """Runs tasks: in this process or on other machines."""
 
-    def run(self, tasks: Sequence[Task], told: Told) -> None:
-        """Run every task whose output is not there; a task comes after those it needs.
+    def run(self, tasks: Sequence[Task], on_end: OnTaskEnd) -> None:
+        """Run every task that is not done.
 
-        ``told`` is called in the calling thread, once a task. An InputError of a task, or a bug, ends the run and is
-        raised; what was made until then stays.
+        tasks : each after the tasks that it needs. on_end : called in the calling thread, once for each task.
+        Raises the InputError, or the unexpected exception, of the first task that has one; outputs computed until then
+        remain.
         """
 
 
 def read_output(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an output file. Raises the ComputationError that its task ended with."""
+    """The arrays of an output file by name, each with the shape, (n, ...), and unit that the function gave it.
+
+    Raises the ComputationError that the task ended with, InputError where the file is not readable.
+    """
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -106,7 +117,10 @@ def read_output(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def digest(*parts: Any) -> str:
-    """A key of values: numbers, text, arrays, sequences, mappings, dataclasses and groups of settings. 32 digits."""
+    """Digest of some values, 32 hexadecimal digits.
+
+    parts : numbers, text, arrays, sequences, mappings, dataclasses and groups of settings; TypeError for others.
+    """
     sha = hashlib.sha256()
     for piece in _pieces(parts):
         sha.update(piece)
@@ -115,24 +129,24 @@ def digest(*parts: Any) -> str:
 
 @cache
 def code_stamp() -> str:
-    """A key of this program's own source: another version makes its outputs anew."""
+    """Digest of the source of this package. It is part of every key, so another version computes all outputs anew."""
     root = Path(__file__).resolve().parents[1]
     sources = sorted(root.rglob("*.py"))
     return digest([(str(path.relative_to(root).as_posix()), path.read_bytes()) for path in sources])
 
 
-def file_digest(path: Path, told: Mapping[str, Any] | None = None) -> str:
-    """The SHA-256 of a file. told : its capture's record of it, believed where the size in bytes agrees."""
-    if told and told.get("sha256") and told.get("bytes") == path.stat().st_size:
-        return str(told["sha256"])
+def file_digest(path: Path, record: Mapping[str, Any] | None = None) -> str:
+    """The SHA-256 of a file. record : of the file in its capture; its digest is used where the size in bytes agrees."""
+    if record and record.get("sha256") and record.get("bytes") == path.stat().st_size:
+        return str(record["sha256"])
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _write(path: Path, arrays: Arrays) -> None:
-    """Written aside and renamed: a file under its own name is whole."""
+    """Write arrays to a temporary file and rename it, so that a file under its own name is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".{path.stem}-{uuid.uuid4().hex}.partial")  # its own on every machine that sees the folder
+    aside = path.with_name(f".{path.stem}-{uuid.uuid4().hex}.partial")  # unique among all machines that see the folder
     try:
         with aside.open("wb") as file:
             np.savez(file, **dict(arrays))  # type: ignore[arg-type]
@@ -142,7 +156,7 @@ def _write(path: Path, arrays: Arrays) -> None:
 
 
 def _pieces(value: Any) -> list[bytes]:
-    """A value as bytes that tell it from every other."""
+    """A value as bytes that no other value gives."""
     if isinstance(value, BaseModel):
         return [type(value).__name__.encode(), *_pieces(value.model_dump())]
     if is_dataclass(value) and not isinstance(value, type):

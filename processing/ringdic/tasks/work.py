@@ -1,4 +1,4 @@
-"""The folder of the tasks' outputs in a session, kept within a size."""
+"""The folder of a session's task outputs, and the limit of its size."""
 
 from __future__ import annotations
 
@@ -11,18 +11,21 @@ _LIMIT = 8 << 30  # bytes
 
 
 def work_folder(session: Path) -> Path:
-    """Where a session's tasks put their outputs. It may be removed at any time that no job runs: it is made anew."""
+    """The folder of a session's task outputs. It may be removed while no job runs; outputs are computed again."""
     return Path(session).resolve() / "work"
 
 
 def tidy(folder: Path, job: Iterable[Task], limit: int = _LIMIT) -> None:
-    """Remove the outputs not used for longest until the folder takes no more than ``limit`` bytes; never the job's."""
+    """Remove the least recently used outputs until the folder takes no more than ``limit`` bytes.
+
+    job : tasks whose outputs are not removed.
+    """
     if not folder.is_dir():
         return
     own = {task.output for task in job}
-    found = [(path.stat(), path) for path in folder.glob("*.npz")]
-    total = sum(stat.st_size for stat, _ in found)
-    for stat, path in sorted(found, key=lambda one: one[0].st_mtime):
+    outputs = [(path.stat(), path) for path in folder.glob("*.npz")]
+    total = sum(stat.st_size for stat, _ in outputs)
+    for stat, path in sorted(outputs, key=lambda one: one[0].st_mtime):
         if total <= limit:
             return
         if path not in own:

@@ -1,4 +1,13 @@
-"""How sure the numbers are: from the noise of the images to matches, points, displacements and strains."""
+"""Standard deviations of matches, positions, displacements and stretches, by image noise and by the calibration.
+
+``noise``        variance of the noise of a camera's grey levels
+``texture``      contrast and slopes of the grey levels over the subsets of an image
+``matches``      standard deviations of matches by cause
+``position``     standard deviations of triangulated positions from those of the pixels
+``strain``       standard deviations of the stretches of triangles, with the correlation of overlapping subsets
+``window``       standard deviations of stretches over a strain window
+``calibration``  standard deviations by the covariance of the camera parameters
+"""
 
 from ringdic.uncertainty.position import position_sigma
 

@@ -1,9 +1,11 @@
-"""What points owe to uncertain cameras: an error that all points and steps share, and that no repetition shows.
+"""Standard deviations of positions, displacements and stretches by the covariance of the camera parameters.
 
-With the cameras' parameters off by dp a point moves by ``-Σ A_c (∂u_c/∂p_c) dp_c``, A_c the gain of its pixels. Written
-for dp = R dq with R Rᵀ their covariance and dq of unit variance, that is a matrix (3, S) a point: its *share* in each
-of the S independent errors. Shares of different points and steps subtract before they are squared, so what is common
-to them cancels: a displacement and a stretch are far surer than the places they come from.
+All points and steps share the errors of the calibration, so repeating the images does not show them. With errors dp of
+the parameters p_c of the cameras a point moves by ``-Σ_c A_c (∂u_c/∂p_c) dp_c``, where A_c is the gain from camera c's
+pixel u_c to the position. Let R be a root of the parameters' covariance, R Rᵀ, and dp = R dq with S independent errors
+dq of unit variance. The derivative with respect to dq, a matrix (3, S) for each point, is called its *sensitivity*
+here. Sensitivities of different points and steps are subtracted before they are squared, so errors in common cancel: a
+displacement and a stretch are much less uncertain than the positions that they are computed from.
 """
 
 from __future__ import annotations
@@ -14,22 +16,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Mask
+from ringdic.arrays import Floats, Indices, Mask, Points
 from ringdic.calibration.parameters import PER_CAMERA, Parameters, projection_jacobians
 from ringdic.geometry.camera import Camera
 from ringdic.strain.deformation import Deformation
 from ringdic.uncertainty.strain import stretch_slopes
 
-Shares = NDArray[np.float32]
+#: Derivatives (..., S) of quantities with respect to S independent errors of unit variance, in single precision.
+Sensitivity = NDArray[np.float32]
 
 _BLOCK = 4096  # points or triangles at a time, which bounds the memory
 
 
 @dataclass(frozen=True)
 class CameraCovariance:
-    """What an adjustment knows of its K cameras.
+    """Covariance of the parameters of K cameras after a bundle adjustment.
 
-    ids : of the cameras. parameters : (16 K, 16 K) covariance of sixteen parameters of each, in their order.
+    ids : of the cameras. parameters : (16 K, 16 K) covariance of the sixteen `Parameters` of each camera (px, rad, mm
+    and, for the distortion, no unit), camera after camera.
     """
 
     ids: tuple[str, ...]
@@ -42,77 +46,89 @@ class CameraCovariance:
 
     @property
     def root(self) -> Floats:
-        """R with R Rᵀ the covariance; parameters that were held have none."""
+        """Root R (16 K, S) of the covariance, R Rᵀ, in the units of the parameters (px, rad, mm); S = 16 K.
+
+        Parameters that the adjustment held fixed have zeros.
+        """
         values, vectors = np.linalg.eigh(self.parameters)
         return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def shares(
+def position_sensitivity(
     cameras: Sequence[Camera],
-    xyz: Floats,
+    xyz: Points,
     gain: Floats,
     known: CameraCovariance,
-    followed: tuple[Floats, Shares] | None = None,
-) -> Shares:
-    """How points move with the independent errors of the cameras, (n, 3, S) mm; NaN where a point has no gain.
+    tracked_from: tuple[Points, Sensitivity] | None = None,
+) -> Sensitivity:
+    """Sensitivity of positions to the independent errors of the calibration.
 
     Parameters
     ----------
-    cameras : C. xyz : (n, 3) mm. gain : (C, n, 3, 2) mm a px, of ``position_gain``.
-    followed : positions (n, 3) of the same points at the reference and their shares there, where each camera followed
-        a point from the projection of that position; None where its pixels are measured in themselves.
+    cameras : the C cameras that the points were triangulated from.
+    xyz : (n, 3) mm, the positions.
+    gain : (C, n, 3, 2) mm a px, from the pixels to the positions, as `position_gain` computes it.
+    known : covariance of the camera parameters.
+    tracked_from : for points that each camera tracked from the projection of their reference position: the reference
+        positions (n, 3) mm and their sensitivity (n, 3, S). None for pixels that do not depend on the cameras.
 
-    Raises ValueError for a camera that was not adjusted.
+    Returns
+    -------
+    (n, 3, S) mm; NaN where a point has no gain.
+
+    Raises
+    ------
+    ValueError for a camera without a covariance.
     """
     missing = [camera.id for camera in cameras if camera.id not in known.ids]
     if missing:
         raise ValueError(f"no covariance of camera {', '.join(missing)}; it took no part in the adjustment")
     root = known.root.astype(np.float32)
     out = np.full((len(xyz), 3, len(root)), np.nan, dtype=np.float32)
-    seen: Mask = np.asarray(gain.any(axis=(2, 3)) & np.isfinite(xyz).all(axis=1))
+    visible: Mask = np.asarray(gain.any(axis=(2, 3)) & np.isfinite(xyz).all(axis=1))
     for first in range(0, len(xyz), _BLOCK):
         part = slice(first, first + _BLOCK)
         moved = np.zeros((len(xyz[part]), 3, len(root)), dtype=np.float32)
         follows = np.zeros((len(moved), 3, 3))
         for k, camera in enumerate(cameras):
-            index = np.flatnonzero(seen[k, part])
+            index = np.flatnonzero(visible[k, part])
             parameters = Parameters.of(camera)
             by_camera = -projection_jacobians(parameters, xyz[part][index])[1]
-            if followed is not None:
-                _, at_first, by_place = projection_jacobians(parameters, followed[0][part][index])
+            if tracked_from is not None:
+                _, at_first, by_place = projection_jacobians(parameters, tracked_from[0][part][index])
                 by_camera += at_first
                 follows[index] += gain[k, part][index] @ by_place
             at = PER_CAMERA * known.ids.index(camera.id)
             moved[index, :, at : at + PER_CAMERA] = gain[k, part][index] @ by_camera
         moved = moved @ root
-        if followed is not None:
-            moved += follows.astype(np.float32) @ followed[1][part]
-        moved[np.flatnonzero(~np.any(seen[:, part], axis=0))] = np.nan
+        if tracked_from is not None:
+            moved += follows.astype(np.float32) @ tracked_from[1][part]
+        moved[np.flatnonzero(~np.any(visible[:, part], axis=0))] = np.nan
         out[part] = moved
     return out
 
 
-def sigma_of(share: Shares) -> Floats:
-    """Standard deviations (...) of quantities with shares (..., S)."""
-    return np.asarray(np.sqrt(np.einsum("...s,...s->...", share, share)), dtype=float)
+def sensitivity_sigma(sensitivity: Sensitivity) -> Floats:
+    """Standard deviations (...) of quantities from their sensitivity (..., S), in the same unit."""
+    return np.asarray(np.sqrt(np.einsum("...s,...s->...", sensitivity, sensitivity)), dtype=float)
 
 
 def stretch_sigma_by_cameras(
-    found: Deformation, reference: Floats, faces: NDArray[np.int_], at_first: Shares, now: Shares
+    deformed: Deformation, reference: Points, faces: Indices, at_reference: Sensitivity, at_step: Sensitivity
 ) -> Floats:
-    """Standard deviations (M, 2) of λ1 and λ2 by those of the cameras.
+    """Standard deviations (M, 2) of the stretches λ1 and λ2 by the covariance of the cameras.
 
-    found : deformation of the step. reference : (N, 3) mm. faces : (M, 3). at_first, now : shares (N, 3, S) of the
-    points at the reference and at the step.
+    deformed : deformation of the M triangles at the step. reference : (N, 3) mm. faces : (M, 3) vertex indices.
+    at_reference, at_step : sensitivities (N, 3, S) mm of the vertices at the reference and at the step.
     """
-    current, before = (each.astype(np.float32) for each in stretch_slopes(found, reference, faces))
+    current, before = (each.astype(np.float32) for each in stretch_slopes(deformed, reference, faces))
     out = np.full((len(faces), 2), np.nan)
     for first in range(0, len(faces), _BLOCK):
         part = slice(first, first + _BLOCK)
         m = len(faces[part])
-        felt = np.zeros((m, 2, now.shape[-1]), dtype=np.float32)
-        for slope, share in ((current, now), (-before, at_first)):
+        stretches = np.zeros((m, 2, at_step.shape[-1]), dtype=np.float32)
+        for slope, sensitivity in ((current, at_step), (-before, at_reference)):
             along = slope[:, part].transpose(1, 0, 2, 3).reshape(m, 2, 9)
-            felt += along @ share[faces[part]].reshape(m, 9, -1)
-        out[part] = sigma_of(felt)
+            stretches += along @ sensitivity[faces[part]].reshape(m, 9, -1)
+        out[part] = sensitivity_sigma(stretches)
     return out

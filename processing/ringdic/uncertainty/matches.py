@@ -1,9 +1,10 @@
-"""What a match's uncertainty is made of: the noise of one image, that of the other, and what is no noise.
+"""Standard deviations of matches by cause: the noise of the reference image, that of the current one, and the rest.
 
-A correlation states ``√2 σ √(H⁻¹)`` with σ from the residual of the subset. That is right where both images show the
-pattern in the same way. Between cameras the residual also holds what each view makes of the same edges: it does not
-change from exposure to exposure, it lies on the edges, where it counts most, and it does not average out. Here the
-residual is parted by the noise that the images are known to have.
+A correlation states the standard deviation ``√2 σ √(H⁻¹)``, with σ from the residual of the subset. That is right where
+both images show the pattern in the same way. Between two cameras the residual also contains the differences
+between the two views of the same edges. This part does not change from exposure to exposure, it lies on the edges,
+where the slopes are largest, and it does not average out. Here the known noise of the images splits the residual into
+these parts.
 """
 
 from __future__ import annotations
@@ -12,33 +13,33 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ringdic.arrays import Floats
+from ringdic.arrays import Floats, Pixels
 from ringdic.uncertainty.texture import Texture
 
-# The interpolation of the current image smooths its noise: the mean of the squared response of the quintic spline over
-# all fractions of a pixel and frequencies, in two directions.
-_SEEN = 0.85
+# Share of the current image's noise variance that is left after its interpolation: the mean of the squared response of
+# the quintic spline over all fractions of a pixel and frequencies, in two directions.
+INTERPOLATED_NOISE = 0.85
 # Mean square of the slopes of the interpolating quintic spline at the samples of white noise of unit variance.
 _SLOPES = 1.894
-# What is no noise goes with the slopes: it counts as much more than an even spread over the subset as they are peaked,
-# less what signs that change along an edge cancel. The share is a measured one: with it and the noise alone the lines
-# of sight of three exact cameras, 30° apart before a stretched limb, miss one another by χ² 0.94 a degree of freedom.
-_LEFT = 0.7
+# The part that is no noise lies where the slopes are, so it counts more than evenly spread residuals by the peakedness
+# of the slopes; where its sign changes along an edge it cancels in part. This share of it remains, by measurement: with
+# it the lines of sight of three exact cameras, 30° apart, on a stretched limb have χ² 0.94 a degree of freedom.
+_REMAINING = 0.7
 
 
 @dataclass(frozen=True)
-class MatchParts:
-    """Standard deviations of n matches, px, each in its own image.
+class MatchUncertainty:
+    """Standard deviations of n matches by cause, (n, 2) px each.
 
-    reference : (n, 2) by the noise of the reference image. current : (n, 2) by that of the current image.
-    systematic : (n, 2) in the current image, by what is no noise; reference_systematic : (n, 2) the same in pixels of
-    the reference. Either image has its part in it, which no one pair can tell.
+    reference : by the noise of the reference image, in its pixels. current : by the noise of the current image, in its
+    pixels. systematic : by the residual that is no noise, in pixels of the current image. reference_systematic : that
+    part in pixels of the reference image. How much of it is due to either image cannot be known from one pair.
     """
 
-    reference: Floats
-    current: Floats
-    systematic: Floats
-    reference_systematic: Floats
+    reference: Pixels
+    current: Pixels
+    systematic: Pixels
+    reference_systematic: Pixels
 
     def __post_init__(self) -> None:
         shapes = {values.shape for values in vars(self).values()}
@@ -46,40 +47,41 @@ class MatchParts:
             raise ValueError("the parts of a match's uncertainty have one shape, (..., 2)")
 
 
-def match_parts(
-    sigma: Floats,
+def match_uncertainty(
+    sigma: Pixels,
     c_ls: Floats,
     textures: tuple[Texture, Texture],
     noise: tuple[float, float],
     gradient: Floats | None = None,
-) -> MatchParts:
-    """Part the standard deviations that a correlation states from its residuals.
+) -> MatchUncertainty:
+    """Split the standard deviations that a correlation states by their causes.
+
+    Where the known noise would give a larger residual than the correlation has, the noise is scaled down to it.
 
     Parameters
     ----------
-    sigma : (n, 2) px, √2 σ √(H⁻¹) as stated, in pixels of the reference. c_ls : (n,).
-    textures : of the reference at the points and of the current image at their matches.
-    noise : variances of the two images, grey levels².
-    gradient : (n, 2, 2) of the displacement; none for zero, as in time.
-
-    Where the noise would be more than the residual shows, the residual counts.
+    sigma : (n, 2) px, √2 σ √(H⁻¹) as the correlation states it, in pixels of the reference image.
+    c_ls : (n,) C_LS of the correlation.
+    textures : of the reference image at the points, and of the current image at their matches.
+    noise : variances of the noise of the two images, grey levels².
+    gradient : (n, 2, 2) gradient of the displacement; None for zero, as between images of one camera.
     """
     first, second = textures
     G = np.eye(2) if gradient is None else np.eye(2) + gradient
     area = np.abs(G[..., 0, 0] * G[..., 1, 1] - G[..., 0, 1] * G[..., 1, 0])
     with np.errstate(invalid="ignore", divide="ignore"):
         residual = first.contrast**2 * c_ls
-        # The diagonal of H⁻¹, whose H must not count the slopes of the noise: they tell no place and let noise in.
-        clean = first.clean(noise[0])
+        # The diagonal of H⁻¹ without the noise's own slopes, which carry no position and pass noise on.
+        clean = first.clean_slopes(noise[0])
         unit = sigma**2 / residual[:, None] * (1.0 + noise[0] * _SLOPES / clean) ** 2
         # Grey levels of the current image are scaled to the reference's contrast before they are compared.
-        seen = noise[0] + _SEEN * noise[1] * (first.contrast / second.contrast) ** 2
-        real = np.minimum(1.0, residual / seen)
+        expected = noise[0] + INTERPOLATED_NOISE * noise[1] * (first.contrast / second.contrast) ** 2
+        real = np.minimum(1.0, residual / expected)
         reference = unit * (real * noise[0])[:, None]
         # The current image locates the same patch of the surface by its own slopes and its own number of pixels.
-        own = second.spread(noise[1]) / first.spread(noise[0])
+        own = second.inverse_diagonal(noise[1]) / first.inverse_diagonal(noise[0])
         current = unit * own * (real * noise[1] / area)[:, None]
-        other = np.maximum(0.0, 1.0 - seen / residual)
-        systematic = sigma**2 * (_LEFT * first.peaked * other)[:, None]
-    there = np.einsum("...ij,...j->...i", G**2, systematic)
-    return MatchParts(np.sqrt(reference), np.sqrt(current), np.sqrt(there), np.sqrt(systematic))
+        other = np.maximum(0.0, 1.0 - expected / residual)
+        systematic = sigma**2 * (_REMAINING * first.peakedness * other)[:, None]
+    in_current = np.einsum("...ij,...j->...i", G**2, systematic)
+    return MatchUncertainty(np.sqrt(reference), np.sqrt(current), np.sqrt(in_current), np.sqrt(systematic))

@@ -1,4 +1,4 @@
-"""How noisy a camera's grey levels are, as a variance: from a scene at rest, from flat places, from matches in time."""
+"""Variance of the noise of a camera's grey levels: from a scene at rest, from flat areas, from matches in time."""
 
 from __future__ import annotations
 
@@ -9,26 +9,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats
-
-Image = NDArray[np.uint8] | NDArray[np.uint16] | Floats
+from ringdic.uncertainty.matches import INTERPOLATED_NOISE
+from ringdic.uncertainty.texture import GreyImage
 
 _QUANTISED = 1.0 / 12.0  # grey levels², the variance of rounding to whole ones
-# Differences of differences in x and y: blind to whatever is a plane, a ridge or an edge along either axis.
-_CROSSED = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]).astype(np.float32) / np.float32(6.0)  # keeps a variance
+# Second differences in x and in y: zero for a plane and for any ridge or edge along either axis.
+_CROSSED = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]).astype(np.float32) / np.float32(
+    6.0
+)  # keeps the variance of white noise
 _FLAT = 0.2  # share of the dark and of the bright pixels that count as flat
 _TRULY_FLAT = 3.0  # slopes there, in units of those that the noise alone would make
 _CLIP = 3.0
 _CLIPPED = 0.9866  # standard deviation of a normal distribution within ± 3 σ
-_SEEN = 0.85  # share of the current image's noise that its interpolation lets through, see matches.py
-# Between two exposures of a moving surface the residual is noise and what the pixels' grid makes of the edges.
+# Between two exposures of a moving surface the residual consists of noise and of edges sampled at other pixels; at
+# least this share of it is noise.
 _LEAST_SHARE = 0.55
 
 
-def flat_noise(image: Image) -> float:
-    """Variance of the noise of one image (h, w), from its flattest dark and its flattest bright places.
+def flat_noise(image: GreyImage) -> float:
+    """Variance of the noise of one image, grey levels², from its flattest dark and its flattest bright areas.
 
-    Grey levels². Where the pattern is so fine that nothing is flat it counts as noise: an upper bound. Where the image
-    was compressed the flat places have lost theirs: a lower bound.
+    image : (h, w) grey levels, at least 16 x 16 px; ValueError for a smaller one.
+    In a pattern so fine that it has no flat areas the result is an upper bound, since the pattern counts as noise. In
+    an image that was compressed it is a lower bound, since compression removes the noise of flat areas.
     """
     grey = np.asarray(image, dtype=np.float32)
     if grey.ndim != 2 or min(grey.shape) < 16:
@@ -39,23 +42,26 @@ def flat_noise(image: Image) -> float:
     wave = cv2.filter2D(grey, cv2.CV_32F, _CROSSED)[4:-4, 4:-4].ravel()
     level = cv2.blur(grey, (5, 5))[4:-4, 4:-4].ravel()
     dark = level < 0.5 * np.percentile(level, [10, 90]).sum()
-    found = []
+    estimates = []
     for half in (dark, ~dark):
         if half.sum() < 50:
             continue
         flat = half & (slope <= np.quantile(slope[half], _FLAT))
         variance = _clipped_variance(wave[flat])
-        if variance <= 0:  # black or white throughout: no noise is left to see
+        if variance <= 0:  # saturated throughout, so the noise is cut off
             continue
-        found.append((float(slope[flat].mean()) / (_white_slope() * variance), variance))
-    trusted = [variance for unevenness, variance in found if unevenness < _TRULY_FLAT]
+        estimates.append((float(slope[flat].mean()) / (_white_slope() * variance), variance))
+    trusted = [variance for unevenness, variance in estimates if unevenness < _TRULY_FLAT]
     return max(
-        float(np.mean(trusted)) if trusted else min((variance for _, variance in found), default=0.0), _QUANTISED
+        float(np.mean(trusted)) if trusted else min((variance for _, variance in estimates), default=0.0), _QUANTISED
     )
 
 
-def rest_noise(images: Sequence[Image]) -> float:
-    """Variance of the noise from K ≥ 2 images (h, w) of a scene at rest, grey levels²; any pattern is without harm."""
+def rest_noise(images: Sequence[GreyImage]) -> float:
+    """Variance of the noise, grey levels², from the differences of images of a scene at rest, whatever it shows.
+
+    images : K ≥ 2 images (h, w), grey levels; ValueError for fewer.
+    """
     if len(images) < 2:
         raise ValueError("noise shows between two images or more of a scene at rest")
     stack = np.stack([np.asarray(image, dtype=np.float32) for image in images])
@@ -63,10 +69,14 @@ def rest_noise(images: Sequence[Image]) -> float:
 
 
 def camera_noise(flat: float, c_ls: Floats, contrast: Floats) -> float:
-    """Variance of one camera's noise from its reference image and from how well its own images agree.
+    """Variance of the noise of one camera, grey levels², from its reference image and from its matches in time.
 
-    flat : of the reference image by ``flat_noise``. c_ls : (F, n) of matches in time, NaN where lost; contrast : (n,)
-    of the reference subsets. The quietest step bounds it from both sides: motion and light only add to the residual.
+    The residual of the step where it is smallest bounds the noise from both sides, since motion and light only add to
+    it.
+
+    flat : grey levels², the variance by `flat_noise` of the reference image.
+    c_ls : (F, n) C_LS of the matches in time, NaN where lost.
+    contrast : (n,) grey levels, standard deviation of the grey levels of each reference subset.
     """
     with np.errstate(invalid="ignore"):
         residual = np.atleast_2d(c_ls) * contrast**2
@@ -74,25 +84,25 @@ def camera_noise(flat: float, c_ls: Floats, contrast: Floats) -> float:
     quiet = [step for step in steps if step > 0]
     if not quiet:
         return flat
-    shown = min(quiet) / (1.0 + _SEEN)
-    # Flat places are the brightest ones, quieter than the edges where coding bends the noise; the truth lies between.
-    return float(np.clip(flat, _LEAST_SHARE * shown, shown) ** (2 / 3) * shown ** (1 / 3))
+    largest = min(quiet) / (1.0 + INTERPOLATED_NOISE)
+    # Compression leaves less noise in flat areas than at edges; the true variance lies between the two estimates.
+    return float(np.clip(flat, _LEAST_SHARE * largest, largest) ** (2 / 3) * largest ** (1 / 3))
 
 
 def _white_slope() -> float:
-    """What white noise of unit variance makes of the mean square of the smoothed slope."""
+    """Mean square of the smoothed slopes of white noise of unit variance."""
     blur, step = np.ones(3) / 3.0, np.array([-1.0, 0.0, 1.0]) * 0.5
     ramp, bell = np.convolve(blur, step), np.convolve(blur, np.array([1.0, 2.0, 1.0]) / 4.0)
     return float(2.0 * (ramp @ ramp) * (bell @ bell))
 
 
 def _clipped_variance(values: NDArray[np.float32]) -> float:
-    """Variance of what is normally distributed, whatever else lies beyond three standard deviations."""
+    """Variance of normally distributed values (n,) with outliers, by clipping at three standard deviations."""
     inside = np.asarray(values, dtype=np.float64)
     for _ in range(10):
         limit = _CLIP * max(float(np.sqrt(np.mean(inside**2))) / _CLIPPED, 1e-6)
-        kept = inside[np.abs(inside) <= limit]
-        if len(kept) == len(inside):
+        clipped = inside[np.abs(inside) <= limit]
+        if len(clipped) == len(inside):
             break
-        inside = kept
+        inside = clipped
     return float(np.mean(inside**2)) / _CLIPPED**2

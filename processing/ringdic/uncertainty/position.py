@@ -1,15 +1,17 @@
-"""From the scatter of matched pixels to the scatter of points in space, to first order.
+"""Covariance of triangulated positions from the standard deviations of the matched pixels, to first order.
 
-With δ_c the error of camera c's pixel, a point triangulated from all cameras moves by ``Σ A_c δ_c``,
-``A_c = (Σ Jᵀ W J)⁻¹ J_cᵀ W_c``. A point *named* by a whole pixel p of its reference camera r carries more: the noise of
-the reference image shifts which place of the surface the pattern about p stands for, and every match with it. With
-``B = ∂X/∂p`` along the surface the reference position is off by ``Σ A_c δ_c - B δ_r``.
+An error δ_c of camera c's pixel moves a point triangulated from all cameras by ``A_c δ_c``, with the gain
+``A_c = (Σ Jᵀ W J)⁻¹ J_cᵀ W_c``; J_c is the derivative of the projection, W_c the weight of the pixel. A point that is
+*defined* by a whole pixel p of its reference camera r has a further error: noise of the reference image changes which
+point of the surface the pattern about p represents, and all its matches move along. With ``B = ∂X/∂p`` along the
+surface, the error of the reference position is ``Σ A_c δ_c - B δ_r``.
 
-The displacement of each camera's pixel is measured from that camera's own reference image, at the projection of the
-point. What the point was off by cancels: ``Σ A'_c (ε_c(t) - ε_c(0))`` is left, ε of the subsets in time.
-The position at a step is the sum of both. It holds each reference image twice, once matched between cameras by a subset
-that is narrow where the view is steep (δ), once in time by a whole one (ε); the whole one contains the narrow one, so
-``⟨δ ε⟩ = ⟨ε ε⟩``.
+At later steps the displacement of each camera's pixel is measured against that camera's own reference image, at the
+projection of the point. The error of the reference position cancels in the displacement, which keeps
+``Σ A'_c (ε_c(t) - ε_c(0))``, with ε_c the errors of the subsets that are matched in time and A'_c the gain at the step.
+The position at a step is the reference position plus the displacement. It contains the noise of each reference image
+twice: once through the match between cameras (δ), whose subset is narrowed where the view is steep, once through the
+match in time (ε), whose subset is a whole disc. The disc contains the narrowed subset, so ``⟨δ ε⟩ = ⟨ε ε⟩``.
 """
 
 from __future__ import annotations
@@ -18,17 +20,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ringdic.arrays import Floats, Indices
+from ringdic.arrays import Floats, Indices, Pixels, Points, Vectors
 from ringdic.geometry import kernels
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.triangulation import LinearSystem
 
 
-def position_gain(cameras: Sequence[Camera], xyz: Floats, sigma: Floats) -> Floats:
-    """``A_c``: how points move with each pixel of each camera, mm a px. (C, n, 3, 2), zero where one takes no part.
+def position_gain(cameras: Sequence[Camera], xyz: Points, sigma: Pixels) -> Floats:
+    """Gain ``A_c`` from the pixels of each camera to positions triangulated from all cameras with weights 1 / σ².
 
-    xyz : (n, 3) mm, as ``triangulate_weighted`` found them with sigma : (C, n, 2) px, NaN for a camera that took no
-    part.
+    xyz : (n, 3) mm, the positions. sigma : (C, n, 2) px, standard deviations of the pixels that they were triangulated
+    from, NaN for a camera that took no part.
+    Returns (C, n, 3, 2) mm a px; zero for a camera that took no part.
     """
     sigma = np.ascontiguousarray(sigma, dtype=float)
     slopes = np.full((len(cameras), len(xyz), 2, 3), np.nan)
@@ -40,24 +43,29 @@ def position_gain(cameras: Sequence[Camera], xyz: Floats, sigma: Floats) -> Floa
     return gain
 
 
-def covariance(gain: Floats, sigma: Floats) -> Floats:
-    """``Σ A_c diag(σ_c²) A_cᵀ`` (n, 3, 3) mm², of a gain (C, n, 3, 2) and independent errors (C, n, 2) px.
+def covariance(gain: Floats, sigma: Pixels) -> Floats:
+    """Covariance ``Σ A_c diag(σ_c²) A_cᵀ`` of positions from independent errors of the pixels.
 
-    NaN where fewer than two cameras take part.
+    gain : (C, n, 3, 2) mm a px, of `position_gain`. sigma : (C, n, 2) px, standard deviations of the pixels.
+    Returns (n, 3, 3) mm²; NaN where fewer than two cameras take part.
     """
-    found = kernels.fill_covariance(np.ascontiguousarray(gain, dtype=float), np.ascontiguousarray(sigma, dtype=float))
-    return np.asarray(found)
+    gain, sigma = np.ascontiguousarray(gain, dtype=float), np.ascontiguousarray(sigma, dtype=float)
+    return np.asarray(kernels.fill_covariance(gain, sigma))
 
 
-def along_surface(cameras: Sequence[Camera], reference: Indices, xyz: Floats, normals: Floats) -> Floats:
-    """``B = ∂X/∂p``: how the point of the surface that a pixel shows moves with that pixel, mm a px. (n, 3, 2).
+def along_surface(cameras: Sequence[Camera], reference: Indices, xyz: Points, normals: Vectors) -> Floats:
+    """Derivative ``B = ∂X/∂p`` of the point of the surface that a pixel shows, with respect to that pixel.
 
-    reference : (n,) index of the camera. xyz, normals : (n, 3). The inverse of the projection, restricted to the
-    surface: ``B = T (J T)⁻¹`` with any basis T of the tangent plane.
+    It is the inverse of the projection, restricted to the surface: ``B = T (J T)⁻¹`` with any basis T of the tangent
+    plane.
+
+    reference : (n,) index of the camera whose pixel it is, -1 for none. xyz : (n, 3) mm, points of the surface.
+    normals : (n, 3), normals there, of any length.
+    Returns (n, 3, 2) mm a px; NaN where there is no camera.
     """
     out = np.full((len(xyz), 3, 2), np.nan)
-    helper = np.eye(3)[np.argmin(np.abs(np.nan_to_num(normals)), axis=1)]
-    first = np.cross(normals, helper)
+    axis = np.eye(3)[np.argmin(np.abs(np.nan_to_num(normals)), axis=1)]
+    first = np.cross(normals, axis)
     tangents = np.stack([first, np.cross(normals, first)], axis=-1)  # (n, 3, 2)
     for k in np.unique(reference[reference >= 0]):
         index = np.flatnonzero(reference == k)
@@ -66,11 +74,12 @@ def along_surface(cameras: Sequence[Camera], reference: Indices, xyz: Floats, no
     return out
 
 
-def reference_covariance(gain: Floats, sigma: Floats, reference: Indices, label: Floats) -> Floats:
-    """Covariance (n, 3, 3) mm² of reference positions named by a pixel of their reference camera, over repeated noise.
+def reference_covariance(gain: Floats, sigma: Pixels, reference: Indices, label: Floats) -> Floats:
+    """Covariance, by the noise of the images, of reference positions that a pixel of their reference camera defines.
 
-    gain : (C, n, 3, 2). sigma : (C, n, 2) px, of the noise of each image alone. reference : (n,). label : (n, 3, 2) of
-    ``along_surface``.
+    gain : (C, n, 3, 2) mm a px, of `position_gain`. sigma : (C, n, 2) px, by the noise of each image alone.
+    reference : (n,) index of the reference camera. label : (n, 3, 2) mm a px, of `along_surface`.
+    Returns (n, 3, 3) mm².
     """
     moved = gain.copy()
     moved[reference, np.arange(len(reference))] -= label
@@ -78,37 +87,41 @@ def reference_covariance(gain: Floats, sigma: Floats, reference: Indices, label:
 
 
 def step_covariance(
-    gains: tuple[Floats, Floats], sigma: Floats, tracked: tuple[Floats, Floats], reference: Indices, label: Floats
+    gains: tuple[Floats, Floats], sigma: Pixels, tracked: tuple[Pixels, Pixels], reference: Indices, label: Floats
 ) -> Floats:
-    """Covariance (n, 3, 3) mm² of the same points at a later step.
+    """Covariance, by the noise of the images, of positions at a later step.
 
-    gains : (C, n, 3, 2), of the reference and of the step. sigma : (C, n, 2) px, as for the reference. tracked :
-    (C, n, 2) px each, of the subsets in time by the noise of the reference image alone and of the step's image alone.
+    gains : (C, n, 3, 2) mm a px each, of `position_gain` at the reference and at the step.
+    sigma : (C, n, 2) px, of the matches between the cameras by the noise of each reference image alone.
+    tracked : (C, n, 2) px each, of the matches in time by the noise of the reference image alone and by that of the
+        step's image alone.
+    reference : (n,) index of the reference camera. label : (n, 3, 2) mm a px, of `along_surface`.
+    Returns (n, 3, 3) mm².
     """
-    at_first, now = gains
-    sigma_first, sigma_now = tracked
-    total = covariance(now, sigma_now)
+    gain_reference, gain_step = gains
+    sigma_reference, sigma_step = tracked
+    total = covariance(gain_step, sigma_step)
     n = np.arange(len(reference))
-    for k in range(len(now)):
-        named = np.where((reference == k)[:, None, None], label, 0.0)
-        # Where a camera has only one of the two subsets nothing cancels.
-        whole = np.nan_to_num(sigma_first[k])
+    for k in range(len(gain_step)):
+        own_label = np.where((reference == k)[:, None, None], label, 0.0)
+        whole = np.nan_to_num(sigma_reference[k])
         narrow = np.nan_to_num(sigma[k])
-        both = at_first[k].any(axis=(1, 2)) & now[k].any(axis=(1, 2))
+        # Errors cancel only where the camera took part at the reference and at the step.
+        both = gain_reference[k].any(axis=(1, 2)) & gain_step[k].any(axis=(1, 2))
         common = np.where(both[:, None], np.minimum(whole, narrow), 0.0)
         parts = (
-            ((at_first[k] - now[k] - named), common),
-            (at_first[k] - named, np.sqrt(np.maximum(narrow**2 - common**2, 0.0))),
-            (now[k], np.sqrt(np.maximum(whole**2 - common**2, 0.0))),
+            ((gain_reference[k] - gain_step[k] - own_label), common),
+            (gain_reference[k] - own_label, np.sqrt(np.maximum(narrow**2 - common**2, 0.0))),
+            (gain_step[k], np.sqrt(np.maximum(whole**2 - common**2, 0.0))),
         )
-        for slope, scatter in parts:
-            scaled = slope * scatter[n, None, :]
+        for slope, part_sigma in parts:
+            scaled = slope * part_sigma[n, None, :]
             total += scaled @ scaled.transpose(0, 2, 1)
     return total
 
 
-def position_sigma(cameras: Sequence[Camera], px: Floats, sigma: Floats) -> Floats:
-    """Standard deviations of linearly triangulated points from those of their pixels, taken as independent.
+def position_sigma(cameras: Sequence[Camera], px: Pixels, sigma: Pixels) -> Floats:
+    """Standard deviations of linearly triangulated positions from those of their pixels, which are independent.
 
     Parameters
     ----------
@@ -117,14 +130,17 @@ def position_sigma(cameras: Sequence[Camera], px: Floats, sigma: Floats) -> Floa
 
     Returns
     -------
-    (n, 3) mm, world frame; NaN where fewer than two cameras know the point and its scatter.
+    (n, 3) mm, world frame; NaN where fewer than two cameras have a pixel and its standard deviation.
     """
     px = np.where(np.isfinite(sigma), np.asarray(px, dtype=float), np.nan)
     return linear_sigma(cameras, LinearSystem.of(cameras, px), sigma)
 
 
-def linear_sigma(cameras: Sequence[Camera], system: LinearSystem, sigma: Floats) -> Floats:
-    """The same of points whose equations are there already; sigma (C, n, 2) px.
+def linear_sigma(cameras: Sequence[Camera], system: LinearSystem, sigma: Pixels) -> Floats:
+    """Standard deviations of positions from the linear equations that they were triangulated with.
+
+    cameras : the C cameras. system : the equations of the n points. sigma : (C, n, 2) px, standard deviations of the
+    pixels, which are independent. Returns (n, 3) mm, world frame.
 
     The linear solution minimises ``|A(px) X - b(px)|²``; for consistent pixels its change is ``dX = -(AᵀA)⁻¹ Aᵀ dr``
     with ``dr = (dA) X - db``, and the residual of a camera moves by ``-(p3 · (X, 1))`` times the change of its pixel.

@@ -14,7 +14,8 @@ import trimesh
 from ringdic.errors import InputError
 from ringdic.export import FORMATS, export
 from ringdic.results.evaluation import Evaluation
-from ringdic.results.results import Results, read_field, read_summary
+from ringdic.results.reader import read_field, read_summary
+from ringdic.results.results import Results
 from ringdic.results.writer import write_results
 from ringdic.strain.window import strain_window
 from scipy.io import loadmat

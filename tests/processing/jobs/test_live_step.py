@@ -8,10 +8,10 @@ from ringdic.errors import InputError
 from ringdic.jobs.live_step import process_step
 from ringdic.jobs.pipeline import process_session
 from ringdic.progress import Progress
-from ringdic.results.results import read_field, read_results
+from ringdic.results.reader import read_field, read_results
 from ringdic.session.folder import live_results
 from ringdic.settings import load_settings
-from ringdic.tasks import LocalExecutor, Ran, Task, Told
+from ringdic.tasks import LocalExecutor, OnTaskEnd, Task, TaskReport
 
 SETTINGS = load_settings(None, ["correlation.radius_px=12", "correlation.step_px=8"])
 
@@ -22,11 +22,11 @@ class Counted:
     def __init__(self) -> None:
         self.made: list[str] = []
 
-    def run(self, tasks: list[Task], told: Told) -> None:
-        def tell(task: Task, ran: Ran, count: int, total: int) -> None:
-            if ran.made:
+    def run(self, tasks: list[Task], on_end: OnTaskEnd) -> None:
+        def tell(task: Task, report: TaskReport, count: int, total: int) -> None:
+            if report.computed:
                 self.made.append(task.name)
-            told(task, ran, count, total)
+            on_end(task, report, count, total)
 
         LocalExecutor(1).run(tasks, tell)
 

@@ -18,7 +18,7 @@ from ringdic.multiview.tracking import Tracking
 from ringdic.multiview.tube import lattice_faces
 from ringdic.multiview.views import seen
 from ringdic.multiview.warps import surface_stencil, warps_to
-from ringdic.results.results import read_results
+from ringdic.results.reader import read_results
 from ringdic.results.writer import write_results
 from ringdic.settings import BEST, CorrelationGroup
 from ringdic.strain.deformation import deformation

@@ -13,11 +13,12 @@ from ringdic.correlation import CorrelationSettings, Status
 from ringdic.geometry.camera import Camera
 from ringdic.jobs.pipeline import process_session
 from ringdic.pairs.tasks import PairJob, ordered_tasks, pair_jobs
-from ringdic.results.results import Results, read_results
+from ringdic.results.reader import read_results
+from ringdic.results.results import Results
 from ringdic.session.folder import open_session
 from ringdic.settings import Settings, load_settings
 from ringdic.sweep.sweep import Search
-from ringdic.tasks import LocalExecutor, Ran, Task, Told, kept
+from ringdic.tasks import LocalExecutor, OnTaskEnd, Task, TaskReport, process_memory
 
 SCALE, STEPS = 0.2, 3  # of the session
 SMALL = ["correlation.radius_px=12", "correlation.step_px=8"]
@@ -32,13 +33,13 @@ class Counted:
         self.made: list[str] = []
         self.stop_after = stop_after
 
-    def run(self, tasks: list[Task], told: Told) -> None:
-        def tell(task: Task, ran: Ran, count: int, total: int) -> None:
-            if ran.made:
+    def run(self, tasks: list[Task], on_end: OnTaskEnd) -> None:
+        def tell(task: Task, report: TaskReport, count: int, total: int) -> None:
+            if report.computed:
                 self.made.append(task.name)
             if self.stop_after == len(self.made):
                 raise KeyboardInterrupt
-            told(task, ran, count, total)
+            on_end(task, report, count, total)
 
         LocalExecutor(1).run(tasks, tell)
 
@@ -78,7 +79,7 @@ def test_an_interrupted_job_makes_only_what_is_missing_and_the_same_results(
     with pytest.raises(KeyboardInterrupt):
         process_session(session, settings, executor=interrupted)
     assert not (session / "results").exists()
-    kept.clear()
+    process_memory.clear()
     second = read_results(process_session(session, settings, executor=resumed) / "results.h5")
     assert len(interrupted.made) == 2
     assert sorted([*interrupted.made, *resumed.made]) == sorted({*interrupted.made, *resumed.made})
@@ -178,9 +179,9 @@ def test_another_calibration_makes_all_anew(session: Path) -> None:
 
 
 def test_no_image_is_decoded_twice(session: Path) -> None:
-    before = kept.made
+    before = process_memory.computations
     process_session(session, SETTINGS, executor=LocalExecutor(2))
     images, references, later = 2 * STEPS, 2, 2 * (STEPS - 1)
     assert (
-        kept.made - before == images + references + later
+        process_memory.computations - before == images + references + later
     )  # the last: what each camera showed, asked for by its pairs

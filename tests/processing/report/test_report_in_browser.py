@@ -12,7 +12,7 @@ from ringdic.errors import InputError
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.measure.region import Everything, region_statistics
 from ringdic.report import write_report
-from ringdic.results.evaluation import evaluated
+from ringdic.results.evaluation import evaluate_results
 from ringdic.results.results import Results
 from ringdic.results.writer import write_results
 
@@ -110,7 +110,7 @@ def test_every_picture_is_whole_and_described(page: Page) -> None:
 
 @pytest.mark.browser
 def test_the_statistics_are_those_of_the_results(page: Page, session: Path) -> None:
-    seen = evaluated(session / "results" / "0001" / "results.h5")
+    seen = evaluate_results(session / "results" / "0001" / "results.h5")
     columns = {
         c.name: c.values for c in region_statistics(seen, Everything(), ["displacement", "lambda1", "J"]).columns
     }

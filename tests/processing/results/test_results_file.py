@@ -8,18 +8,12 @@ import numpy as np
 import pytest
 from ringdic.errors import InputError
 from ringdic.geometry.camera import Camera, Intrinsics
-from ringdic.results.fields import FIELDS, Field
-from ringdic.results.results import (
-    WHERE_KNOWN,
-    Matches,
-    Results,
-    read_field,
-    read_mesh,
-    read_positions,
-    read_results,
-    read_summary,
-)
-from ringdic.results.writer import write_results
+from ringdic.results.fields import FIELDS, OPTIONAL_ARRAYS, Field
+from ringdic.results.layout import SCHEMA
+from ringdic.results.reader import read_field, read_mesh, read_positions, read_results, read_summary
+from ringdic.results.results import Matches, Results
+from ringdic.results.series import select_steps
+from ringdic.results.writer import ResultsWriter, write_results
 from ringdic.strain.window import strain_window
 
 LOST = 7
@@ -169,7 +163,7 @@ def test_what_is_known_beside_the_rest_has_its_fields(tmp_path: Path) -> None:
     summary = read_summary(path)
     assert [row["name"] for row in summary["fields"]] == [entry.name for entry in FIELDS]
     back = read_results(path)
-    for name in WHERE_KNOWN:
+    for name in OPTIONAL_ARRAYS:
         np.testing.assert_allclose(getattr(back, name), getattr(result, name), rtol=1e-6)
     np.testing.assert_allclose(read_field(path, "sigma_lambda2", 1)[0], result.sigma_lambda[1, :, 1], rtol=1e-6)
     total, _ = read_field(path, "sigma_total", 1)
@@ -280,6 +274,46 @@ def test_what_cannot_be_read_is_said(written: Path, tmp_path: Path) -> None:
         pass
     with pytest.raises(InputError, match="not results"):
         read_mesh(tmp_path / "other.h5")
+
+
+def test_a_file_of_a_newer_schema_is_refused_by_every_reader(written: Path) -> None:
+    with h5py.File(written, "a") as file:
+        file["ringdic"].attrs["schema"] = SCHEMA + 1
+    sentence = rf"results\.h5: results of schema {SCHEMA + 1}, written by a newer ringdic.* Install the newer ringdic"
+    for read in (
+        read_results, read_summary, read_mesh, lambda path: read_positions(path, 0),
+        lambda path: read_field(path, "lambda1", 0),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=sentence):
+            read(written)
+
+
+def test_a_file_that_was_not_written_to_its_end_is_refused(tmp_path: Path) -> None:
+    path, whole = tmp_path / "results.h5", a_result()
+    with ResultsWriter(path, select_steps(whole, [0]), whole.steps):
+        pass  # a run that died
+    with pytest.raises(InputError, match=r"results\.h5: the results were not written to their end"):
+        read_summary(path)
+
+
+def test_what_a_reader_does_not_know_is_ignored(written: Path) -> None:
+    with h5py.File(written, "a") as file:
+        own, group = file["ringdic"], file["VTKHDF"]
+        for place in (file, own, own["matches"], own["matches/0"], own["cameras"], own["cameras/201"], group):
+            place.attrs["of_a_later_version"] = "anything"
+            place.create_group("of_a_later_version")["values"] = np.zeros(3)
+        for place in ("PointData", "CellData"):
+            group[place]["of_a_later_version"] = np.zeros(5)
+    result, found = a_result(), read_results(written)
+    np.testing.assert_array_equal(found.vertices, result.vertices)
+    np.testing.assert_array_equal(found.matches[0].px, result.matches[0].px)
+    assert len(found.matches) == 1
+    assert [camera.id for camera in found.cameras] == ["201", "202"]
+    assert read_summary(written)["cameras"] == ["201", "202"]
+    values, location = read_field(written, "lambda2", 2)
+    assert (values.shape, location) == ((50,), "face")
+    np.testing.assert_array_equal(read_positions(written, 1), result.vertices[1])
+    assert len(read_mesh(written).faces) == 50
 
 
 def test_results_that_do_not_fit_together_cannot_be_built() -> None:

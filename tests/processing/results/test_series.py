@@ -1,4 +1,4 @@
-"""Steps taken out of results and put together again, and values laid aside."""
+"""Steps taken out of results and put together again, and the cache of values on disk."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from ringdic.pairs.reconstruction import PairShape, PairStep
 from ringdic.pairs.surfaces import reconstruct_pair
-from ringdic.results.results import WHERE_KNOWN, Matches, Results
-from ringdic.results.series import InMemory, StepCache, join_steps, select_steps
+from ringdic.results.fields import OPTIONAL_ARRAYS
+from ringdic.results.results import Matches, Results
+from ringdic.results.series import InMemorySeries, StepCache, join_steps, select_steps
 from ringdic.results.uncertainty import StepUncertainty, add_uncertainty
 
 F, N = 4, 6
@@ -25,7 +26,7 @@ def some_results() -> Results:
     matches = Matches(("1",), rng.uniform(size=(N, 2)), rng.uniform(size=(F, 1, N, 2)), rng.uniform(size=(F, N)),
                       rng.uniform(size=(F, 1, N, 2)), np.zeros((F, N), np.int8), np.arange(N))  # fmt: skip
     ends = {"point": (N,), "vector": (N, 3), "face": (len(faces), 2)}
-    known = {name: rng.uniform(size=(F, *ends[kind])) for name, kind in WHERE_KNOWN.items() if name != "chi2"}
+    known = {name: rng.uniform(size=(F, *ends[kind])) for name, kind in OPTIONAL_ARRAYS.items() if name != "chi2"}
     return Results(
         rig="strip", steps=tuple("abcd"), cameras=(), pairs=(), vertices_ref=reference, vertices=vertices, faces=faces,
         pair=np.zeros(len(faces), np.int64), vertex_pair=np.zeros(N, np.int64), correlation=rng.uniform(size=(F, N)),
@@ -36,7 +37,7 @@ def some_results() -> Results:
 
 def same(first: Results, second: Results) -> None:
     assert first.steps == second.steps
-    for name in ("vertices", "correlation", "sigma_xyz", "status", *WHERE_KNOWN):
+    for name in ("vertices", "correlation", "sigma_xyz", "status", *OPTIONAL_ARRAYS):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
     for name in ("xy", "px", "c_ls", "sigma", "status", "vertex"):
         np.testing.assert_array_equal(getattr(first.matches[0], name), getattr(second.matches[0], name), err_msg=name)
@@ -44,19 +45,19 @@ def same(first: Results, second: Results) -> None:
 
 def test_a_part_of_the_steps_keeps_everything_that_belongs_to_them() -> None:
     whole = some_results()
-    kept = select_steps(whole, [0, 2])
-    assert kept.steps == ("a", "c")
+    part = select_steps(whole, [0, 2])
+    assert part.steps == ("a", "c")
     for name in ("vertices", "correlation", "sigma_xyz", "status", "sigma_displacement", "sigma_lambda"):
-        np.testing.assert_array_equal(getattr(kept, name), getattr(whole, name)[[0, 2]])
-    np.testing.assert_array_equal(kept.matches[0].px, whole.matches[0].px[[0, 2]])
-    assert kept.chi2 is None
+        np.testing.assert_array_equal(getattr(part, name), getattr(whole, name)[[0, 2]])
+    np.testing.assert_array_equal(part.matches[0].px, whole.matches[0].px[[0, 2]])
+    assert part.chi2 is None
     with pytest.raises(ValueError, match="step 0"):
         select_steps(whole, [1, 2])
 
 
 def test_the_steps_of_results_one_by_one_are_the_results() -> None:
     whole = some_results()
-    series = InMemory(whole)
+    series = InMemorySeries(whole)
     same(join_steps([series.at(k) for k in range(F)]), whole)
     same(select_steps(join_steps([series.at(0), series.at(3)]), [0, 1]), select_steps(whole, [0, 3]))
     assert series.without_matches().at(1).matches == ()
@@ -65,18 +66,18 @@ def test_the_steps_of_results_one_by_one_are_the_results() -> None:
 def test_what_is_known_of_the_uncertainty_is_left_as_it_is() -> None:
     whole = some_results()
     same(add_uncertainty(whole, None), whole)
-    stated = StepUncertainty(InMemory(whole).reference, None, InMemory(whole).noise)
-    same(stated.of(InMemory(whole).at(2), 2), select_steps(whole, [0, 2]))
+    uncertainty = StepUncertainty(InMemorySeries(whole).reference, None, InMemorySeries(whole).noise)
+    same(uncertainty.complete(InMemorySeries(whole).at(2), 2), select_steps(whole, [0, 2]))
 
 
-def test_values_laid_aside_come_back_whichever_thread_asks(tmp_path: Path) -> None:
-    shelf, back = StepCache(tmp_path / "new"), {}
+def test_cached_values_come_back_whichever_thread_asks(tmp_path: Path) -> None:
+    cache, back = StepCache(tmp_path / "new"), {}
 
     def use(key: int) -> None:
         for step in range(20):
-            shelf.put((key, step), np.full(5000, 100 * key + step))
+            cache.put((key, step), np.full(5000, 100 * key + step))
         for step in reversed(range(20)):
-            back[key, step] = shelf.get((key, step))
+            back[key, step] = cache.get((key, step))
 
     threads = [Thread(target=use, args=(key,)) for key in range(4)]
     for thread in threads:
@@ -86,7 +87,7 @@ def test_values_laid_aside_come_back_whichever_thread_asks(tmp_path: Path) -> No
     for (key, step), values in back.items():
         np.testing.assert_array_equal(values, np.full(5000, 100 * key + step))
     with pytest.raises(KeyError):
-        shelf.get("nothing")
+        cache.get("nothing")
 
 
 @dataclass(frozen=True)

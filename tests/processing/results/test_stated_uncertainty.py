@@ -266,7 +266,7 @@ def pixels(runs: list[Run]) -> list[np.ndarray]:
 
 @pytest.mark.parametrize(("step", "previous"), [(1, False), (2, False), (2, True)])
 def test_displacements_of_a_pair_spread_as_stated(runs, pixels, figures, step: int, previous: bool) -> None:
-    values = taken(runs, pixels, lambda run: run.pair.vertices[step] - run.pair.before(step, previous))
+    values = taken(runs, pixels, lambda run: run.pair.vertices[step] - run.pair.reference_positions(step, previous))
     sigma = taken(runs, pixels, lambda run: run.pair.fields(step, previous=previous).point["sigma_displacement"])
     judge(f"pair, displacement {step - 1 if previous else 0} → {step}", spread(values, sigma), figures)
 

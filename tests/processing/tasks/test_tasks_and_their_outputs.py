@@ -16,8 +16,8 @@ from ringdic.tasks import (
     Arrays,
     LocalExecutor,
     Memory,
-    Ran,
     Task,
+    TaskReport,
     digest,
     file_digest,
     kernels_side_by_side,
@@ -61,10 +61,10 @@ def chain(folder: Path, length: int = 4) -> list[Task]:
 def run(tasks: list[Task], workers: int = 2) -> list[tuple[str, bool]]:
     told: list[tuple[str, bool]] = []
 
-    def tell(task: Task, ran: Ran, count: int, total: int) -> None:
+    def tell(task: Task, report: TaskReport, count: int, total: int) -> None:
         assert (count, total) == (len(told) + 1, len(tasks))
         assert threading.current_thread() is threading.main_thread()
-        told.append((task.name, ran.made))
+        told.append((task.name, report.computed))
 
     LocalExecutor(workers).run(tasks, tell)
     return told
@@ -124,9 +124,9 @@ def test_a_bad_image_ends_the_run_and_leaves_what_was_made(tmp_path: Path) -> No
 def test_a_task_travels(tmp_path: Path) -> None:
     task = chain(tmp_path, 1)[0]
     travelled = pickle.loads(pickle.dumps(task))
-    assert travelled.run().made
+    assert travelled.run().computed
     assert task.done
-    assert travelled.run() == Ran(made=False)
+    assert travelled.run() == TaskReport(computed=False)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,12 @@ from ringdic.calibration.parameters import PER_CAMERA, Parameters
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.geometry.weighted_triangulation import triangulate_weighted
 from ringdic.strain.deformation import deformation
-from ringdic.uncertainty.calibration import CameraCovariance, shares, sigma_of, stretch_sigma_by_cameras
+from ringdic.uncertainty.calibration import (
+    CameraCovariance,
+    position_sensitivity,
+    sensitivity_sigma,
+    stretch_sigma_by_cameras,
+)
 from ringdic.uncertainty.position import position_gain
 
 STEPS = np.array([1.0, 1.0, 0.5, 1.0, 1.0, 1e-3, 1e-2, 1e-4, 1e-4, 1e-2, 1e-4, 1e-4, 1e-4, 0.05, 0.05, 0.05])
@@ -44,13 +49,13 @@ def test_points_scatter_as_cameras_of_that_covariance_place_them() -> None:
     places = np.array(
         [triangulate_weighted(moved(cameras, root @ rng.normal(size=48)), px, sigma).xyz for _ in range(trials)]
     )
-    share = shares(cameras, xyz, position_gain(cameras, xyz, sigma), CameraCovariance(IDS, root @ root.T))
+    share = position_sensitivity(cameras, xyz, position_gain(cameras, xyz, sigma), CameraCovariance(IDS, root @ root.T))
     for n in range(2):
         stated = share[n] @ share[n].T
         size = np.sqrt(np.outer(*[np.diag(stated)] * 2))
         # Variances of 1500 trials are known to 3.7 %.
         np.testing.assert_allclose(np.cov(places[:, n].T) / size, stated / size, atol=0.15)
-        np.testing.assert_allclose(sigma_of(share[n]), np.sqrt(np.diag(stated)), rtol=1e-5)
+        np.testing.assert_allclose(sensitivity_sigma(share[n]), np.sqrt(np.diag(stated)), rtol=1e-5)
 
 
 @pytest.mark.parametrize("followed", [False, True])
@@ -74,11 +79,11 @@ def test_motions_and_stretches_scatter_as_cameras_of_that_covariance_measure_the
         found = deformation(at_first, now, faces)
         stretches.append([found.lambda1[0], found.lambda2[0]])
     known = CameraCovariance(IDS, root @ root.T)
-    share = shares(cameras, before, position_gain(cameras, before, sigma[0]), known)
+    share = position_sensitivity(cameras, before, position_gain(cameras, before, sigma[0]), known)
     gain = position_gain(cameras, after, sigma[1])
-    then = shares(cameras, after, gain, known, (before, share) if followed else None)
+    then = position_sensitivity(cameras, after, gain, known, (before, share) if followed else None)
     # Deviations of 600 trials are known to 2.9 %.
-    np.testing.assert_allclose(np.std(moves, axis=0), sigma_of(then - share), rtol=0.15)
+    np.testing.assert_allclose(np.std(moves, axis=0), sensitivity_sigma(then - share), rtol=0.15)
     stated = stretch_sigma_by_cameras(deformation(before, after, faces), before, faces, share, then)
     np.testing.assert_allclose(np.std(stretches, axis=0), stated[0], rtol=0.15)
 
@@ -89,12 +94,12 @@ def test_cameras_in_another_order_and_points_without_views() -> None:
     gain = position_gain(cameras, xyz, np.full((3, 2, 2), 0.01))
     covariance = np.diag(np.tile(STEPS**2, 3) * np.repeat([1.0, 4.0, 9.0], 16))
     turned = np.diag(np.tile(STEPS**2, 3) * np.repeat([9.0, 4.0, 1.0], 16))
-    found = sigma_of(shares(cameras, xyz, gain, CameraCovariance(IDS, covariance)))
-    again = sigma_of(shares(cameras, xyz, gain, CameraCovariance(IDS[::-1], turned)))
+    found = sensitivity_sigma(position_sensitivity(cameras, xyz, gain, CameraCovariance(IDS, covariance)))
+    again = sensitivity_sigma(position_sensitivity(cameras, xyz, gain, CameraCovariance(IDS[::-1], turned)))
     np.testing.assert_allclose(found, again, rtol=1e-4)
     assert np.isnan(found[1]).all()
     two = CameraCovariance(IDS[:2], covariance[:32, :32])
     with pytest.raises(ValueError, match="camera c"):
-        shares(cameras, xyz, gain, two)
+        position_sensitivity(cameras, xyz, gain, two)
     with pytest.raises(ValueError, match="sixteen parameters a camera"):
         CameraCovariance(IDS, covariance[:32, :32])

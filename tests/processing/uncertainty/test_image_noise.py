@@ -64,13 +64,13 @@ def test_the_texture_of_a_wave_is_that_of_its_formula() -> None:
     # Over 37 px the squares of the waves are not quite averaged: sin(37 a)/(37 a) and the like.
     np.testing.assert_allclose(found.contrast[:2], np.sqrt((30.0**2 + 20.0**2) / 2), rtol=0.05)
     np.testing.assert_allclose(found.slopes[:2, [0, 2]], [[(30 * a) ** 2 / 2, (20 * b) ** 2 / 2]] * 2, rtol=0.1)
-    np.testing.assert_allclose(found.spread(0.0)[:2], [[2 / (30 * a) ** 2, 2 / (20 * b) ** 2]] * 2, rtol=0.1)
+    np.testing.assert_allclose(found.inverse_diagonal(0.0)[:2], [[2 / (30 * a) ** 2, 2 / (20 * b) ** 2]] * 2, rtol=0.1)
     # Mean of (A cos² + B cos²)² by that of A cos² + B cos² squared, with ⟨cos⁴⟩ = 3/8.
     A, B = (30 * a) ** 2, (20 * b) ** 2
     expected = (3 / 8 * (A**2 + B**2) + A * B / 2) / (A / 2 + B / 2) ** 2
-    np.testing.assert_allclose(found.peaked[:2], expected, rtol=0.1)
+    np.testing.assert_allclose(found.peakedness[:2], expected, rtol=0.1)
     assert np.isnan(found.contrast[2:]).all()
-    assert np.isnan(found.spread(0.0)[2:]).all()
+    assert np.isnan(found.inverse_diagonal(0.0)[2:]).all()
     np.testing.assert_array_equal(found.slopes[0], found.slopes[1])  # the nearest place of the map
 
 
@@ -80,14 +80,14 @@ def test_the_slopes_of_the_noise_are_taken_off() -> None:
     at = np.array([[150.0, 150.0]])
     noisy = texture_map(image + np.random.default_rng(0).normal(0.0, 3.0, image.shape), radius=130).at(at)
     clean = texture_map(image, radius=130).at(at)
-    np.testing.assert_allclose(noisy.clean(9.0), clean.clean(0.0), rtol=0.03)  # 53,000 pixels
-    assert (noisy.clean(0.0) > 1.5 * clean.clean(0.0)).all()
+    np.testing.assert_allclose(noisy.clean_slopes(9.0), clean.clean_slopes(0.0), rtol=0.03)  # 53,000 pixels
+    assert (noisy.clean_slopes(0.0) > 1.5 * clean.clean_slopes(0.0)).all()
 
 
 def test_a_pattern_of_one_direction_does_not_tell_where_it_is() -> None:
     _, x = np.mgrid[:100, :100].astype(float)
     found = texture_map(100.0 + 30.0 * np.sin(x), radius=10).at(np.array([[50.0, 50.0]]))
-    assert np.isnan(found.spread(0.0)).all()
+    assert np.isnan(found.inverse_diagonal(0.0)).all()
 
 
 def test_textures_of_different_lengths_are_refused() -> None:

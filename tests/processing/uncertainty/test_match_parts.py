@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from ringdic.correlation import CorrelationSettings, correlate_points, prepare_current, prepare_reference
-from ringdic.uncertainty.matches import MatchParts, match_parts
+from ringdic.uncertainty.matches import MatchUncertainty, match_uncertainty
 from ringdic.uncertainty.texture import Texture, texture_map
 
 SIZE = 170
@@ -35,7 +35,7 @@ def test_over_repeated_noise_matches_scatter_as_their_two_parts_say(squeeze: flo
         pair = prepare_reference(a, settings=settings), prepare_current(b, settings=settings)
         found = correlate_points(*pair, XY, settings, start=start, threads=1)
         textures = texture_map(a, 20).at(XY), texture_map(b, 20).at(XY + found.uv)
-        parts = match_parts(found.sigma, found.c_ls, textures, (noise[0] ** 2, noise[1] ** 2), found.gradient)
+        parts = match_uncertainty(found.sigma, found.c_ls, textures, (noise[0] ** 2, noise[1] ** 2), found.gradient)
         G = np.eye(2) + found.gradient
         uv.append(found.uv)
         stated.append(np.einsum("nij,nj->ni", G**2, parts.reference**2) + parts.current**2)
@@ -51,7 +51,7 @@ def test_what_the_noise_does_not_explain_is_systematic_and_what_it_does_is_not()
     texture = Texture(np.full(3, 40.0), np.tile([1e14, 0.0, 1e14], (3, 1)), np.full(3, 5.0))
     visible = (4.0 + 0.85 * 4.0) / 40.0**2
     c_ls, sigma = visible * np.array([1.0, 0.5, 3.0]), np.full((3, 2), 0.005)
-    parts = match_parts(sigma, c_ls, (texture, texture), (4.0, 4.0))
+    parts = match_uncertainty(sigma, c_ls, (texture, texture), (4.0, 4.0))
     np.testing.assert_allclose(parts.systematic[:2], 0.0, atol=1e-9)
     # Where all is noise its parts make up what was stated but for the share that the interpolation hides.
     np.testing.assert_allclose(parts.reference[0] ** 2 + 0.85 * parts.current[0] ** 2, sigma[0] ** 2, rtol=1e-9)
@@ -64,7 +64,7 @@ def test_what_the_noise_does_not_explain_is_systematic_and_what_it_does_is_not()
 
 def test_a_lost_match_has_no_parts() -> None:
     texture = Texture(np.full(1, 40.0), np.array([[100.0, 0.0, 100.0]]), np.ones(1))
-    parts = match_parts(np.full((1, 2), np.nan), np.full(1, np.nan), (texture, texture), (4.0, 4.0))
+    parts = match_uncertainty(np.full((1, 2), np.nan), np.full(1, np.nan), (texture, texture), (4.0, 4.0))
     assert np.isnan(parts.reference).all()
     assert np.isnan(parts.current).all()
     assert np.isnan(parts.systematic).all()
@@ -72,4 +72,4 @@ def test_a_lost_match_has_no_parts() -> None:
 
 def test_parts_of_different_shapes_are_refused() -> None:
     with pytest.raises(ValueError, match="one shape"):
-        MatchParts(np.zeros((3, 2)), np.zeros((3, 2)), np.zeros((3, 2)), np.zeros((2, 2)))
+        MatchUncertainty(np.zeros((3, 2)), np.zeros((3, 2)), np.zeros((3, 2)), np.zeros((2, 2)))

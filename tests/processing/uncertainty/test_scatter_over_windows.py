@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from ringdic.mesh.mesh import Mesh
 from ringdic.strain.window import strain_window
-from ringdic.uncertainty.strain import overlap
+from ringdic.uncertainty.strain import subset_correlation
 from ringdic.uncertainty.window import window_scatter
 
 RADIUS_PX, PX_A_MM = 20, 10.0
@@ -25,7 +25,7 @@ def tube(around: int = 60, along: int = 9) -> Mesh:
 
 
 def subsets(apart: np.ndarray) -> np.ndarray:
-    return overlap(apart * PX_A_MM, RADIUS_PX)
+    return subset_correlation(apart * PX_A_MM, RADIUS_PX)
 
 
 def strangers(apart: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from ringdic.strain.deformation import deformation
-from ringdic.uncertainty.strain import corners_alike, overlap, stretch_sigma
+from ringdic.uncertainty.strain import corner_correlations, stretch_sigma, subset_correlation
 
 
 def disc(radius: int) -> tuple[np.ndarray, np.ndarray]:
@@ -29,15 +29,15 @@ def test_neighbours_are_as_alike_as_least_squares_over_their_pixels_makes_them(o
         shifted = np.zeros_like(image)
         shifted[:, d:] = image[:, : image.shape[1] - d]
         exact = float(np.sum(image * shifted) / np.sum(image**2))
-        stated = float(overlap(np.array(d), 20.0, order))
+        stated = float(subset_correlation(np.array(d), 20.0, order))
         if order == 1:
             stated **= 1 / 1.15  # without what uneven slopes add
         assert stated == pytest.approx(exact, abs=0.03)
 
 
 def test_far_points_have_nothing_in_common() -> None:
-    np.testing.assert_allclose(overlap(np.array([41.0, 100.0, 1e6]), 20.0), 0.0, atol=1e-12)
-    assert overlap(np.array(0.0), 20.0) == 1.0
+    np.testing.assert_allclose(subset_correlation(np.array([41.0, 100.0, 1e6]), 20.0), 0.0, atol=1e-12)
+    assert subset_correlation(np.array(0.0), 20.0) == 1.0
 
 
 def surface() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -62,7 +62,7 @@ def test_the_variance_is_that_of_the_stretches_own_derivatives(alike: bool) -> N
     sigma[2, 1] = np.nan
     # All at one place: errors of a camera are the same everywhere. Far apart: independent.
     px = np.zeros((3, 4, 2)) if alike else 1e6 * rng.normal(size=(3, 4, 2))
-    shared = corners_alike(px, faces, 20.0)
+    shared = corner_correlations(px, faces, 20.0)
     found = stretch_sigma(deformation(reference, current, faces), reference, faces, gain, shared, sigma)
     variance = np.zeros((2, 2))
     for c in range(3):
@@ -81,6 +81,6 @@ def test_the_variance_is_that_of_the_stretches_own_derivatives(alike: bool) -> N
 def test_a_common_error_of_all_points_is_no_strain() -> None:
     reference, current, faces = surface()
     gain = np.broadcast_to(np.eye(3)[:, :2], (1, 4, 3, 2)).copy()
-    alike = corners_alike(np.zeros((1, 4, 2)), faces, 20.0)
+    alike = corner_correlations(np.zeros((1, 4, 2)), faces, 20.0)
     found = stretch_sigma(deformation(reference, current, faces), reference, faces, gain, alike, np.ones((1, 4, 2)))
     np.testing.assert_allclose(found, 0.0, atol=1e-6)

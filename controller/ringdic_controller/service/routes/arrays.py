@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 from fastapi import APIRouter, Depends, Query, Request, Response
 from numpy.typing import NDArray
-from ringdic.results.results import read_field, read_mesh, read_positions
+from ringdic.results.reader import read_field, read_mesh, read_positions
 
 from ringdic_controller.service.routes.etag import forever, unchanged
 

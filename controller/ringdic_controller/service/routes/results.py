@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Response
 from fastapi.responses import FileResponse, HTMLResponse
-from ringdic.results.results import read_summary
+from ringdic.results.reader import read_summary
 
 from ringdic_controller.service.desk import NotFoundError
 from ringdic_controller.service.routes.arrays import add_arrays, version_of

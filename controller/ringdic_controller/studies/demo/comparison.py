@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from ringdic.arrays import Floats
-from ringdic.results.results import read_results
+from ringdic.results.reader import read_results
 from ringdic_node.virtual_rig.scenes import Limb
 
 from ringdic_controller.studies.truth import errors, face_middles

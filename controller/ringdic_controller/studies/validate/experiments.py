@@ -11,7 +11,8 @@ from ringdic.calibration.calibrated_rig import CalibratedRig, calibrate_rig
 from ringdic.geometry.camera import Camera
 from ringdic.jobs.pipeline import process_session
 from ringdic.progress import Progress, Report, silent
-from ringdic.results.results import Results, read_results
+from ringdic.results.reader import read_results
+from ringdic.results.results import Results
 from ringdic.session.folder import open_session
 from ringdic.session.rig import Rig, parse_rig
 from ringdic.settings import CalibrationGroup, Settings

@@ -1,13 +1,13 @@
-"""The tasks of a job on a cluster of machines, by dask.distributed: the very tasks that the local executor runs.
+"""Runs the tasks of a job on a cluster of machines, with dask.distributed; they are those of the local executor.
 
-Every machine sees the session's folder under the same path: a task reads and writes files there, and only its
-description and how it ended go over the network. So a worker that dies costs the tasks it was at, which run elsewhere,
-and a job that dies costs no more: started again, it makes what is missing.
+Every machine sees the session's folder under the same path. Tasks read and write files there; only their descriptions
+and outcomes go over the network. The tasks of a worker that dies run on another worker, and a job that dies computes
+only the missing outputs when it is started again.
 
-``executor``  the driver's side: gives tasks to the scheduler and takes how they ended
-``worker``    what runs on a worker
+``executor``  the driver's side: submits tasks to the scheduler and takes their outcomes
+``worker``    the worker's side: checks the worker and runs a task
 
-dask is imported when a cluster is asked for, and not before.
+dask is imported only when a cluster is used.
 """
 
 from ringdic.jobs.cluster.executor import ClusterExecutor

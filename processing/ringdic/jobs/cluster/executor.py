@@ -1,4 +1,4 @@
-"""The driver's side of a cluster: gives tasks to the scheduler as they may start, takes how they ended."""
+"""The driver's side of a cluster: submits tasks to the scheduler as they may start, and takes their outcomes."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from pathlib import Path
 from typing import Any
 
 from ringdic.errors import ComputationError, InputError
-from ringdic.jobs.cluster.worker import VISIBLE_S, Sign, TaskOutcome, inspect, run_task, visible
-from ringdic.tasks import Agenda, Task, Told, code_stamp
+from ringdic.jobs.cluster.worker import VISIBLE_S, Handshake, TaskOutcome, inspect, run_task, visible
+from ringdic.tasks import Agenda, OnTaskEnd, Task, code_stamp
 
 log = logging.getLogger(__name__)
 
-_RETRIES = 2  # of a task that failed for a reason of the machine, such as a shared folder that did not answer
-_LOOK_S = 2.0  # between two looks at the cluster while no task ends
+_RETRIES = 2  # of a task that failed because of the machine, for instance of a shared folder that did not answer
+_LOOK_S = 2.0  # time between two checks of the workers while no task ends
 _INSPECTION_S = 600.0  # a worker may have to compile the kernels first
 
 
 class ClusterExecutor:
-    """Runs tasks on the workers of a dask scheduler. A worker runs as many at a time as it has threads.
+    """Runs tasks on the workers of a dask scheduler. A worker runs as many tasks at a time as it has threads.
 
-    address : of the scheduler, like ``tcp://192.168.1.10:8786``. answer_s : within which the scheduler must answer.
-    idle_s : that a job waits without any worker. Raises InputError if dask is not installed.
+    address : of the scheduler, such as ``tcp://192.168.1.10:8786``. answer_s : time in which the scheduler must answer.
+    idle_s : time that a job waits while there is no worker. Raises InputError where dask is not installed.
     """
 
     def __init__(self, address: str, *, answer_s: float = 10.0, idle_s: float = 60.0) -> None:
@@ -35,12 +35,12 @@ class ClusterExecutor:
         self._idle_s = idle_s
 
     def check(self, folder: Path) -> None:
-        """Ask every worker whether it is fit to work in this folder, which exists, and have it load its kernels.
+        """Check that every worker can run tasks in this folder, which exists, and have it load its kernels.
 
         Raises InputError where the scheduler does not answer, there is no worker, or one does not see the folder or
         runs another version of this program.
         """
-        with self._connected() as client, _sign(folder) as sign:
+        with self._connected() as client, _handshake(folder) as handshake:
             workers = list(client.nthreads())
             if not workers:
                 raise InputError(
@@ -48,30 +48,32 @@ class ClusterExecutor:
                     f"start one on each machine with 'dask worker {self.address}'"
                 )
             asked = {
-                worker: client.submit(inspect, sign, workers=[worker], allow_other_workers=False, pure=False)
+                worker: client.submit(inspect, handshake, workers=[worker], allow_other_workers=False, pure=False)
                 for worker in workers
             }
             _wait(list(asked.values()), _INSPECTION_S, "ALL_COMPLETED")
             for worker, future in asked.items():
                 if future.status == "error":
                     raise InputError(f"worker {worker} does not run ringdic ({future.exception()}); install it there")
-                reason = future.result() if future.status == "finished" else None  # one busy with other jobs is let be
+                # A worker that is busy with other jobs has not finished and is not refused.
+                reason = future.result() if future.status == "finished" else None
                 if reason is not None:
                     raise InputError(f"worker {worker} cannot be used: {reason}")
 
-    def run(self, tasks: Sequence[Task], told: Told) -> None:
-        """See ``Executor.run``. A worker that is not fit is left out.
+    def run(self, tasks: Sequence[Task], on_end: OnTaskEnd) -> None:
+        """Run every task that is not done on the workers; a worker that fails the check gets no tasks.
 
-        Raises InputError where the scheduler does not answer or no worker is fit, ComputationError if the cluster is
-        lost meanwhile.
+        tasks : each after the tasks that it needs. on_end : called in the calling thread, once for each task.
+        Raises InputError where the scheduler does not answer or no worker passes the check, ComputationError where the
+        cluster is lost meanwhile.
         """
-        agenda = Agenda(tasks, told)
+        agenda = Agenda(tasks, on_end)
         if not agenda:
             return
         tasks[0].folder.mkdir(exist_ok=True)
-        with self._connected() as client, _sign(tasks[0].folder) as sign:
+        with self._connected() as client, _handshake(tasks[0].folder) as handshake:
             try:
-                _Job(client, sign, agenda, self._idle_s).run()
+                _Job(client, handshake, agenda, self._idle_s).run()
             except (OSError, _distributed().CancelledError) as error:
                 raise ComputationError(
                     f"the scheduler {self.address} was lost; start it again and process again: what is done is kept"
@@ -100,20 +102,20 @@ class ClusterExecutor:
 
 
 class _Job:
-    """The tasks of one run on their way through the cluster."""
+    """The tasks of one run on a cluster: which are running, and on which workers."""
 
-    def __init__(self, client: Any, sign: Sign, agenda: Agenda, idle_s: float) -> None:
+    def __init__(self, client: Any, handshake: Handshake, agenda: Agenda, idle_s: float) -> None:
         self._client = client
-        self._sign = sign
+        self._handshake = handshake
         self._agenda = agenda
         self._idle_s = idle_s
         self._running: dict[Any, Task] = {}
-        self._unfit: set[str] = set()
+        self._refused: set[str] = set()
         self._submitted = 0
-        self._seen_at = time.monotonic()  # when there was a worker
+        self._worker_at = time.monotonic()  # last time that there was a worker
 
     def run(self) -> None:
-        """Submit what may start, take what has ended, until nothing is left."""
+        """Submit the tasks that may start and take the outcomes of those that have ended, until none is left."""
         try:
             while self._agenda:
                 threads = self._workers()
@@ -126,14 +128,14 @@ class _Job:
             self._client.cancel(list(self._running))
 
     def _workers(self) -> dict[str, int]:
-        """The threads of every worker that may be of use."""
+        """Number of threads of each worker that has not been refused, by its address."""
         threads = {
-            worker: count for worker, count in self._client.nthreads().items() if worker not in self._unfit
+            worker: count for worker, count in self._client.nthreads().items() if worker not in self._refused
         }  # fmt: skip
         now = time.monotonic()
         if threads:
-            self._seen_at = now
-        elif now - self._seen_at > self._idle_s:
+            self._worker_at = now
+        elif now - self._worker_at > self._idle_s:
             raise ComputationError(
                 f"the cluster has had no worker for {self._idle_s:.0f} s; start one and process again: "
                 "what is done is kept"
@@ -144,12 +146,13 @@ class _Job:
         future = self._client.submit(
             run_task,
             task,
-            self._sign,
+            self._handshake,
             share,
-            key=f"{task.function.__name__}-{uuid.uuid4().hex}",  # of this run: another's may be cancelled with it
+            # Unique to this run, since cancelling a key cancels it for every client.
+            key=f"{task.function.__name__}-{uuid.uuid4().hex}",
             retries=_RETRIES,
-            workers=list(threads) if self._unfit else None,
-            priority=-self._submitted,  # in order: neighbours read the same images
+            workers=list(threads) if self._refused else None,
+            priority=-self._submitted,  # in order, since neighbours read the same images
         )
         self._submitted += 1
         self._running[future] = task
@@ -161,31 +164,31 @@ class _Job:
             raise ComputationError(
                 f"{task.name}: one worker after the other died at it; their logs tell why (out of memory?)"
             ) from error
-        if outcome.wrong is not None:
-            raise InputError(outcome.wrong)
-        if outcome.ran is None:
-            self._shun(outcome, threads)
+        if outcome.input_error is not None:
+            raise InputError(outcome.input_error)
+        if outcome.report is None:
+            self._refuse(outcome, threads)
             self._submit(task, threads)
         elif visible(lambda: task.done, task.folder):
-            self._agenda.ended(task, outcome.ran)
+            self._agenda.ended(task, outcome.report)
         else:
             raise InputError(
                 f"{task.output}: written by worker {outcome.worker} and not seen here after {VISIBLE_S:.0f} s; "
                 "every machine must see the session's folder under the same path"
             )
 
-    def _shun(self, outcome: TaskOutcome, threads: dict[str, int]) -> None:
-        """Give a worker of no use nothing more to do."""
+    def _refuse(self, outcome: TaskOutcome, threads: dict[str, int]) -> None:
+        """Submit no more tasks to a worker that refused one; raises InputError where no other is left."""
         threads.pop(outcome.worker, None)
         if not threads:
-            raise InputError(f"worker {outcome.worker} cannot be used, and there is no other: {outcome.unfit}")
-        if outcome.worker not in self._unfit:
-            log.warning("worker %s is left out: %s", outcome.worker, outcome.unfit)
-            self._unfit.add(outcome.worker)
+            raise InputError(f"worker {outcome.worker} cannot be used, and there is no other: {outcome.refusal}")
+        if outcome.worker not in self._refused:
+            log.warning("worker %s is left out: %s", outcome.worker, outcome.refusal)
+            self._refused.add(outcome.worker)
 
 
 def _distributed() -> Any:
-    """The library, or a sentence about how to get it."""
+    """The dask.distributed module; raises InputError with the way to install it where it is missing."""
     try:
         import distributed
     except ImportError as error:
@@ -193,13 +196,13 @@ def _distributed() -> Any:
             f"a cluster needs a library that is not installed ({error}); "
             "install the extra: pip install 'ringdic[cluster]'"
         ) from error
-    for name in ("distributed", "distributed.client"):  # a lost scheduler is told in a sentence, not in tracebacks
+    for name in ("distributed", "distributed.client"):  # their tracebacks; a lost scheduler is reported in a sentence
         logging.getLogger(name).setLevel(logging.CRITICAL)
     return distributed
 
 
 def _wait(futures: list[Any], timeout: float, until: str) -> list[Any]:
-    """The futures that have ended; waits no longer than ``timeout`` seconds."""
+    """Wait no longer than ``timeout`` seconds; the futures that have ended."""
     try:
         return list(_distributed().wait(futures, timeout=timeout, return_when=until).done)
     except TimeoutError:
@@ -207,12 +210,12 @@ def _wait(futures: list[Any], timeout: float, until: str) -> list[Any]:
 
 
 @contextmanager
-def _sign(folder: Path) -> Iterator[Sign]:
-    """A file in the folder by which a worker knows that it sees the same one."""
+def _handshake(folder: Path) -> Iterator[Handshake]:
+    """A handshake with a file in this folder, which is removed after the context."""
     file = folder / f".cluster-{uuid.uuid4().hex}"
     text = uuid.uuid4().hex
     file.write_text(text, encoding="utf-8")
     try:
-        yield Sign(code_stamp(), file, text)
+        yield Handshake(code_stamp(), file, text)
     finally:
         file.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""What runs on a worker of a cluster: one task, with its share of the worker's threads, if the worker is fit for it."""
+"""Runs one task on a worker of a cluster, with its share of the worker's threads, after a check of the worker."""
 
 from __future__ import annotations
 
@@ -15,19 +15,22 @@ import numba
 
 from ringdic.correlation.correlate import load_kernels
 from ringdic.errors import InputError
-from ringdic.tasks import Ran, Task, code_stamp, kernels_side_by_side
+from ringdic.tasks import Task, TaskReport, code_stamp, kernels_side_by_side
 
-VISIBLE_S = 60.0  # a shared folder may show another machine's file so much later
+VISIBLE_S = 60.0  # a shared folder may show a file of another machine with this delay
 _LOOK_S = 0.2
 
-_alone = threading.Lock()  # of a task whose kernels use all threads of the worker
+_alone = threading.Lock()  # held by a task whose kernels use all threads of the worker
 _ready = threading.Lock()
-_seen: set[Sign] = set()  # found good by this process
+_accepted: set[Handshake] = set()  # checked by this process, without a refusal
 
 
 @dataclass(frozen=True)
-class Sign:
-    """By what a worker is known to be fit: this program's source, and a file that the driver has made."""
+class Handshake:
+    """What a worker is checked against: the driver's version, and a file with a random text in the session's folder.
+
+    stamp : digest of the driver's source. file, text : the file and its contents.
+    """
 
     stamp: str
     file: Path
@@ -36,75 +39,84 @@ class Sign:
 
 @dataclass(frozen=True)
 class TaskOutcome:
-    """What a worker tells of a task: how it ran, or why this worker runs none, or what is wrong with the input."""
+    """How a task ended on a worker: with a report, a refusal of this worker to run tasks, or an error of the input.
+
+    worker : its address. One of the others is not None; refusal and input_error are sentences.
+    """
 
     worker: str
-    ran: Ran | None = None
-    unfit: str | None = None
-    wrong: str | None = None
+    report: TaskReport | None = None
+    refusal: str | None = None
+    input_error: str | None = None
 
 
-def inspect(sign: Sign) -> str | None:
-    """Why this process cannot run the driver's tasks, None if it can; then its kernels are loaded, once."""
+def inspect(handshake: Handshake) -> str | None:
+    """Check this process and load its kernels, once. Why it cannot run the driver's tasks, None if it can."""
     with _ready:
-        if sign in _seen:
+        if handshake in _accepted:
             return None
-        if code_stamp() != sign.stamp:
+        if code_stamp() != handshake.stamp:
             return "it runs another version of ringdic; install the same one there"
-        if not visible(sign.file.is_file, sign.file.parent, limit=10 * _LOOK_S) or _text(sign.file) != sign.text:
+        if (
+            not visible(handshake.file.is_file, handshake.file.parent, limit=10 * _LOOK_S)
+            or _text(handshake.file) != handshake.text
+        ):
             return (
-                f"it does not see the folder {sign.file.parent}; "
+                f"it does not see the folder {handshake.file.parent}; "
                 "every machine must see the session's folder under the same path"
             )
-        if not os.access(sign.file.parent, os.W_OK):
-            return f"it may not write to {sign.file.parent}; give it the permission"
+        if not os.access(handshake.file.parent, os.W_OK):
+            return f"it may not write to {handshake.file.parent}; give it the permission"
         cv2.setNumThreads(1)
         load_kernels()
-        _seen.add(sign)
+        _accepted.add(handshake)
         return None
 
 
-def run_task(task: Task, sign: Sign, share: int) -> TaskOutcome:
-    """Run a task here.
+def run_task(task: Task, handshake: Handshake, share: int) -> TaskOutcome:
+    """Run a task in this process.
 
-    share : threads for its kernels, so that the tasks at a time do not take more than the worker's threads; where
-    kernels cannot run side by side, one task at a time takes all of them.
+    handshake : to check the worker against. share : threads for the task's kernels, so that the tasks running at a time
+    use no more than the worker's threads. Where kernels cannot run side by side, one task at a time uses all of them.
     """
     address, threads = _worker()
-    unfit = inspect(sign)
-    if unfit is not None:
-        return TaskOutcome(address, unfit=unfit)
+    refusal = inspect(handshake)
+    if refusal is not None:
+        return TaskOutcome(address, refusal=refusal)
     absent = [path for path in task.inputs if not visible(path.is_file, task.folder)]
     if absent:
-        return TaskOutcome(address, unfit=f"it does not see {absent[0]}, which another worker has written")
+        return TaskOutcome(address, refusal=f"it does not see {absent[0]}, which another worker has written")
     try:
         if kernels_side_by_side():
-            return TaskOutcome(address, ran=_run(task, min(share, threads)))
+            return TaskOutcome(address, report=_run(task, min(share, threads)))
         with _alone:
-            return TaskOutcome(address, ran=_run(task, threads))
+            return TaskOutcome(address, report=_run(task, threads))
     except InputError as error:
-        return TaskOutcome(address, wrong=str(error))
+        return TaskOutcome(address, input_error=str(error))
 
 
 def visible(there: Callable[[], bool], folder: Path, limit: float = VISIBLE_S) -> bool:
-    """Wait until a file that another machine has made in a folder is seen here; whether it was within the time (s)."""
+    """Wait until a file that another machine has written becomes visible here; whether it did within ``limit`` seconds.
+
+    there : whether the file is visible now. folder : of the file.
+    """
     deadline = time.monotonic() + limit
     while not there():
         if time.monotonic() > deadline:
             return False
         time.sleep(_LOOK_S)
         if folder.is_dir():
-            os.listdir(folder)  # makes a network file system ask its server anew
+            os.listdir(folder)  # has a network file system ask its server again
     return True
 
 
-def _run(task: Task, threads: int) -> Ran:
+def _run(task: Task, threads: int) -> TaskReport:
     numba.set_num_threads(max(1, min(threads, int(numba.config.NUMBA_NUM_THREADS))))  # type: ignore[attr-defined]
     return task.run()
 
 
 def _worker() -> tuple[str, int]:
-    """Address and threads of the worker that runs this."""
+    """Address and number of threads of the worker that runs this function."""
     from distributed import get_worker
 
     worker: Any = get_worker()

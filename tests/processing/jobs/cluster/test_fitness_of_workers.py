@@ -14,26 +14,26 @@ import numpy as np
 import pytest
 from ringdic.errors import InputError
 from ringdic.jobs.cluster import ClusterExecutor, worker
-from ringdic.jobs.cluster.worker import Sign, TaskOutcome, inspect, run_task, visible
+from ringdic.jobs.cluster.worker import Handshake, TaskOutcome, inspect, run_task, visible
 from ringdic.tasks import Task, code_stamp, read_output
 
 
 @pytest.fixture
-def sign(tmp_path: Path) -> Sign:
+def handshake(tmp_path: Path) -> Handshake:
     (tmp_path / "sign").write_text("here", encoding="utf-8")
-    return Sign(code_stamp(), tmp_path / "sign", "here")
+    return Handshake(code_stamp(), tmp_path / "sign", "here")
 
 
-def test_a_process_that_sees_the_folder_and_has_the_version_is_fit(sign: Sign):
-    assert inspect(sign) is None
+def test_a_process_that_sees_the_folder_and_has_the_version_is_fit(handshake: Handshake):
+    assert inspect(handshake) is None
 
 
-def test_what_makes_a_process_unfit_is_told(sign: Sign, tmp_path: Path):
-    assert "another version" in str(inspect(replace(sign, stamp="0" * 32)))
-    elsewhere = replace(sign, file=tmp_path / "not-mounted" / "sign")
+def test_what_makes_a_process_unfit_is_told(handshake: Handshake, tmp_path: Path):
+    assert "another version" in str(inspect(replace(handshake, stamp="0" * 32)))
+    elsewhere = replace(handshake, file=tmp_path / "not-mounted" / "sign")
     assert f"does not see the folder {tmp_path / 'not-mounted'}" in str(inspect(elsewhere))
     # A folder of the same path on the worker's own disk is not the driver's.
-    assert "does not see the folder" in str(inspect(replace(sign, text="there")))
+    assert "does not see the folder" in str(inspect(replace(handshake, text="there")))
 
 
 def test_a_file_that_another_machine_shows_late_is_waited_for(tmp_path: Path):
@@ -52,31 +52,31 @@ def threads_seen(*, inputs: tuple[Path, ...]) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize(("share", "threads"), [(8, 1), (1, 2)])
 def test_a_tasks_kernels_take_their_share_and_no_more_than_the_worker_has(
-    sign: Sign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: int, threads: int
+    handshake: Handshake, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: int, threads: int
 ):
     monkeypatch.setattr(worker, "_worker", lambda: ("tcp://here", threads))
     monkeypatch.setattr(worker, "kernels_side_by_side", lambda: True)
     task = Task("k", "a task", threads_seen, (), tmp_path)
     outcome: list[TaskOutcome] = []
     thread = threading.Thread(
-        target=lambda: outcome.append(run_task(task, sign, share))
+        target=lambda: outcome.append(run_task(task, handshake, share))
     )  # numba's number is a thread's
     thread.start()
     thread.join(60)
-    assert outcome[0].ran is not None
+    assert outcome[0].report is not None
     assert read_output(task.output)["threads"] == 1
 
 
 def test_an_input_that_cannot_be_used_is_no_fault_of_the_worker(
-    sign: Sign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    handshake: Handshake, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(worker, "_worker", lambda: ("tcp://here", 1))
 
     def refuse(*, inputs: tuple[Path, ...]) -> dict[str, np.ndarray]:
         raise InputError("board.png: cut off")
 
-    outcome = run_task(Task("k", "a task", refuse, (), tmp_path), sign, 1)
-    assert (outcome.wrong, outcome.unfit, outcome.ran) == ("board.png: cut off", None, None)
+    outcome = run_task(Task("k", "a task", refuse, (), tmp_path), handshake, 1)
+    assert (outcome.input_error, outcome.refusal, outcome.report) == ("board.png: cut off", None, None)
 
 
 def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch):
