@@ -158,65 +158,39 @@ def _row(results: Results, step: int, motion: RigidMotion, deformation: Deformat
 
 
 def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
-    """The rows that the terminal and the web page show of a summary, as text."""
-    control = figures["control_points"]
+    """The rows of a summary that the terminal and the web page show, as text."""
+    control, bundle = figures["control_points"], figures["calibration"]["bundle"]
+    agreement, strain = figures["agreement"], figures["strain"]
     rows = [
-        {
-            "figure": "camera pairs, points, triangles",
-            "value": f"{figures['pairs']}, {figures['points']:,}, {figures['faces']:,}",
-        },
-        {"figure": "measured area", "value": f"{figures['area_mm2'] / 100:,.1f} cm²"},
-        {
-            "figure": "control points: mean vector, RMS",
-            "value": f"{control['mean_mm']:.4f}, {control['rms_mm']:.4f} mm",
-        },
+        ("camera pairs, points, triangles", f"{figures['pairs']}, {figures['points']:,}, {figures['faces']:,}"),
+        ("measured area", f"{figures['area_mm2'] / 100:,.1f} cm²"),
+        ("control points: mean vector, RMS", f"{control['mean_mm']:.4f}, {control['rms_mm']:.4f} mm"),
     ]
-    bundle = figures["calibration"]["bundle"]
     if bundle is not None:
-        rows.append(
-            {
-                "figure": "bundle: centroids, print errors, radius",
-                "value": f"{bundle['centroid_sigma_px']:.4f} px, {bundle['print_errors_rms_mm']:.3f} mm, "
-                f"{bundle['radius_mm']:.3f} mm",
-            }
-        )
-    agreement = figures["agreement"]
+        value = f"{bundle['centroid_sigma_px']:.4f} px, {bundle['print_errors_rms_mm']:.3f} mm"
+        rows.append(("bundle: centroids, print errors, radius", f"{value}, {bundle['radius_mm']:.3f} mm"))
     if agreement.get("mismatch_mm") is not None:
-        rows.append(
-            {
-                "figure": "distance between the surfaces of neighbouring pairs",
-                "value": f"{agreement['mismatch_mm']:.4f} ± {agreement['mismatch_std_mm']:.4f} mm",
-            }
-        )
+        value = f"{agreement['mismatch_mm']:.4f} ± {agreement['mismatch_std_mm']:.4f} mm"
+        rows.append(("distance between the surfaces of neighbouring pairs", value))
     if agreement.get("residual_px") is not None:
-        rows.append(
-            {
-                "figure": "cameras a point, how far they miss it",
-                "value": f"{agreement['views']:.1f}, {agreement['residual_px']:.4f} px",
-            }
-        )
-    strain = figures["strain"]
+        value = f"{agreement['views']:.1f}, {agreement['residual_px']:.4f} px"
+        rows.append(("cameras a point, how far they miss it", value))
     if strain["gauge_mm"] is not None:
         value = f"{strain['gauge_mm']:.1f} mm"
         if strain["window_gauge_mm"] is not None:
             value += f", over the window of {strain['window_mm']:g} mm {strain['window_gauge_mm']:.1f} mm"
-        rows.append({"figure": "a strain averages over (virtual strain gauge)", "value": value})
-    for part, figures_of in (("noise", "image noise"), ("calibration", "calibration")):
+        rows.append(("a strain averages over (virtual strain gauge)", value))
+    for part, cause in (("noise", "image noise"), ("calibration", "calibration")):
         known = figures["uncertainty"][part]
         if None not in known.values():
             value = f"{known['position_mm']:.4f} mm, {known['displacement_mm']:.5f} mm, {known['stretch']:.1e}"
-            rows.append({"figure": f"standard deviations by the {figures_of}: place, displacement, λ2", "value": value})
+            rows.append((f"standard deviations by the {cause}: place, displacement, λ2", value))
     for step in figures["steps"][1:]:
         if step["measured"]:
-            rows.append(
-                {
-                    "figure": f"{step['step']}: displacement, λ1, λ2 (medians), lost",
-                    "value": f"{step['displacement_mm']:.3f} mm, {step['lambda1_median']:.4f}, "
-                    f"{step['lambda2_median']:.4f}, {step['lost']:,}",
-                }
-            )
-    rows += [{"figure": "warning", "value": sentence} for sentence in figures["warnings"]]
-    return rows
+            value = f"{step['displacement_mm']:.3f} mm, {step['lambda1_median']:.4f}, {step['lambda2_median']:.4f}"
+            rows.append((f"{step['step']}: displacement, λ1, λ2 (medians), lost", f"{value}, {step['lost']:,}"))
+    rows += [("warning", sentence) for sentence in figures["warnings"]]
+    return [{"figure": figure, "value": value} for figure, value in rows]
 
 
 def _median(values: Floats) -> float | None:

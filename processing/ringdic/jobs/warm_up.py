@@ -1,7 +1,7 @@
 """Compiles or loads the kernels that follow the matching, by processing a small synthetic plate once.
 
-Triangulation, merging, deformation, uncertainty and the writing of results run on the matches of a plate that cameras
-would see, so the first step of a session need not wait for compilation.
+Triangulation, merging, deformation, uncertainty and the writing of results run on the exact matches of the plate, so
+the first step of a session need not wait for their compilation.
 """
 
 from __future__ import annotations

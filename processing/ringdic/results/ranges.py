@@ -93,8 +93,8 @@ def percentiles(values: NDArray[np.float32]) -> Floats | None:
     place = _PERCENTILES / 100.0 * (count - 1)
     below = np.floor(place).astype(np.int64)
     above = np.minimum(below + 1, count - 1)
-    found = _bits_at_ranks(keys[:count], np.stack([below, above], axis=1).ravel()).view(np.float32)
-    first, second = found.reshape(-1, 2).T.astype(float)
+    neighbours = _bits_at_ranks(keys[:count], np.stack([below, above], axis=1).ravel()).view(np.float32)
+    first, second = neighbours.reshape(-1, 2).T.astype(float)
     return np.asarray(first + (second - first) * (place - below))
 
 

@@ -1,4 +1,4 @@
-"""The parts of a match's uncertainty, from patterns and noise that are known."""
+"""Standard deviations of matches by cause, against patterns and noise that are known."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""After a rehearsal a job finds every kernel that follows its matching compiled."""
+"""After the warm-up a job finds every kernel that follows its matching compiled."""
 
 import importlib
 from pathlib import Path
@@ -25,7 +25,7 @@ def compiled() -> set[tuple[str, str]]:
     }
 
 
-def test_a_job_needs_no_kernel_that_was_not_rehearsed(session: Path) -> None:
+def test_a_job_needs_no_kernel_that_the_warm_up_left_out(session: Path) -> None:
     run_small_plate()
     before = compiled()
     assert any(name == "pairs.merging.stars.stars" for name, _ in before)
