@@ -67,7 +67,7 @@ class PatternCamera:
 
 
 def pattern(camera: str, kind: str, scene: int, width: int, height: int) -> npt.NDArray[np.uint8]:
-    """Grey levels (height, width) of a diagonal ramp x + 2 y, shifted by a checksum of camera, kind and scene."""
+    """Grey levels of a diagonal ramp x + 2 y, shifted by a checksum of camera, kind and scene, (height, width)."""
     shift = zlib.crc32(f"{camera}/{kind}/{scene}".encode())
     y, x = np.mgrid[0:height, 0:width]
     return ((x + 2 * y + shift) % 251).astype(np.uint8)
