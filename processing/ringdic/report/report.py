@@ -130,9 +130,7 @@ def _pictures(
         for name in chosen:
             if name in gathered.scales:
                 scale = gathered.scales[name]
-                document.picture(
-                    f"map-{name}", plots.maps(gathered, scale, views), _caption(scale), palette(scale), dpi=100
-                )
+                document.picture(f"map-{name}", plots.maps(gathered, scale, views), _caption(scale), palette(scale))
                 done += 1
                 progress(0.2 + 0.8 * done / len(gathered.scales))
 
