@@ -63,7 +63,7 @@ def running_controller(folder: Path, rig_toml: str, settings_toml: str) -> Itera
     )
     with (folder / "controller.log").open("w", encoding="utf-8") as log:
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "ringdic_controller", "controller", "--config", str(config)],
+            [sys.executable, "-P", "-m", "ringdic", "controller", "--config", str(config)],
             stdout=subprocess.PIPE,
             stderr=log,
             text=True,
