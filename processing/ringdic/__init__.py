@@ -37,8 +37,11 @@ results' file; ``sweep`` and ``uncertainty``; ``calibration`` and ``correlation`
 
 from __future__ import annotations
 
+from ringdic.compiled import choose_cache_folder
 from ringdic.errors import ComputationError, InputError, RingdicError
 
 __version__ = "0.2.0"
 
 __all__ = ["ComputationError", "InputError", "RingdicError", "__version__"]
+
+choose_cache_folder()  # before any kernel is imported
