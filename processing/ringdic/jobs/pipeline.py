@@ -31,7 +31,7 @@ from ringdic.results.uncertainty import StepUncertainty, camera_covariance
 from ringdic.results.writer import ResultsWriter, StepRecord, in_turn
 from ringdic.session.folder import Capture, Session, new_run, open_session
 from ringdic.settings import CalibrationGroup, Settings
-from ringdic.sweep.sweep import Search
+from ringdic.sweep.sweep import DepthSearch
 from ringdic.tasks import Executor, LocalExecutor, Ran, Task, tidy, work_folder
 
 if TYPE_CHECKING:
@@ -279,8 +279,8 @@ def _whole_ring(
     return surface_of_tracks(session.rig.name, cameras, pairs, names, shape, tracks, settings)
 
 
-def _search(session: Session, settings: Settings) -> Search:
-    return Search(
+def _search(session: Session, settings: Settings) -> DepthSearch:
+    return DepthSearch(
         radius=settings.surface.radius_mm or session.rig.target.radius_mm,
         reach=settings.surface.reach_mm,
         incidence=settings.surface.incidence_deg,

@@ -16,9 +16,9 @@ from ringdic.correlation import (
     Current,
     Reference,
     Status,
+    correlate_independently,
     prepare_current,
     prepare_reference,
-    refine_alone,
 )
 from ringdic.correlation.prepared import Box
 from ringdic.errors import ComputationError
@@ -169,7 +169,7 @@ def match_nodes(
         chosen = np.flatnonzero(partners[b, own] & np.isfinite(start).all(axis=1))
         if not len(chosen):
             continue
-        found = refine_alone(filtered, ring.current(b), at[chosen], settings, start[chosen])
+        found = correlate_independently(filtered, ring.current(b), at[chosen], settings, start[chosen])
         made += len(chosen)
         seconds += found.seconds["refine"]
         who = own[chosen]

@@ -30,7 +30,7 @@ from ringdic.multiview.matching import Image, NodeMatches, ReferenceImages, matc
 from ringdic.multiview.tube import lattice_faces
 from ringdic.multiview.views import seen
 from ringdic.multiview.weights import smooth_sigma
-from ringdic.sweep.sweep import Search, radii_of, sweep
+from ringdic.sweep.sweep import DepthSearch, search_radii, sweep_depths
 from ringdic.uncertainty.texture import Texture, TextureMap
 
 log = logging.getLogger(__name__)
@@ -129,7 +129,7 @@ def reference_shape(
     image: Callable[[str], Image | None],
     masks: Mapping[str, Mask],
     pairs: Sequence[tuple[int, int]],
-    search: Search,
+    search: DepthSearch,
     correlation: CorrelationSettings,
     settings: ShapeSettings | None = None,
     progress: Callable[[float, str], None] = lambda *_: None,
@@ -162,7 +162,7 @@ def _spacing(cameras: Sequence[Camera], samples: Floats, correlation: Correlatio
 
 
 def _samples(
-    ring: ReferenceImages, pairs: Sequence[tuple[int, int]], search: Search, progress: Callable[[float], None]
+    ring: ReferenceImages, pairs: Sequence[tuple[int, int]], search: DepthSearch, progress: Callable[[float], None]
 ) -> Floats:
     """Places (n, 3) mm where the sweeps of the pairs found the surface."""
     found = []
@@ -170,8 +170,8 @@ def _samples(
         progress(k / len(pairs))
         cameras = (ring.cameras[a], ring.cameras[b])
         mask = ring.masks.get(cameras[0].id)
-        radii = radii_of(cameras, search)
-        seen_at = sweep(cameras, ring.grey(a), ring.current(b), mask, radii, search, ring.settings, _PIECE)
+        radii = search_radii(cameras, search)
+        seen_at = sweep_depths(cameras, ring.grey(a), ring.current(b), mask, radii, search, ring.settings, _PIECE)
         found.append(seen_at.xyz[seen_at.good])
         log.debug("cameras %s, %s: %d places of the surface", cameras[0].id, cameras[1].id, len(found[-1]))
     samples = np.concatenate(found)

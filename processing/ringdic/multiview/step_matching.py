@@ -25,12 +25,12 @@ from ringdic.correlation import (
     Current,
     Reference,
     Status,
+    as_start_values,
+    correlate_independently,
     correlate_points,
-    refine_alone,
-    start_order,
 )
 from ringdic.correlation.quadratic import QuadraticFit
-from ringdic.correlation.seeds import flow_starts
+from ringdic.correlation.seeds import flow_start_values
 from ringdic.multiview.tracked_points import TrackedPoints, robust
 
 _LOOSE = 5e-3  # px, tolerance of the first of two passes
@@ -94,7 +94,7 @@ def match_tracked_points(
         return _nowhere(points, first.status[points.knot])
     warp = _foretold(first, points, settings.radius)
     part = _about(points.pixel + warp[:, :2], settings.radius, part, current)
-    second = refine_alone(reference, part, points.pixel, settings, warp)
+    second = correlate_independently(reference, part, points.pixel, settings, warp)
     return _judged(_unbiased(first, second, points), points)
 
 
@@ -137,10 +137,10 @@ def _at_knots(
     part, whole = current
     xy = points.around.xy
     if start is None:
-        part, given = whole, start_order(flow_starts(reference, whole, xy, settings.radius))
+        part, given = whole, as_start_values(flow_start_values(reference, whole, xy, settings.radius))
     else:
         given = start[points.knots]
-    found = refine_alone(reference, part, xy, settings, given)
+    found = correlate_independently(reference, part, xy, settings, given)
     if search and found.good.sum() < _ENOUGH * max(1, np.isfinite(given).all(axis=1).sum()):
         searched = correlate_points(reference, whole, xy, settings)
         return searched if searched.good.sum() > found.good.sum() else found
@@ -150,7 +150,7 @@ def _at_knots(
     again = _smooth(found, points)[lost]
     if not np.isfinite(again).all(axis=1).any():
         return found
-    return placed(found, lost, refine_alone(reference, part, xy[lost], settings, again))
+    return placed(found, lost, correlate_independently(reference, part, xy[lost], settings, again))
 
 
 def placed(found: Correlation, index: Indices, other: Correlation) -> Correlation:
@@ -178,7 +178,7 @@ def _about(positions: Floats, radius: int, part: Current, whole: Current) -> Cur
         last = whole.box[2:]
         if (low >= (x0, y0)).all() and (np.minimum(high, last) <= (x1, y1)).all():
             return part
-    return whole.around(known, 2.0 * radius + _MARGIN)
+    return whole.crop_around(known, 2.0 * radius + _MARGIN)
 
 
 def _matched(
@@ -257,7 +257,7 @@ def _unbiased(first: Correlation, second: Correlation, points: TrackedPoints) ->
     share = _clear(fit.value, s, _BIASED)
     known = np.isfinite(fit.value).all(axis=1) & np.isfinite(s).all(axis=1)
     knot = points.nearest(known, points.around.window)
-    bias = fit.carried(knot, points.pixel - points.around.xy[knot])
+    bias = fit.extrapolate(knot, points.pixel - points.around.xy[knot])
     there: Mask = np.asarray((knot >= 0) & second.good)
     uv = np.where(there[:, None], second.uv - share[knot] * bias, second.uv)
     doubt = share[knot] * np.hypot(s[knot], _LEFT * bias)

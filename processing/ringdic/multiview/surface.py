@@ -26,7 +26,7 @@ from ringdic.multiview.uncertainty import surface_uncertainty
 from ringdic.multiview.views import incidence
 from ringdic.results.results import Matches, Results
 from ringdic.settings import Settings
-from ringdic.sweep.sweep import Search
+from ringdic.sweep.sweep import DepthSearch
 
 Tell = Callable[[float, str, str], None]
 
@@ -55,7 +55,7 @@ def ring_surface(
     image: Callable[[str, int], Image | None],
     masks: Mapping[str, Mask],
     steps: Sequence[str],
-    search: Search,
+    search: DepthSearch,
     settings: Settings,
     tell: Tell = lambda *_: None,
 ) -> RingSurface:

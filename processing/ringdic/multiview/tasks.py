@@ -22,7 +22,7 @@ from ringdic.multiview.tracking import CameraTrack, Tracking, TrackState, at_ref
 from ringdic.session.folder import Capture, Session
 from ringdic.session.images import read_mask
 from ringdic.settings import Settings
-from ringdic.sweep.sweep import Search
+from ringdic.sweep.sweep import DepthSearch
 from ringdic.tasks import Arrays, Task, code_stamp, digest, read_output, work_folder
 from ringdic.tasks.step_images import Digests, Image, step_image
 
@@ -66,7 +66,7 @@ def ring_job(
     cameras: Sequence[Camera],
     pairs: Sequence[tuple[str, str]],
     steps: Sequence[Capture],
-    search: Search,
+    search: DepthSearch,
     settings: Settings,
 ) -> RingJob:
     """The tasks over these steps, the reference first, of cameras that all have a reference image."""
@@ -110,7 +110,7 @@ def ring_job(
 def shape_task(
     cameras: tuple[Camera, ...],
     pairs: tuple[tuple[int, int], ...],
-    search: Search,
+    search: DepthSearch,
     correlation: CorrelationSettings,
     how: ShapeSettings,
     images: Mapping[str, Path],

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from ringdic.arrays import Floats, Indices, Mask
 from ringdic.correlation import CorrelationSettings, Reference
 from ringdic.correlation.quadratic import LowerQuartiles, Neighbourhoods, QuadraticFit
-from ringdic.correlation.seeds import spread
+from ringdic.correlation.seeds import even_sample
 
 _APART = 0.8  # subset radii, side of the squares with a knot each
 _REACH = 3.0  # subset radii about a knot in which its neighbours tell its curvature and its bias
@@ -76,9 +76,9 @@ class TrackedPoints:
         """Points (n,) whose values (n, 2) lie far off the quadratic of their neighbours; NaN does not."""
         fit = self.quadratics(values, sigma)
         knot = self.nearest(np.asarray(np.isfinite(fit.value).all(axis=1)), self.around.window)
-        off = np.hypot(*(values - fit.carried(knot, self.pixel - self.around.xy[knot])).T)
+        off = np.hypot(*(values - fit.extrapolate(knot, self.pixel - self.around.xy[knot])).T)
         off[knot < 0] = np.nan
-        own = np.hypot(*fit.leave_out.T)
+        own = np.hypot(*fit.leave_one_out.T)
         off[self.knots] = np.where(np.isfinite(own), own, off[self.knots])
         with np.errstate(invalid="ignore"):
             return np.asarray(off > _limit(off))
@@ -110,7 +110,9 @@ def tracked_points(
     _, knot = cKDTree(pixel[knots]).query(pixel)
     variance = _variance(reference, pixel, settings.radius)
     least = (reference.grey_range / 255.0) ** 2
-    return TrackedPoints(at, pixel, variance, least, spread(at), knots, np.asarray(knot, np.int64), around, quartile)
+    return TrackedPoints(
+        at, pixel, variance, least, even_sample(at), knots, np.asarray(knot, np.int64), around, quartile
+    )
 
 
 def thinned(xy: Floats, side: float) -> Indices:
@@ -128,13 +130,13 @@ def robust(around: Neighbourhoods, values: Floats, sigma: Floats) -> QuadraticFi
     fit = around.fit(values, sigma)
     for factor in _STRICTER:
         with np.errstate(invalid="ignore"):
-            off = np.hypot(*np.where(np.isfinite(kept), fit.leave_out, values - fit.value).T)
+            off = np.hypot(*np.where(np.isfinite(kept), fit.leave_one_out, values - fit.value).T)
             odd = off > factor * _limit(off)
         if (odd == (np.isfinite(values) & ~np.isfinite(kept)).any(axis=1)).all():
             continue
         kept = np.where(odd[:, None], np.nan, values)
         fit = around.fit(kept, sigma)
-    return replace(fit, leave_out=np.where(np.isfinite(kept), fit.leave_out, values - fit.value))
+    return replace(fit, leave_one_out=np.where(np.isfinite(kept), fit.leave_one_out, values - fit.value))
 
 
 def _limit(off: Floats) -> float:

@@ -24,7 +24,7 @@ from ringdic.correlation import (
     Status,
     prepare_current,
     prepare_reference,
-    search_hypotheses,
+    search_warps,
 )
 from ringdic.errors import InputError
 from ringdic.multiview.step_matching import ImageMatches, match_tracked_points
@@ -278,7 +278,7 @@ class _Points:
 
     def _resemblance(self, current: Current, seeds: Indices, warp: Floats) -> float:
         xy = self.x0[seeds]
-        found = search_hypotheses(self.reference, current, np.rint(xy), warp[seeds][:, None, :6], self.settings.radius)
+        found = search_warps(self.reference, current, np.rint(xy), warp[seeds][:, None, :6], self.settings.radius)
         return float(np.median(found[1]))
 
     def _worth_asking(self, found: ImageMatches) -> list[int]:

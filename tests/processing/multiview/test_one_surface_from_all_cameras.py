@@ -22,8 +22,8 @@ from ringdic.results.results import read_results
 from ringdic.results.writer import write_results
 from ringdic.settings import BEST, CorrelationGroup
 from ringdic.strain.deformation import deformation
-from ringdic.sweep.proxies import on_cylinder
-from ringdic.sweep.sweep import Search
+from ringdic.sweep.proxies import cylinder_intersections
+from ringdic.sweep.sweep import DepthSearch
 from ringdic_node.virtual_rig.render import render
 from ringdic_node.virtual_rig.rig import paper_rig
 from ringdic_node.virtual_rig.scenes.specimen import Limb, Specimen
@@ -63,7 +63,7 @@ def test_warps_are_those_of_exact_lines_of_sight_to_a_cylinder() -> None:
 
     def moved(dx: float, dy: float) -> np.ndarray:
         at = px + np.array([dx, dy])
-        return second.project(on_cylinder(first, at, np.array([57.0]))[:, 0]) - at
+        return second.project(cylinder_intersections(first, at, np.array([57.0]))[:, 0]) - at
 
     assert len(px) > 50
     np.testing.assert_allclose(warps[:, :2], moved(0, 0), rtol=0, atol=1e-7)
@@ -195,7 +195,7 @@ def limb() -> Images:
 
 
 CORRELATION = CorrelationSettings(radius=8, step=5)
-SEARCH = Search(radius=57.0, reach=20.0, incidence=65.0)
+SEARCH = DepthSearch(radius=57.0, reach=20.0, incidence=65.0)
 
 
 def measured(images: Images, **more):

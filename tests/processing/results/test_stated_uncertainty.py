@@ -29,7 +29,7 @@ from ringdic.results.series import StepCache, join_steps
 from ringdic.results.uncertainty import add_uncertainty
 from ringdic.settings import Settings
 from ringdic.strain.deformation import deformation
-from ringdic.sweep.sweep import Search
+from ringdic.sweep.sweep import DepthSearch
 from ringdic_node.virtual_rig.lens import VirtualCamera
 from ringdic_node.virtual_rig.render import radiance
 from ringdic_node.virtual_rig.rig import paper_rig
@@ -141,7 +141,7 @@ def exposed(light: dict, repeat: int) -> Callable[[str, int], np.ndarray]:
 
 
 def measure(cameras: list[Camera], image: Callable[[str, int], np.ndarray]) -> Run:
-    search = Search(radius=55.0, reach=6.0, incidence=65.0)
+    search = DepthSearch(radius=55.0, reach=6.0, incidence=65.0)
     shape = reference_shape(cameras, lambda id_: image(id_, 0), {}, [(0, 1), (1, 2)], search, CORRELATION)
     motion = measure_motion(cameras, shape, image, STEPS, {}, CORRELATION, Tracking(), 0.05)
     return Run(
@@ -152,7 +152,7 @@ def measure(cameras: list[Camera], image: Callable[[str, int], np.ndarray]) -> R
     )
 
 
-def by_pair(cameras: list[Camera], image: Callable[[str, int], np.ndarray], search: Search) -> Results:
+def by_pair(cameras: list[Camera], image: Callable[[str, int], np.ndarray], search: DepthSearch) -> Results:
     pair = (cameras[0], cameras[1])
     grid, steps = matched(Stereo(pair, search, CORRELATION), image)
     shape = pair_shape(pair, grid.xy, grid.faces, steps[0], CORRELATION.step, 0.05)
