@@ -35,7 +35,7 @@ from ringdic.sweep.sweep import DepthSearch
 from ringdic.tasks import Executor, LocalExecutor, Ran, Task, tidy, work_folder
 
 if TYPE_CHECKING:
-    from ringdic.multiview.surface import RingSurface
+    from ringdic.multiview.surface import MultiviewSurface
 
 Calibrate = Callable[[Session, CalibrationGroup, Callable[[float, str], None]], CalibratedRig]
 
@@ -265,15 +265,15 @@ def _whole_ring(
     settings: Settings,
     stages: Stages,
     executor: Executor | None,
-) -> RingSurface:
+) -> MultiviewSurface:
     """One surface from all cameras that have a reference image, as tasks."""
     from ringdic.multiview.surface import surface_of_tracks  # loaded where it is asked for: pairs need none of it
-    from ringdic.multiview.tasks import ring_job
+    from ringdic.multiview.tasks import multiview_job
 
     cameras = [each.camera for each in ring.cameras.values() if each.camera.id in steps[0].images]
-    job = ring_job(session, cameras, pairs, steps, _search(session, settings), settings)
+    job = multiview_job(session, cameras, pairs, steps, _search(session, settings), settings)
     _run(job.tasks, executor, stages, session)
-    shape, tracks = job.found()
+    shape, tracks = job.outputs()
     stages.at("triangulate", 0.0)
     names = [step.id for step in steps]
     return surface_of_tracks(session.rig.name, cameras, pairs, names, shape, tracks, settings)

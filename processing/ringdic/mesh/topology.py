@@ -73,8 +73,12 @@ def fans(mesh: Mesh) -> Indices:
     return np.asarray(fan_numbers(half_edges(mesh.faces)))
 
 
-def without_pinches(mesh: Mesh) -> Mask:
-    """Triangles (M,) left when at every vertex only the fan of the largest area stays."""
+def without_pinches(mesh: Mesh, weights: Floats | None = None) -> Mask:
+    """Triangles (M,) left when at every vertex only the fan of the largest weight stays, of equal ones the first.
+
+    weights : (M,) float64, mm², of the triangles; their areas where None is given.
+    """
+    weights = np.nan_to_num(mesh.areas) if weights is None else weights
     kept = np.ones(len(mesh.faces), bool)
     while True:
         left = np.flatnonzero(kept)
@@ -83,10 +87,10 @@ def without_pinches(mesh: Mesh) -> Mask:
         pinched = vertices_of_several_fans(part.faces.ravel(), fan)
         if not pinched.any():
             return kept
-        area = np.bincount(fan, np.repeat(np.nan_to_num(part.areas), 3))
+        weight = np.bincount(fan, np.repeat(weights[left], 3))
         corners = np.flatnonzero(pinched)
-        # The largest fan of each vertex: the last of its corners in order of the fan's area.
-        order = np.lexsort((fan[corners], area[fan[corners]], part.faces.ravel()[corners]))
+        # The largest fan of each vertex: the last of its corners in order of the fan's weight.
+        order = np.lexsort((-fan[corners], weight[fan[corners]], part.faces.ravel()[corners]))
         corners = corners[order]
         vertex = part.faces.ravel()[corners]
         last = np.flatnonzero(np.append(vertex[1:] != vertex[:-1], True))

@@ -121,8 +121,7 @@ class NodeMatches:
     systematic: Floats
     c_ls: Floats
     status: NDArray[np.int8]
-    made: int = 0
-    seconds: float = 0.0
+    count: int = 0
 
 
 def match_nodes(
@@ -134,7 +133,6 @@ def match_nodes(
     *,
     order: int,
     curved: bool = True,
-    progress: Callable[[float], None] = lambda _: None,
 ) -> NodeMatches:
     """Match the nodes (columns (n,), rows (n,)) from their reference camera (n,) to their partners (C, n).
 
@@ -146,15 +144,14 @@ def match_nodes(
     px, sigma = np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan)
     parts = _Parts(np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan), np.zeros(n))
     c_ls, status = np.full((count, n), np.nan), np.full(n, Status.NOT_REACHED, np.int8)
-    made, seconds = 0, 0.0
+    made = 0
     xyz = pieces.xyz[nodes]
     theta, z = (place[nodes] for place in pieces.lattice.places)
     reach = max(2.0, _FELT * settings.radius)
     jobs = [(a, b) for a in range(count) for b in range(count) if (partners[b] & (reference == a)).any()]
     own = np.empty(0, np.int64)
     before = -1
-    for job, (a, b) in enumerate(jobs):
-        progress(job / len(jobs))
+    for a, b in jobs:
         if a != before:
             own, before = np.flatnonzero(reference == a), a
             at = np.rint(ring.cameras[a].project(xyz[own]))
@@ -171,14 +168,12 @@ def match_nodes(
             continue
         found = correlate_independently(filtered, ring.current(b), at[chosen], settings, start[chosen])
         made += len(chosen)
-        seconds += found.seconds["refine"]
         who = own[chosen]
         px[b, who], sigma[b, who], c_ls[b, who] = at[chosen] + found.uv, found.sigma, found.c_ls
         parts.add(ring, (a, b), found, who)
         status[who] = np.where(status[who] == Status.GOOD, Status.GOOD, found.status)
     px[:, status != Status.GOOD] = np.nan
-    progress(1.0)
-    return NodeMatches(px, sigma, np.sqrt(parts.noise), np.sqrt(parts.systematic), c_ls, status, made, seconds)
+    return NodeMatches(px, sigma, np.sqrt(parts.noise), np.sqrt(parts.systematic), c_ls, status, made)
 
 
 @dataclass(frozen=True)

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask
-from ringdic.correlation import CorrelationSettings, Status
+from ringdic.correlation import Status
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.outliers import LostPoint, grid_neighbours, surface_outliers
 from ringdic.multiview.agreement import triangulate_agreeing
-from ringdic.multiview.matching import Image
 from ringdic.multiview.shape import ReferenceShape
-from ringdic.multiview.tracking import CameraTrack, Tracking, track
+from ringdic.multiview.tracking import CameraTrack
 from ringdic.multiview.weights import smooth_sigma
 from ringdic.uncertainty.matches import match_parts
 from ringdic.uncertainty.noise import camera_noise
 from ringdic.uncertainty.texture import Texture
 
 Placed = Callable[[int, Floats, Floats], Sequence[Camera]]
-
-log = logging.getLogger(__name__)
 
 _CELL = 8  # steps of the correlation, side of the squares over which weights are levelled
 _LEAST_SIGMA = 1e-3  # px, what no match is better than
@@ -71,45 +67,7 @@ class Motion:
     drift: Floats
 
 
-def measure_motion(
-    cameras: Sequence[Camera],
-    shape: ReferenceShape,
-    image: Callable[[str, int], Image | None],
-    steps: int,
-    masks: Mapping[str, Mask],
-    correlation: CorrelationSettings,
-    options: Tracking,
-    sigma_max: float,
-    progress: Callable[[float, str], None] = lambda *_: None,
-    placed: Placed | None = None,
-) -> Motion:
-    """Follow the points in every camera that saw them at the reference and triangulate every step from all cameras.
-
-    image : gives the grey image of a camera id and a step, None where there is none. sigma_max : px, the least certain
-    match that is believed. placed : where the cameras stood at a step, by px and sigma (C, n, 2) of what they saw.
-    """
-    tracks = []
-    for k, camera in enumerate(cameras):
-        progress(k / len(cameras), f"camera {camera.id}")
-        vertex = np.flatnonzero(np.isfinite(shape.px[k, :, 0]))
-        reference = image(camera.id, 0)
-        if not len(vertex) or reference is None:
-            continue
-
-        def of_step(step: int, id_: str = camera.id) -> Image | None:
-            return image(id_, step)
-
-        def share(done: float, k: int = k, id_: str = camera.id) -> None:
-            progress((k + done) / len(cameras), f"camera {id_}")
-
-        x0 = camera.project(shape.xyz[vertex])
-        found = track(reference, of_step, steps, x0, masks.get(camera.id), correlation, options, share)
-        tracks.append(camera_track(k, x0, vertex, shape, found, correlation.step, sigma_max))
-    progress(1.0, "")
-    return motion_from(cameras, shape, tracks, steps, placed)
-
-
-def camera_track(
+def vertex_track(
     camera: int, x0: Floats, vertex: Indices, shape: ReferenceShape, found: CameraTrack, step: int, sigma_max: float
 ) -> VertexTrack:
     """One camera's track with what its pixels are uncertain by.
@@ -138,7 +96,7 @@ def _parted(found: CameraTrack, texture: Texture, variance: float) -> tuple[Floa
     return noise, total
 
 
-def motion_from(
+def surface_motion(
     cameras: Sequence[Camera],
     shape: ReferenceShape,
     tracks: Sequence[VertexTrack],

@@ -93,8 +93,7 @@ class ReferenceShape:
     faces: Indices
     pieces: Pieces
     status: NDArray[np.int8]
-    made: int
-    seconds: float
+    match_count: int
 
     def arrays(self) -> dict[str, NDArray]:
         """All of it by name."""
@@ -120,7 +119,7 @@ class ReferenceShape:
         )
         plain: dict[str, Any] = {each.name: arrays[each.name] for each in fields(cls) if each.name in arrays}
         pieces = Pieces(lattice, arrays["coefficients"], arrays["support"])
-        plain |= {"made": int(arrays["made"]), "seconds": float(arrays["seconds"])}
+        plain["match_count"] = int(arrays["match_count"])
         return cls(**plain, pieces=pieces, textures=textures)
 
 
@@ -132,7 +131,6 @@ def reference_shape(
     search: DepthSearch,
     correlation: CorrelationSettings,
     settings: ShapeSettings | None = None,
-    progress: Callable[[float, str], None] = lambda *_: None,
 ) -> ReferenceShape:
     """Measure the surface in the reference images of all cameras.
 
@@ -142,17 +140,17 @@ def reference_shape(
     """
     settings = settings or ShapeSettings()
     ring = ReferenceImages(cameras, image, masks, correlation)
-    samples = _samples(ring, pairs, search, lambda share: progress(0.3 * share, "searching for the surface"))
+    samples = _samples(ring, pairs, search)
     lattice = lay_lattice(samples, settings.spacing or _spacing(cameras, samples, correlation))
     surface = _Surface(ring, settings, rough_surface(lattice, samples))
     surface.thin = math.pi * settings.piece**2 >= _IN_PIECE * _EVERY**2 * math.prod(lattice.spacing)
-    surface.measure(2, 2, lambda share: progress(0.3 + 0.2 * share, "first pass"))
+    surface.measure(2, 2)
     surface.fit()
-    surface.retry(2, 2, lambda share: progress(0.5 + 0.05 * share, "first pass, lost points"))
+    surface.retry(2, 2)
     surface.thin = False
-    surface.measure(correlation.order, len(cameras), lambda share: progress(0.55 + 0.4 * share, "all views"))
+    surface.measure(correlation.order, len(cameras))
     surface.fit()
-    surface.retry(correlation.order, len(cameras), lambda share: progress(0.95 + 0.05 * share, "lost points"))
+    surface.retry(correlation.order, len(cameras))
     return surface.result()
 
 
@@ -161,13 +159,10 @@ def _spacing(cameras: Sequence[Camera], samples: Floats, correlation: Correlatio
     return correlation.step / px_per_mm(cameras, radius)
 
 
-def _samples(
-    ring: ReferenceImages, pairs: Sequence[tuple[int, int]], search: DepthSearch, progress: Callable[[float], None]
-) -> Floats:
+def _samples(ring: ReferenceImages, pairs: Sequence[tuple[int, int]], search: DepthSearch) -> Floats:
     """Places (n, 3) mm where the sweeps of the pairs found the surface."""
     found = []
-    for k, (a, b) in enumerate(pairs):
-        progress(k / len(pairs))
+    for a, b in pairs:
         cameras = (ring.cameras[a], ring.cameras[b])
         mask = ring.masks.get(cameras[0].id)
         radii = search_radii(cameras, search)
@@ -200,7 +195,7 @@ class _Surface:
         self.reference = np.full((columns, rows), -1, np.int64)
         self.status = np.full((columns, rows), Status.NOT_REACHED, np.int8)
         self.tries, self.tried = np.zeros((columns, rows), np.int64), np.zeros((columns, rows), bool)
-        self.made, self.seconds = 0, 0.0
+        self.match_count = 0
         self.thin = False  # some of the nodes alone
 
     @property
@@ -208,7 +203,7 @@ class _Surface:
         """Measured nodes. (columns, rows)."""
         return self.status == Status.GOOD
 
-    def measure(self, order: int, views: int, progress: Callable[[float], None], only_lost: bool = False) -> int:
+    def measure(self, order: int, views: int, only_lost: bool = False) -> int:
         """Match the nodes that have a piece in up to so many cameras beside the reference; how many are new.
 
         A node is matched from the camera that faces it, or, where that failed, from the next: an obstacle or a
@@ -239,20 +234,17 @@ class _Surface:
         order_of = np.argsort(best_first, axis=0)
         partners = (rank > 0) & (order_of <= views) & (np.arange(len(rank))[:, None] != reference)
         curved = settings.curvature == "geometry" or order == 2
-        found = match_nodes(
-            ring, self.pieces, nodes, reference, partners, order=order, curved=curved, progress=progress
-        )
+        found = match_nodes(ring, self.pieces, nodes, reference, partners, order=order, curved=curved)
         before = int(self.known.sum())
         self._keep(nodes, reference, found)
-        self.made, self.seconds = self.made + found.made, self.seconds + found.seconds
+        self.match_count += found.count
         log.debug("order %d: %d of %d nodes measured", order, int(self.known[nodes].sum()), len(nodes[0]))
         return int(self.known.sum()) - before
 
-    def retry(self, order: int, views: int, progress: Callable[[float], None]) -> None:
+    def retry(self, order: int, views: int) -> None:
         """Match the lost nodes again, and those a little beyond the rim, until few are gained."""
-        for k in range(_RETRIES):
-            progress(k / _RETRIES)
-            gained = self.measure(order, views, lambda _: None, only_lost=True)
+        for _ in range(_RETRIES):
+            gained = self.measure(order, views, only_lost=True)
             if self.fit() == 0 and gained < _FEW * self.known.sum():
                 return
 
@@ -325,8 +317,7 @@ class _Surface:
             faces=faces,
             pieces=self.pieces,
             status=self.status,
-            made=self.made,
-            seconds=self.seconds,
+            match_count=self.match_count,
         )
 
 

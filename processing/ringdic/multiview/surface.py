@@ -6,35 +6,30 @@ and placed by all cameras together. The pair of a point is the two cameras that 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ringdic.arrays import Floats, Image, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask
 from ringdic.calibration.refined_cameras import RefinedCameras
-from ringdic.correlation import CorrelationSettings, Status
+from ringdic.correlation import Status
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.outliers import LostPoint
 from ringdic.geometry.triangulation import reprojection_residuals
-from ringdic.multiview.motion import Motion, VertexTrack, camera_track, measure_motion, motion_from
-from ringdic.multiview.shape import ReferenceShape, ShapeSettings, reference_shape
+from ringdic.multiview.motion import Motion, VertexTrack, surface_motion, vertex_track
+from ringdic.multiview.shape import ReferenceShape, ShapeSettings
 from ringdic.multiview.tracking import CameraTrack, Tracking
 from ringdic.multiview.uncertainty import surface_uncertainty
 from ringdic.multiview.views import incidence
 from ringdic.results.results import Matches, Results
 from ringdic.settings import Settings
-from ringdic.sweep.sweep import DepthSearch
-
-Tell = Callable[[float, str, str], None]
-
-_SHAPE_SHARE = 0.5  # of the time, with few steps
 
 
 @dataclass(frozen=True)
-class RingSurface:
+class MultiviewSurface:
     """Results, how well the cameras agree, and a sentence for each that took no part.
 
     drift : (F,) px for each camera, the mean vertical residual of each step. agreement : views a point, RMS residual of
@@ -48,53 +43,6 @@ class RingSurface:
     warnings: list[str]
 
 
-def ring_surface(
-    rig: str,
-    cameras: Sequence[Camera],
-    pairs: Sequence[tuple[str, str]],
-    image: Callable[[str, int], Image | None],
-    masks: Mapping[str, Mask],
-    steps: Sequence[str],
-    search: DepthSearch,
-    settings: Settings,
-    tell: Tell = lambda *_: None,
-) -> RingSurface:
-    """Measure the surface that all cameras see, and its motion through the steps.
-
-    pairs : ids of neighbouring cameras. image : the grey image of a camera id and a step, None where there is none.
-    masks : drawn regions by camera id. steps : names, the reference first. tell(share, what, rate) is told progress.
-    Raises ComputationError where no two cameras share a textured surface.
-    """
-    correlation = CorrelationSettings(**settings.correlation.keywords)
-    shape_share = _SHAPE_SHARE if len(steps) > 1 else 1.0
-    shape = reference_shape(
-        cameras,
-        lambda id_: image(id_, 0),
-        masks,
-        numbers_of(cameras, pairs),
-        search,
-        correlation,
-        shape_settings(settings),
-        lambda share, what: tell(shape_share * share, what, ""),
-    )
-    _require_faces(shape)
-    rate = f"{shape.made / shape.seconds:,.0f} points/s" if shape.seconds else ""
-    steadied = RefinedCameras(cameras)
-    motion = measure_motion(
-        cameras,
-        shape,
-        image,
-        len(steps),
-        masks,
-        correlation,
-        tracking_of(settings),
-        settings.surface.sigma_max_px,
-        lambda share, what: tell(shape_share + (1 - shape_share) * share, what, rate),
-        steadied if settings.calibration.refine_poses else None,
-    )
-    return _found(rig, cameras, pairs, steps, shape, motion, steadied, settings)
-
-
 def surface_of_tracks(
     rig: str,
     cameras: Sequence[Camera],
@@ -103,27 +51,27 @@ def surface_of_tracks(
     shape: ReferenceShape,
     tracks: Mapping[int, CameraTrack],
     settings: Settings,
-) -> RingSurface:
+) -> MultiviewSurface:
     """The same from the reference shape and each camera's track through all steps, by its index."""
     _require_faces(shape)
     step, sigma_max = settings.correlation.step_px, settings.surface.sigma_max_px
     followed = []
     for k, found in tracks.items():
-        vertex, x0 = reference_places(cameras[k], shape, k)
-        followed.append(camera_track(k, x0, vertex, shape, found, step, sigma_max))
+        vertex, x0 = reference_pixels(cameras[k], shape, k)
+        followed.append(vertex_track(k, x0, vertex, shape, found, step, sigma_max))
     steadied = RefinedCameras(cameras)
     placed = steadied if settings.calibration.refine_poses else None
-    motion = motion_from(cameras, shape, followed, len(steps), placed)
+    motion = surface_motion(cameras, shape, followed, len(steps), placed)
     return _found(rig, cameras, pairs, steps, shape, motion, steadied, settings)
 
 
-def reference_places(camera: Camera, shape: ReferenceShape, k: int) -> tuple[Indices, Floats]:
+def reference_pixels(camera: Camera, shape: ReferenceShape, k: int) -> tuple[Indices, Floats]:
     """The points (n,) that camera k saw at the reference, and the pixels (n, 2) from which it follows them."""
     vertex = np.flatnonzero(np.isfinite(shape.px[k, :, 0]))
     return vertex, camera.project(shape.xyz[vertex])
 
 
-def numbers_of(cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
+def pair_indices(cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
     """The pairs by the cameras' indices."""
     ids = [camera.id for camera in cameras]
     return [(ids.index(first), ids.index(second)) for first, second in pairs]
@@ -153,9 +101,9 @@ def _found(
     motion: Motion,
     steadied: RefinedCameras,
     settings: Settings,
-) -> RingSurface:
+) -> MultiviewSurface:
     residuals = reprojection_residuals(cameras, shape.xyz, shape.px)
-    return RingSurface(
+    return MultiviewSurface(
         _results(rig, cameras, pairs, steps, shape, motion, settings),
         _drift(cameras, residuals, motion),
         {**_agreement(shape, residuals), "moved_cameras": steadied.figures(steps)},
@@ -204,7 +152,7 @@ def _idle(cameras: Sequence[Camera], shape: ReferenceShape) -> list[str]:
     ]
 
 
-def tracking_of(settings: Settings) -> Tracking:
+def tracking_settings(settings: Settings) -> Tracking:
     """How points are followed."""
     order = settings.correlation.order
     return Tracking(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ringdic.correlation import CorrelationSettings
 from ringdic.geometry.camera import Camera
 from ringdic.multiview.shape import ReferenceShape, ShapeSettings, reference_shape
-from ringdic.multiview.surface import numbers_of, reference_places, shape_settings, tracking_of
+from ringdic.multiview.surface import pair_indices, reference_pixels, shape_settings, tracking_settings
 from ringdic.multiview.tracking import CameraTrack, Tracking, TrackState, at_reference, track_block
 from ringdic.session.folder import Capture, Session
 from ringdic.session.images import read_mask
@@ -34,7 +34,7 @@ _STATE, _TRACK = "state_", "track_"
 
 
 @dataclass(frozen=True)
-class RingJob:
+class MultiviewJob:
     """The tasks of the whole ring: the shape, and of every camera the blocks of steps in order."""
 
     cameras: tuple[Camera, ...]
@@ -46,7 +46,7 @@ class RingJob:
         """All tasks, block by block."""
         return [self.shape, *(task for turn in zip(*self.blocks, strict=True) for task in turn)]
 
-    def found(self) -> tuple[ReferenceShape, dict[int, CameraTrack]]:
+    def outputs(self) -> tuple[ReferenceShape, dict[int, CameraTrack]]:
         """The shape, and the tracks through all steps of the cameras that see some of it, by index.
 
         Raises the ComputationError that the shape ended with.
@@ -54,25 +54,25 @@ class RingJob:
         shape = ReferenceShape.from_arrays(read_output(self.shape.output))
         tracks = {}
         for k, (camera, blocks) in enumerate(zip(self.cameras, self.blocks, strict=True)):
-            vertex, x0 = reference_places(camera, shape, k)
+            vertex, x0 = reference_pixels(camera, shape, k)
             if len(vertex):
                 later = [_part(CameraTrack, read_output(task.output), _TRACK) for task in blocks]
                 tracks[k] = CameraTrack.joined([at_reference(x0, camera.size[::-1]), *later])
         return shape, tracks
 
 
-def ring_job(
+def multiview_job(
     session: Session,
     cameras: Sequence[Camera],
     pairs: Sequence[tuple[str, str]],
     steps: Sequence[Capture],
     search: DepthSearch,
     settings: Settings,
-) -> RingJob:
+) -> MultiviewJob:
     """The tasks over these steps, the reference first, of cameras that all have a reference image."""
     digests, folder = Digests(session), work_folder(session.path)
     correlation = CorrelationSettings(**settings.correlation.keywords)
-    numbers, how = numbers_of(cameras, pairs), shape_settings(settings)
+    numbers, how = pair_indices(cameras, pairs), shape_settings(settings)
     masks = {camera.id: mask for camera in cameras if (mask := session.mask(camera.id)) is not None}
     seen = [[digests.image(steps[0], camera.id), digests.mask(camera.id)] for camera in cameras]
     shape = Task(
@@ -83,7 +83,7 @@ def ring_job(
         folder,
         cost=_SHAPE_COST * len(cameras),
     )
-    options = tracking_of(settings)
+    options = tracking_settings(settings)
     blocks = []
     for k, camera in enumerate(cameras):
         images = [step.images.get(camera.id) for step in steps]
@@ -104,7 +104,7 @@ def ring_job(
                 )
             )
         blocks.append(tuple(row))
-    return RingJob(tuple(cameras), shape, tuple(blocks))
+    return MultiviewJob(tuple(cameras), shape, tuple(blocks))
 
 
 def shape_task(
@@ -127,7 +127,7 @@ def shape_task(
         return step_image(images[id_], by_id[id_]) if id_ in images else None
 
     shape = reference_shape(cameras, image, drawn, pairs, search, correlation, how)
-    return {**shape.arrays(), "points": np.array(shape.made)}
+    return {**shape.arrays(), "points": np.array(shape.match_count)}
 
 
 def track_task(
@@ -143,7 +143,7 @@ def track_task(
 ) -> Arrays:
     """The points of camera number k through a block of steps. images : of all steps so far, the reference first."""
     shape_file, *before = inputs
-    _, x0 = reference_places(camera, ReferenceShape.from_arrays(read_output(shape_file)), k)
+    _, x0 = reference_pixels(camera, ReferenceShape.from_arrays(read_output(shape_file)), k)
     state = _part(TrackState, read_output(before[0]), _STATE) if before else None
 
     def image(step: int) -> Image | None:

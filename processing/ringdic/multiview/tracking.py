@@ -118,26 +118,6 @@ class TrackState:
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
 
-def track(
-    reference_image: Image,
-    image_of_step: Callable[[int], Image | None],
-    steps: int,
-    x0: Floats,
-    mask: Mask | None,
-    settings: CorrelationSettings,
-    options: Tracking = Tracking(),
-    progress: Callable[[float], None] = lambda _: None,
-) -> CameraTrack:
-    """Follow points of one camera from its reference image, step 0, through the images of steps 1 … steps - 1.
-
-    As :func:`track_block`; the reference is the first step of the result.
-    """
-    block, _ = track_block(
-        reference_image, image_of_step, range(1, steps), x0, mask, settings, options, progress=progress
-    )
-    return CameraTrack.joined([at_reference(x0, reference_image.shape), block])
-
-
 def track_block(
     reference_image: Image,
     image_of_step: Callable[[int], Image | None],
@@ -147,7 +127,6 @@ def track_block(
     settings: CorrelationSettings,
     options: Tracking = Tracking(),
     state: TrackState | None = None,
-    progress: Callable[[float], None] = lambda _: None,
 ) -> tuple[CameraTrack, TrackState]:
     """Follow points of one camera from its reference image through some steps, and what the next steps set out from.
 
@@ -174,7 +153,6 @@ def track_block(
             result.c_ls[k, index] = found.c_ls
             result.status[k, index] = found.status
             result.updated[k, index] = found.good & (points.state.by_way > 0)
-        progress((k + 1) / len(steps))
     return result, points.state
 
 

@@ -12,8 +12,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from ringdic.arrays import Floats, Indices
-from ringdic.mesh.adjacency import fan_numbers, piece_numbers
-from ringdic.mesh.mesh import half_edges
+from ringdic.mesh.mesh import Mesh
+from ringdic.mesh.polygon import triangulate_polygon
+from ringdic.mesh.topology import pieces, without_pinches
 
 _LARGEST_HOLE = 5.0  # mm², filled
 _MOST_NODES = 16  # lost side by side in a hole worth a look
@@ -31,6 +32,10 @@ class _Nodes:
         """Number of each node, -1 where lost. (columns, rows)."""
         numbers = np.arange(self.xyz[..., 0].size).reshape(self.xyz.shape[:2])
         return np.where(np.isfinite(self.xyz).all(axis=2), numbers, -1)
+
+    def mesh(self, faces: Indices) -> Mesh:
+        """Triangles (M, 3) between nodes as a mesh whose vertices are all nodes of the lattice."""
+        return Mesh(self.xyz.reshape(-1, 3), faces)
 
     def place(self, node: Indices) -> Indices:
         """Column and row (n, 2) of nodes (n,)."""
@@ -56,13 +61,10 @@ def lattice_faces(xyz: Floats) -> tuple[Indices, tuple[Indices, Indices]]:
     nodes = _Nodes(xyz)
     faces = _cells(nodes)
     faces = np.concatenate([faces, _fillings(nodes, faces)])
-    count = xyz.shape[0] * xyz.shape[1]
-    faces = _without_scraps(_without_pinches(faces, count))
-    used = np.unique(faces)
-    renumber = np.full(count, -1, np.int64)
-    renumber[used] = np.arange(len(used))
+    faces = faces[without_pinches(nodes.mesh(faces), np.ones(len(faces)))]
+    mesh, used = nodes.mesh(_without_scraps(nodes.mesh(faces))).compact()
     column, row = nodes.place(used).T
-    return renumber[faces], (column, row)
+    return mesh.faces, (column, row)
 
 
 def _cells(nodes: _Nodes) -> Indices:
@@ -87,11 +89,11 @@ def _cells(nodes: _Nodes) -> Indices:
 
 def _fillings(nodes: _Nodes, faces: Indices) -> Indices:
     """Triangles (k, 3) that close the small holes of a sheet."""
-    edges = _borders(faces)
+    edges = nodes.mesh(faces).boundary_edges()
     holes, size = _holes(nodes)
     where = _beside(nodes, edges)
     hole = np.where(where[:, 1] >= 0, holes[where[:, 0], np.maximum(where[:, 1], 0)], -1)
-    found: list[tuple[int, int, int]] = []
+    fillings = [np.empty((0, 3), np.int64)]
     small = np.flatnonzero((size <= _MOST_NODES)[np.maximum(hole, 0)] & (hole >= 0))
     if not len(small):
         return np.empty((0, 3), np.int64)
@@ -101,23 +103,15 @@ def _fillings(nodes: _Nodes, faces: Indices) -> Indices:
         loop = _loop(loop_edges)
         if loop is None:
             continue
-        triangles = _clipped(loop, nodes.unrolled(loop))
-        corners = nodes.xyz.reshape(-1, 3)[triangles]
-        area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        closed = len(triangles) == len(loop) - 2
-        if closed and (area.sum() <= _LARGEST_HOLE or size[number] == 1):
-            found += [(int(a), int(b), int(c)) for a, b, c in triangles]
-    return np.array(found, np.int64).reshape(-1, 3)
-
-
-def _borders(faces: Indices) -> Indices:
-    """Edges (k, 2) with one triangle, as that triangle runs along them."""
-    directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    span = int(directed.max(initial=0)) + 1
-    _, inverse, count = np.unique(
-        directed.min(axis=1) * span + directed.max(axis=1), return_inverse=True, return_counts=True
-    )
-    return directed[count[inverse] == 1]
+        # On the lattice itself the outline never folds over, however the surface lies in space.
+        outline = np.column_stack([nodes.unrolled(loop), np.zeros(len(loop))]).astype(np.float64)
+        triangles = triangulate_polygon(outline, np.array([0.0, 0.0, 1.0]))
+        if triangles is None:
+            continue
+        filling = nodes.mesh(loop[triangles])
+        if filling.areas.sum() <= _LARGEST_HOLE or size[number] == 1:
+            fillings.append(filling.faces)
+    return np.concatenate(fillings)
 
 
 def _holes(nodes: _Nodes) -> tuple[Indices, Indices]:
@@ -177,59 +171,10 @@ def _loop(edges: Indices) -> Indices | None:
     return np.array(loop) if following is not None and len(loop) == len(edges) else None
 
 
-def _clipped(loop: Indices, place: Indices) -> Indices:
-    """Triangles (k, 3) of a polygon of nodes (n,) at places (n, 2), by clipping the ear of the shortest cut."""
-    left = list(range(len(loop)))
-    found = []
-    while len(left) > 3:
-        ears = []
-        for i in range(len(left)):
-            before, here, after = left[i - 1], left[i], left[(i + 1) % len(left)]
-            if _turn(place[before], place[here], place[after]) <= 0:
-                continue
-            others = [k for k in left if k not in (before, here, after)]
-            if not any(_inside(place[k], place[[before, here, after]]) for k in others):
-                ears.append((float(np.sum((place[after] - place[before]) ** 2)), i))
-        if not ears:
-            return np.empty((0, 3), np.int64)
-        _, i = min(ears)
-        found.append((left[i - 1], left[i], left[(i + 1) % len(left)]))
-        left.pop(i)
-    if _turn(*(place[k] for k in left)) > 0:
-        found.append((left[0], left[1], left[2]))
-    return loop[np.array(found, np.int64).reshape(-1, 3)]
-
-
-def _turn(a: Indices, b: Indices, c: Indices) -> int:
-    """Twice the signed area of a triangle of places."""
-    return int((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
-
-
-def _inside(p: Indices, triangle: Indices) -> bool:
-    """Whether a place lies in a triangle or on its rim."""
-    return all(_turn(triangle[k], triangle[(k + 1) % 3], p) >= 0 for k in range(3))
-
-
-def _without_pinches(faces: Indices, count: int) -> Indices:
-    """The triangles without those that hang on the rest by one vertex alone; the larger fan at a vertex stays."""
-    for _ in range(20):
-        fan = fan_numbers(half_edges(faces)).reshape(faces.shape)
-        each, first, size = np.unique(fan, return_index=True, return_counts=True)
-        vertex = faces.ravel()[first]
-        if (np.bincount(vertex, minlength=count) <= 1).all():
-            return faces
-        order = np.lexsort((-size, vertex))
-        keep = order[np.flatnonzero(np.diff(vertex[order], prepend=-1))]
-        best = np.full(count, -1)
-        best[vertex[keep]] = each[keep]
-        faces = faces[(fan == best[faces]).all(axis=1)]
-    return faces
-
-
-def _without_scraps(faces: Indices) -> Indices:
-    """The triangles of the largest piece, and of all others that are no scraps."""
-    if not len(faces):
-        return faces
-    piece = piece_numbers(half_edges(faces))
+def _without_scraps(mesh: Mesh) -> Indices:
+    """Triangles (M, 3) of the largest piece of a mesh and of all others that are no scraps."""
+    if not len(mesh.faces):
+        return mesh.faces
+    piece = pieces(mesh)
     triangles = np.bincount(piece)
-    return faces[triangles[piece] >= min(_LEAST_PIECE, triangles.max())]
+    return mesh.faces[triangles[piece] >= min(_LEAST_PIECE, triangles.max())]

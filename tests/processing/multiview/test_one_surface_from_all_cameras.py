@@ -1,7 +1,10 @@
 """The surface that several cameras see together, from exact geometry and from rendered images with truth."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from ringdic.correlation import CorrelationSettings
@@ -11,10 +14,10 @@ from ringdic.mesh.mesh import Mesh
 from ringdic.mesh.topology import holes, inconsistent_edges, is_closed_tube, non_manifold_vertices
 from ringdic.multiview.agreement import triangulate_agreeing
 from ringdic.multiview.lattice import Pieces, SurfaceLattice, fit_pieces
-from ringdic.multiview.motion import measure_motion
+from ringdic.multiview.motion import Motion
 from ringdic.multiview.shape import reference_shape
-from ringdic.multiview.surface import ring_surface
-from ringdic.multiview.tracking import Tracking
+from ringdic.multiview.surface import pair_indices, shape_settings, surface_of_tracks
+from ringdic.multiview.tasks import MultiviewJob, shape_task
 from ringdic.multiview.tube import lattice_faces
 from ringdic.multiview.views import seen
 from ringdic.multiview.warps import surface_stencil, warps_to
@@ -24,6 +27,7 @@ from ringdic.settings import BEST, CorrelationGroup
 from ringdic.strain.deformation import deformation
 from ringdic.sweep.proxies import cylinder_intersections
 from ringdic.sweep.sweep import DepthSearch
+from ringdic.tasks import LocalExecutor, Task, kept
 from ringdic_node.virtual_rig.render import render
 from ringdic_node.virtual_rig.rig import paper_rig
 from ringdic_node.virtual_rig.scenes.specimen import Limb, Specimen
@@ -243,8 +247,10 @@ def test_points_rest_on_whole_pixels_of_their_reference_camera(shape) -> None:
     assert (np.isfinite(shape.px[..., 0]).sum(axis=0) >= 2).all()
 
 
-def test_the_motion_of_the_limb_from_three_cameras(limb: Images, shape, figures) -> None:
-    motion = measure_motion(limb.cameras, shape, limb, 2, {}, CORRELATION, Tracking(), 0.1)
+def test_the_motion_of_the_limb_from_three_cameras(
+    limb: Images, shape, motion_of_shape: Callable[..., Motion], figures
+) -> None:
+    motion = motion_of_shape(limb.cameras, shape, limb, 2, CORRELATION, 0.1)
     theta, z, _ = Limb().material_coordinates(shape.xyz)
     speckled = (z > 5) & (z < 245)
     true = [Limb().position(theta, z, step) for step in (0, STEP)]
@@ -260,26 +266,35 @@ def test_the_motion_of_the_limb_from_three_cameras(limb: Images, shape, figures)
     assert np.nanstd((found.lambda2 - exact.lambda2)[whole]) < 3e-3
     # A camera that drops out does not move the points: they are labels that all cameras share.
     without = Images(limb.cameras, {key: grey for key, grey in limb.grey.items() if key != (limb.cameras[2].id, 1)})
-    fewer = measure_motion(limb.cameras, shape, without, 2, {}, CORRELATION, Tracking(), 0.1)
+    fewer = motion_of_shape(limb.cameras, shape, without, 2, CORRELATION, 0.1)
     both = np.isfinite(fewer.xyz[1, :, 0]) & np.isfinite(motion.xyz[1, :, 0]) & speckled
     assert 0.3 < both.mean() < 0.9
     assert np.abs(np.median((fewer.xyz - motion.xyz)[1, both], axis=0)).max() < 1e-3
 
 
-def test_two_cameras_are_enough_and_a_third_that_sees_nothing_is_named(limb: Images, tmp_path) -> None:
+def test_two_cameras_are_enough_and_a_third_that_sees_nothing_is_named(limb: Images, tmp_path: Path) -> None:
     ids = [camera.id for camera in limb.cameras]
-    grey = {(id_, 0): limb.grey[id_, 0] for id_ in ids[:2]}
-    grey[ids[2], 0] = np.full_like(grey[ids[0], 0], 128)
+    grey = {id_: limb.grey[id_, 0] for id_ in ids[:2]}
+    grey[ids[2]] = np.full_like(grey[ids[0]], 128)
+    images = {id_: tmp_path / f"{id_}.png" for id_ in ids}
+    for id_, path in images.items():
+        assert cv2.imwrite(str(path), grey[id_])
     settings = BEST.model_copy(update={"correlation": CorrelationGroup(radius_px=8, step_px=5)})
+    correlation = CorrelationSettings(**settings.correlation.keywords)
     pairs = [(ids[0], ids[1]), (ids[1], ids[2])]
-    found = ring_surface("ring", limb.cameras, pairs, Images(limb.cameras, grey), {}, ["reference"], SEARCH, settings)
-    results = found.results
-    assert [sentence for sentence in found.warnings if ids[2] in sentence]
-    assert len(found.warnings) == 1
-    assert set(found.drift) == set(ids[:2])
+    numbers, how = tuple(pair_indices(limb.cameras, pairs)), shape_settings(settings)
+    arguments = (tuple(limb.cameras), numbers, SEARCH, correlation, how, images, {})
+    job = MultiviewJob(tuple(limb.cameras), Task("shape", "shape", shape_task, arguments, tmp_path), ((), (), ()))
+    kept.clear()
+    LocalExecutor(1).run(job.tasks, lambda *_: None)
+    surface = surface_of_tracks("ring", limb.cameras, pairs, ["reference"], *job.outputs(), settings)
+    results = surface.results
+    assert [sentence for sentence in surface.warnings if ids[2] in sentence]
+    assert len(surface.warnings) == 1
+    assert set(surface.drift) == set(ids[:2])
     assert set(results.pair) == {0}
     assert len(results.vertices_ref) > 1000
-    assert found.agreement["views"] == 2.0
+    assert surface.agreement["views"] == 2.0
     _, z, distance = Limb().material_coordinates(results.vertices_ref)
     speckled = (z > 5) & (z < 245)
     assert np.abs(distance[speckled]).max() < 0.5

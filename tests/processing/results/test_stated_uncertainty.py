@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 from ringdic.correlation import CorrelationSettings, prepare_reference
 from ringdic.geometry.camera import Camera, Intrinsics
-from ringdic.multiview.motion import Motion, measure_motion
+from ringdic.multiview.motion import Motion
 from ringdic.multiview.shape import ReferenceShape, reference_shape
-from ringdic.multiview.tracking import Tracking
 from ringdic.multiview.uncertainty import SurfaceUncertainty, surface_uncertainty
 from ringdic.pairs import tracking as in_time
 from ringdic.pairs.matching import Grid, StepMatches, Stereo, at_step, match_reference
@@ -123,7 +122,7 @@ def cropped(camera: VirtualCamera, xyz: np.ndarray) -> VirtualCamera:
 
 
 @pytest.fixture(scope="module")
-def runs() -> list[Run]:
+def runs(motion_of_shape: Callable[..., Motion]) -> list[Run]:
     limb, rig = Limb(), paper_rig(12, 1.0)
     reach = HALF / 9.3  # mm: so many px a mm there
     theta, z = np.meshgrid(np.linspace(-reach, reach, 5) / 55.0, 120.0 + np.linspace(-reach, reach, 5))
@@ -131,7 +130,8 @@ def runs() -> list[Run]:
     views = [cropped(rig.cameras[k], patch) for k in (11, 0, 1)]
     light = {(v.id, step): radiance(v, Specimen(limb, step)) for v in views for step in (0, 1)}
     light |= {(v.id, 2): light[v.id, 1] for v in views}
-    return [measure([real(v) for v in views], exposed(light, repeat)) for repeat in range(REPEATS)]
+    cameras = [real(v) for v in views]
+    return [measure(cameras, exposed(light, repeat), motion_of_shape) for repeat in range(REPEATS)]
 
 
 def exposed(light: dict, repeat: int) -> Callable[[str, int], np.ndarray]:
@@ -140,10 +140,12 @@ def exposed(light: dict, repeat: int) -> Callable[[str, int], np.ndarray]:
     return lambda id_, step: grey[id_, step]
 
 
-def measure(cameras: list[Camera], image: Callable[[str, int], np.ndarray]) -> Run:
+def measure(
+    cameras: list[Camera], image: Callable[[str, int], np.ndarray], motion_of_shape: Callable[..., Motion]
+) -> Run:
     search = DepthSearch(radius=55.0, reach=6.0, incidence=65.0)
     shape = reference_shape(cameras, lambda id_: image(id_, 0), {}, [(0, 1), (1, 2)], search, CORRELATION)
-    motion = measure_motion(cameras, shape, image, STEPS, {}, CORRELATION, Tracking(), 0.05)
+    motion = motion_of_shape(cameras, shape, image, STEPS, CORRELATION, 0.05)
     return Run(
         shape,
         motion,
