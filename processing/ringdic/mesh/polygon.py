@@ -16,19 +16,21 @@ def triangulate_polygon(
 ) -> Indices | None:
     """Triangulate a polygon over its own vertices with the smallest sum of squared edge lengths.
 
-    Only triangulations are considered whose triangles all face the normal, none of them thinner than ``thinnest``,
-    and whose diagonals are no longer than ``longest`` and not barred. The best of them is found by dynamic programming
-    in O(n³) (Klincsek 1980).
+    Only triangulations are considered whose triangles all face the normal, none of them thinner than ``thinnest``, and
+    whose diagonals are no longer than ``longest`` and not barred. The best of them is found by dynamic programming in
+    O(n³) (Klincsek 1980).
 
-    Parameters:
-        points : (n, 3) float64, mm, the corners, counter-clockwise seen against the normal.
-        normal : (3,) float64, unit normal of the polygon.
-        longest : mm, of a diagonal.
-        barred : (n, n) bool, diagonals that are not allowed, by their ends i < j; None: all are allowed.
-        thinnest : least height of a triangle over its longest edge.
+    Parameters
+    ----------
+    points : (n, 3) float64, mm, the corners, counter-clockwise seen against the normal.
+    normal : (3,) float64, unit normal of the polygon.
+    longest : mm, greatest length of a diagonal.
+    barred : (n, n) bool, diagonals that are not allowed, by their ends i < j; None: all are allowed.
+    thinnest : least height of a triangle over its longest edge.
 
-    Returns:
-        Triangles (n - 2, 3) as indices into ``points``, counter-clockwise, or None where no triangulation is allowed.
+    Returns
+    -------
+    Triangles (n - 2, 3) as indices into ``points``, counter-clockwise, or None where no triangulation is allowed.
     """
     n = len(points)
     distance = np.linalg.norm(points[:, None] - points, axis=2)

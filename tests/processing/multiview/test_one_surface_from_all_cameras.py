@@ -19,7 +19,7 @@ from ringdic.multiview.shape import reference_shape
 from ringdic.multiview.surface import pair_indices, shape_settings, surface_of_tracks
 from ringdic.multiview.tasks import MultiviewJob, shape_task
 from ringdic.multiview.tube import lattice_faces
-from ringdic.multiview.views import seen
+from ringdic.multiview.views import visibility
 from ringdic.multiview.warps import surface_stencil, warps_to
 from ringdic.results.results import read_results
 from ringdic.results.writer import write_results
@@ -57,9 +57,9 @@ def test_warps_are_those_of_exact_lines_of_sight_to_a_cylinder() -> None:
     """Second differences over one pixel of lines of sight cut with the cylinder itself, no pieces."""
     first, second = CAMERAS[0], CAMERAS[1]
     pieces = cylinder()
-    sight, _ = seen(pieces, (first, second), {}, 40.0, 30.0)
+    sight, _ = visibility(pieces, (first, second), {}, 40.0, 30.0)
     nodes = tuple(index[::53] for index in np.nonzero(sight.all(axis=0)))
-    theta, z = (place[nodes] for place in LATTICE.places)
+    theta, z = (place[nodes] for place in LATTICE.coordinates)
     px = np.rint(first.project(pieces.xyz[nodes]))
     stencil = surface_stencil(LATTICE, pieces.coefficients[nodes], theta, z, first, px, 3.0)
     assert np.abs(np.hypot(stencil[..., 0], stencil[..., 1]) - 57.0).max() < 1e-9
@@ -84,7 +84,7 @@ def test_warps_are_those_of_exact_lines_of_sight_to_a_cylinder() -> None:
 
 def test_cameras_see_the_nodes_that_face_them() -> None:
     pieces = cylinder()
-    sight, cosine = seen(pieces, CAMERAS, {}, 60.0, 0.0)
+    sight, cosine = visibility(pieces, CAMERAS, {}, 60.0, 0.0)
     towards = np.array([camera.centre for camera in CAMERAS])[:, None, None] - pieces.xyz
     normal = pieces.xyz * np.array([1, 1, 0]) / 57.0
     true = np.sum(towards * normal, axis=-1) / np.linalg.norm(towards, axis=-1)
@@ -96,7 +96,7 @@ def test_cameras_see_the_nodes_that_face_them() -> None:
 
 
 def test_a_mask_and_a_hidden_place_are_not_seen() -> None:
-    theta, z = LATTICE.places
+    theta, z = LATTICE.coordinates
     collar = 57.0 + 12.0 * np.exp(-(((z - 120.0) / 4.0) ** 2))  # stands 12 mm out at half height
     down = np.array([-np.sqrt(0.5), 0.0, -np.sqrt(0.5)])  # a camera 45° above the middle looks down on it
     right = np.array([0.0, 1.0, 0.0])
@@ -105,8 +105,8 @@ def test_a_mask_and_a_hidden_place_are_not_seen() -> None:
     P = np.diag([1000.0, 1000.0, 1.0]) @ np.column_stack([R, -R @ centre])
     P[:2] += np.outer([600.0, 600.0], P[2])
     above = Camera("above", P / P[2, 3], (1200, 1200))
-    free, _ = seen(fit_pieces(LATTICE, collar, 4.0), [above], {}, 80.0, 0.0)
-    plain, _ = seen(cylinder(), [above], {}, 80.0, 0.0)
+    free, _ = visibility(fit_pieces(LATTICE, collar, 4.0), [above], {}, 80.0, 0.0)
+    plain, _ = visibility(cylinder(), [above], {}, 80.0, 0.0)
     # The collar's shadow ends where the line over its edge meets the cylinder again.
     assert not free[0][(np.abs(z - 111.0) < 2) & plain[0]].any()
     assert plain[0][np.abs(z - 111.0) < 2].any()
@@ -116,7 +116,7 @@ def test_a_mask_and_a_hidden_place_are_not_seen() -> None:
     camera = CAMERAS[0]
     mask = np.zeros((camera.size[1], camera.size[0]), bool)
     mask[:, : camera.size[0] // 2] = True
-    masked, _ = seen(cylinder(), [camera], {camera.id: mask}, 60.0, 0.0)
+    masked, _ = visibility(cylinder(), [camera], {camera.id: mask}, 60.0, 0.0)
     assert masked.any()
     assert (camera.project(cylinder().xyz[masked[0]])[:, 0] < camera.size[0] / 2).all()
 
