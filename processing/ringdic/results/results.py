@@ -370,6 +370,11 @@ def _open(path: Path) -> h5py.File:
     if "ringdic" not in file or "VTKHDF" not in file:
         file.close()
         raise InputError(f"{path}: an HDF5 file, but not results of a processing run")
+    schema = int(file["ringdic"].attrs.get("schema", 0))
+    if schema != SCHEMA:
+        file.close()
+        remedy = "update RingDIC" if schema > SCHEMA else "process the session again"
+        raise InputError(f"{path}: results of schema {schema}, but this version reads schema {SCHEMA}; {remedy}")
     return file
 
 
