@@ -66,7 +66,7 @@ def _facts(
     found: dict[str, object] = {"focal": None if lens is None else float(np.sqrt(lens.K[0, 0] * lens.K[1, 1]))}
     with np.errstate(invalid="ignore"):
         xyz = mesh.vertices[camera.incidence_cosine(mesh.vertices, normals) > _SQUARELY]
-    px, slope = camera.project_with_slope(xyz)
+    px, slope = camera.project_with_jacobian(xyz)
     shown = ((px > 0) & (px < np.array(camera.size) - 1.0)).all(axis=1)
     px, slope, xyz = px[shown], slope[shown], xyz[shown]
     if len(px) >= _FEWEST:

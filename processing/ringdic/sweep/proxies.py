@@ -93,7 +93,7 @@ def _project_intersection(origin, ray, radius, P, K, distortion):  # type: ignor
     w = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
     u = (P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3]) / w
     v = (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3]) / w
-    x_d, y_d = lens.distorted_point((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], distortion)
+    x_d, y_d = lens.distort_point((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], distortion)
     return K[0, 0] * x_d + K[0, 1] * y_d + K[0, 2], K[1, 1] * y_d + K[1, 2]
 
 
