@@ -40,3 +40,11 @@ bench: install                         ## speed and memory
 
 clean:
 	rm -rf $(VENV) build dist controller/ringdic_controller/web/static
+
+.PHONY: docs
+$(VENV)/.installed-docs: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet -e ".[pc,docs]"
+	touch $@
+
+docs: $(VENV)/.installed-docs          ## the documentation as a site under build/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --config-file docs/mkdocs.yml

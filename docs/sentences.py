@@ -19,9 +19,9 @@ from pathlib import Path
 ROOTS = ("processing", "node_agent", "controller")
 LEANING = re.compile(r"(The same|See|As)\b")
 ARRAYS = re.compile(r"\b(Floats|Points|Vectors|Pixels|Mask|Indices|Image|Radiance|NDArray)\b")
-SHAPE = re.compile(r"\((\.\.\.|[A-Z0-9]|[a-z]\w*|[0-9]+ ?[A-Za-z]+)( ?[-+*/×] ?\w+)*,[^()]*\)")
+SHAPE = re.compile(r"\((\.\.\.|\w+|[0-9]+ ?[A-Za-z]+)( ?[-+*/×] ?\w+)*,[^()]*\)")
 UNIT = re.compile(
-    r"mm|\bpx\b|\brad\b|degrees|µm|\bns\b|\bseconds\b|grey level|no unit|\bbool|\bint|ind(ex|ices)|stretch|strain|"
+    r"mm|\bpx\b|\brad\b|degrees|µm|\bns\b|\bseconds\b|[Gg]rey level|no unit|\bbool|\bint|ind(ex|ices)|stretch|strain|"
     r"\bsRGB\b|\bshare|\bnumber|\bunit\b|\bones? for\b|0 \.\.\. |0 to \d|\bC_LS\b|ZNCC|status"
 )
 Named = ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef

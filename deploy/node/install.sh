@@ -112,9 +112,9 @@ as_service_user() {
 controller_address() { # controller_address VENV: the host in the node's configuration; fails if it is not sound
   "$1/bin/python" - "$config" <<'PYTHON'
 import pathlib, sys
-from ringdic_node.config import ConfigError, read_config
+from ringdic_node.config import ConfigError, read_node_config
 try:
-    endpoint = read_config(pathlib.Path(sys.argv[1])).controller
+    endpoint = read_node_config(pathlib.Path(sys.argv[1])).controller
 except ConfigError as error:
     sys.exit(f"install: {error}")
 print(endpoint.partition("/")[2].partition("#")[0].rpartition(":")[0].strip("[]"))

@@ -46,6 +46,8 @@ REMEMBERED = 200  # failures and answers kept for repeated questions
 
 @dataclass(frozen=True)
 class ArmAsked:
+    """The controller asks this node to lock its camera. question : number to answer by."""
+
     message: Arm
     question: int
 
@@ -59,23 +61,31 @@ class CameraLocked:
 
 @dataclass(frozen=True)
 class CameraRefused:
+    """The camera could not be locked to the settings with this hash; `reason` says why."""
+
     settings_hash: str
     reason: str
 
 
 @dataclass(frozen=True)
 class Triggered:
+    """A trigger has arrived. question : number to answer by."""
+
     message: Trigger
     question: int
 
 
 @dataclass(frozen=True)
 class FrameSpooled:
+    """The frame of the capture under way lies in the spool, safe against a power cut."""
+
     manifest: Manifest
 
 
 @dataclass(frozen=True)
 class FrameLost:
+    """The camera or the spool failed: there will be no image of this capture."""
+
     key: CaptureKey
     reason: str
 
@@ -89,16 +99,22 @@ class Sent:
 
 @dataclass(frozen=True)
 class Acknowledged:
+    """The controller has acknowledged an image, or says that it does not know the capture."""
+
     message: Ack
 
 
 @dataclass(frozen=True)
 class InventoryAsked:
+    """The controller asks what this node holds. question : number to answer by."""
+
     question: int
 
 
 @dataclass(frozen=True)
 class FetchAsked:
+    """The controller asks for the image of one capture. question : number to answer by."""
+
     key: CaptureKey
     question: int
 
@@ -128,6 +144,8 @@ Event = (
 
 @dataclass(frozen=True)
 class LockCamera:
+    """Lock the camera to these settings; the event CameraLocked or CameraRefused tells the outcome."""
+
     settings: dict[str, Any]
     settings_hash: str
 
@@ -141,6 +159,8 @@ class TakeFrame:
 
 @dataclass(frozen=True)
 class Publish:
+    """Send the image of this manifest from the spool; the event Sent follows."""
+
     manifest: Manifest
 
 
@@ -154,23 +174,31 @@ class Free:
 
 @dataclass(frozen=True)
 class Report:
+    """Tell the controller about a capture without an image."""
+
     failure: Failure
 
 
 @dataclass(frozen=True)
 class Answer:
+    """Answer a question with a message."""
+
     question: int
     message: ArmReply | TriggerReply | Inventory
 
 
 @dataclass(frozen=True)
 class AnswerImage:
+    """Answer a question with the image of this manifest from the spool."""
+
     question: int
     manifest: Manifest
 
 
 @dataclass(frozen=True)
 class Decline:
+    """Answer a question with an error and its reason."""
+
     question: int
     reason: str
 
@@ -228,6 +256,7 @@ class Agent:
 
     @property
     def state(self) -> str:
+        """One of ``wire.NODE_STATES``: capturing, arming, armed or idle."""
         if self._capturing is not None:
             return "capturing"
         if self._arming is not None:
@@ -236,6 +265,7 @@ class Agent:
 
     @property
     def armed(self) -> bool:
+        """Whether the camera is locked to the settings that were asked for last."""
         return self._lock_reply is not None
 
     @property

@@ -20,18 +20,22 @@ class Instant:
 class Clock(Protocol):
     """Tells the moment and waits."""
 
-    def now(self) -> Instant: ...
+    def now(self) -> Instant:
+        """The present moment on both clocks."""
 
-    def sleep(self, seconds: float) -> None: ...
+    def sleep(self, seconds: float) -> None:
+        """Wait; a negative time is no wait."""
 
 
 class SystemClock:
     """The machine's clocks."""
 
     def now(self) -> Instant:
+        """The present moment on the machine's clocks."""
         return Instant(wall_ns=time.time_ns(), monotonic_ns=time.monotonic_ns())
 
     def sleep(self, seconds: float) -> None:
+        """Wait; a negative time is no wait."""
         time.sleep(max(seconds, 0.0))
 
 

@@ -225,7 +225,7 @@ class NodeService:
             self._spool.store(manifest, parts)
         except (CameraError, SpoolError, WireError) as error:
             return steps.FrameLost(trigger.key, str(error))
-        self._preview = shrink(frame)
+        self._preview = preview_image(frame)
         return steps.FrameSpooled(manifest)
 
     # The sender's thread
@@ -265,8 +265,8 @@ def make_manifest(node: str, trigger: Trigger, frame: Frame, parts: tuple[bytes,
     )
 
 
-def shrink(frame: Frame) -> npt.NDArray[np.uint8]:
-    """Every n-th pixel of the frame, at most `PREVIEW_WIDTH` wide, 8 bit."""
+def preview_image(frame: Frame) -> npt.NDArray[np.uint8]:
+    """Every n-th pixel of a frame, for the preview: (height, width) 8-bit grey levels, at most `PREVIEW_WIDTH` wide."""
     stride = -(-frame.width // PREVIEW_WIDTH)
     small = frame.pixels[::stride, ::stride]
     shift = 8 if small.dtype == np.uint16 else 0

@@ -75,12 +75,15 @@ class Keys:
         checked_name("rig", self.rig)
 
     def node(self, node: str, verb: str) -> str:
+        """Key of one verb of a node: arm, trigger, inventory, fetch, preview, ack or status."""
         return f"rig/{self.rig}/node/{node}/{verb}"
 
     def image(self, node: str) -> str:
+        """Key under which a node publishes its images."""
         return f"rig/{self.rig}/img/{node}"
 
     def alive(self, node: str) -> str:
+        """Key of the liveliness token of a node."""
         return f"rig/{self.rig}/alive/{node}"
 
 
@@ -199,6 +202,8 @@ class Trigger(_Message):
 
 @dataclass(frozen=True)
 class TriggerReply(_Message):
+    """Whether the node will capture: accepted, late (the moment had passed when the trigger came) or not armed."""
+
     TYPE: ClassVar[str] = "trigger-reply"
     node: str
     key: CaptureKey
@@ -272,6 +277,8 @@ class Inventory(_Message):
 
 @dataclass(frozen=True)
 class Fetch(_Message):
+    """Send the image of this capture as the answer."""
+
     TYPE: ClassVar[str] = "fetch"
     key: CaptureKey
 

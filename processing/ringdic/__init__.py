@@ -26,10 +26,22 @@ Deformation
 Lost points
     A point that could not be measured is NaN and carries a status; it is never an exception and never zero.
 
-The rooms
----------
-``session`` and ``rig`` read what was captured; ``images`` decodes; ``calibration`` finds the cameras;
-``correlation`` matches images; ``triangulation`` lifts matches into space; ``multiview`` measures one surface from
-all cameras together; ``deformation`` and ``rigid_motion`` turn positions into strain; ``results`` and ``export`` keep
-them. Stages do not know one another: ``pipeline`` is the only place that joins them.
+The front door
+--------------
+``ringdic.api`` offers what is listed in ``__all__``; the names are loaded when they are first used. Below it lie the
+rooms, by storey: ``jobs`` processes whole sessions; ``report`` writes their reports; ``pairs`` and ``multiview``
+measure surfaces, ``export``, ``pictures`` and ``measure`` make something of them; ``results`` holds fields and the
+results' file; ``sweep`` and ``uncertainty``; ``calibration`` and ``correlation``; ``tasks`` keeps what was computed;
+``session`` reads what was captured and ``strain`` the deformation of a mesh; ``mesh`` and ``geometry``.
 """
+
+from __future__ import annotations
+
+from ringdic.compiled import choose_cache_folder
+from ringdic.errors import ComputationError, InputError, RingdicError
+
+__version__ = "0.2.0"
+
+__all__ = ["ComputationError", "InputError", "RingdicError", "__version__"]
+
+choose_cache_folder()  # before any kernel is imported

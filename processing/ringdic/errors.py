@@ -5,6 +5,8 @@ RingdicError
 └── ComputationError  the input is sound but the answer cannot be computed: exit code 3
 """
 
+from __future__ import annotations
+
 
 class RingdicError(Exception):
     """A failure with a sentence for the operator: what, which file or camera, what to do."""
@@ -22,3 +24,27 @@ class ComputationError(RingdicError, RuntimeError):
     """Sound input that does not determine the answer: no texture in common, a board seen from one side only."""
 
     exit_code = 3
+
+
+# Extras of the installation and the packages that each brings, by the names under which they are imported.
+_EXTRAS = {
+    "processing": ("cv2", "h5py", "matplotlib", "numba", "PIL", "pydantic", "rich", "scipy", "trimesh", "typer"),
+    "controller": ("fastapi", "uvicorn"),
+    "cluster": ("dask", "distributed"),
+    "viewer": ("pyvista",),
+}
+
+
+def missing_extra(error: ModuleNotFoundError) -> InputError | None:
+    """The sentence that names the extra to install when a package of an extra could not be imported.
+
+    Returns None for a package of no extra: then the installation is damaged, or the code is wrong.
+    """
+    package = (error.name or "").partition(".")[0]
+    for extra, packages in _EXTRAS.items():
+        if package in packages:
+            return InputError(
+                f"this needs the extra '{extra}', which is not installed ({package} is missing); "
+                f"install it with: pip install 'ringdic[{extra}]'"
+            )
+    return None

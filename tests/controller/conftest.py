@@ -1,4 +1,4 @@
-"""A controller without a network: a real archive and desk over a ring of stand-in cameras."""
+"""A controller without a network: a real archive and desk with stand-in nodes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CAMERAS = ("01", "02", "03", "04")
 STAND_IN = [sys.executable, str(Path(__file__).with_name("stand_in_processing.py"))]
 
 
-class StandInRing:
+class StandInNodes:
     """Cameras that deliver small images at once. ``gate`` holds a capture up, ``absent`` nodes are not there."""
 
     def __init__(self, on_event: Callable[[dict[str, Any]], None]) -> None:
@@ -71,16 +71,16 @@ def image_of(session: str, capture_id: str, camera: str, kind: str, time_ns: int
 @pytest.fixture
 def desk_of(tmp_path: Path, rig_toml: Callable[[str, Sequence[str]], str]) -> Iterator[Callable[..., Desk]]:
     """Call it with what carries out the jobs, and more arguments of a desk: a desk over stand-in cameras."""
-    made: list[Desk] = []
+    desks: list[Desk] = []
 
     def make(processing: Any, **more: Any) -> Desk:
         desk = Desk(tmp_path / "archive", processing, rig_toml("test-ring", CAMERAS), **more)
-        made.append(desk)
-        desk.connect(Archive(tmp_path / "archive"), StandInRing(desk.on_event))
+        desks.append(desk)
+        desk.connect(Archive(tmp_path / "archive"), StandInNodes(desk.on_event))
         return desk
 
     yield make
-    for desk in made:
+    for desk in desks:
         desk.close()
 
 
@@ -97,14 +97,14 @@ def warm_stand_in() -> WarmChild:
 
 
 @pytest.fixture
-def ring(desk: Desk) -> StandInRing:
-    """The cameras of the desk."""
-    assert isinstance(desk._ring, StandInRing)
-    return desk._ring
+def nodes(desk: Desk) -> StandInNodes:
+    """The stand-in nodes that the desk is connected to."""
+    assert isinstance(desk.roster.nodes, StandInNodes)
+    return desk.roster.nodes
 
 
 @pytest.fixture
 def client(desk: Desk) -> Iterator[TestClient]:
     """The HTTP interface over the desk."""
-    with TestClient(create_app(desk)) as made:
-        yield made
+    with TestClient(create_app(desk)) as client:
+        yield client

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from ringdic.geometry.camera import Camera
 from ringdic.results.results import Results
-from ringdic.results.series import part
+from ringdic.results.series import select_steps
 from ringdic.results.writer import write_results
 from ringdic.session.folder import new_live, new_run, open_session
 
@@ -33,7 +33,7 @@ def tube(steps: tuple[str, ...]) -> Results:
     vertices[-1, LOST] = np.nan
     number = np.arange(AROUND * ALONG).reshape(AROUND, ALONG)
     after = np.roll(number, -1, axis=0)
-    a, b, c, d = (part.ravel() for part in (number[:, :-1], after[:, :-1], after[:, 1:], number[:, 1:]))
+    a, b, c, d = (corner.ravel() for corner in (number[:, :-1], after[:, :-1], after[:, 1:], number[:, 1:]))
     faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
     shape = (len(steps), len(reference))
     lost = ~np.isfinite(vertices[..., 0])
@@ -71,7 +71,7 @@ def process(session: Path, step: str | None, seconds: float) -> dict:
     if step is not None:
         with new_live(session, step) as folder:
             whole, at = tube(steps), sorted({0, steps.index(step)})
-            write_results(folder / "results.h5", part(whole, at))
+            write_results(folder / "results.h5", select_steps(whole, at))
         return {"state": "done", "live": step}
     results = tube(steps)
     with new_run(session) as run:

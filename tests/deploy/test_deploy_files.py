@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 import typer.main
 import zenoh
-from ringdic_controller.cli.app import app
+from ringdic.cli.app import application
 from ringdic_controller.service.config import read_controller_config
 from ringdic_node.cli import _parser as node_parser
 from ringdic_node.config import read_node_config
@@ -99,7 +99,7 @@ def test_node_unit_starts_a_command_that_exists() -> None:
 def test_controller_unit_starts_a_command_that_exists() -> None:
     program, (verb, *arguments) = command_of(UNITS[1])
     assert Path(program).name in {script.name for script in distribution("ringdic").entry_points}
-    command = typer.main.get_command(app).commands[verb]  # type: ignore[attr-defined]
+    command = typer.main.get_command(application()).commands[verb]  # type: ignore[attr-defined]
     context = command.make_context(verb, arguments)
     assert context.params == {"config": Path("/etc/ringdic/controller.toml")}
 
@@ -161,7 +161,7 @@ def wheel(folder: Path, version: str, *, broken: bool = False) -> Path:
             text = source.read_text(encoding="utf-8")
             if broken and source.name == "link.py":
                 text = "raise RuntimeError('this release does not work')\n"
-            archive.writestr(source.relative_to(REPOSITORY).as_posix(), text)
+            archive.writestr(source.relative_to(REPOSITORY / "node_agent").as_posix(), text)
         archive.writestr(
             f"{about}/METADATA",
             f"Metadata-Version: 2.1\nName: ringdic\nVersion: {version}\n"

@@ -46,7 +46,19 @@ class Worker:
 
     def __init__(self, address: str, name: str, folder: Path, path: Path | None = None) -> None:
         environment = os.environ if path is None else {**os.environ, "PYTHONPATH": str(path)}
-        command = [sys.executable, "-m", "dask", "worker", address, "--no-nanny", "--nthreads", "1", "--name", name]
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            "dask",
+            "worker",
+            address,
+            "--no-nanny",
+            "--nthreads",
+            "1",
+            "--name",
+            name,
+        ]
         local = ["--no-dashboard", "--local-directory", str(folder), "--death-timeout", "60"]
         self.name = name
         with open(folder / f"{name}.log", "ab") as log:
@@ -74,7 +86,7 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The address of a running scheduler."""
     folder = tmp_path_factory.mktemp("scheduler")
     file = folder / "scheduler.json"
-    command = [sys.executable, "-m", "dask", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+    command = [sys.executable, "-P", "-m", "dask", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
     with open(folder / "log", "wb") as log:
         process = subprocess.Popen([*command, "--scheduler-file", str(file)], stderr=log, stdout=log, cwd=folder)
     try:
@@ -248,7 +260,7 @@ def test_a_worker_killed_in_the_middle_costs_only_its_tasks(
 
 def test_a_job_whose_driver_was_killed_makes_only_what_is_missing(session: Path, local: Results, crew: str) -> None:
     options = [each for name in SETTINGS for each in ("--set", name)]
-    command = [sys.executable, "-P", "-m", "ringdic_controller", "process", str(session), *options, "--cluster", crew]
+    command = [sys.executable, "-P", "-m", "ringdic", "process", str(session), *options, "--cluster", crew]
     driver = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     outputs = work_folder(session)
     try:

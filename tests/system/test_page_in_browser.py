@@ -77,7 +77,7 @@ class Station:
     def capture(self, kind: str) -> None:
         """Capture, and wait for the close."""
         begun = self.post("captures", {"kind": kind})["id"]
-        self.until(lambda: self.desk.round(begun).state == "closed", f"the {kind} capture")
+        self.until(lambda: self.desk.rounds.get(begun).state == "closed", f"the {kind} capture")
 
     def processed_session(self, name: str, steps: int = 3) -> None:
         """A session of its own with results, made without the page."""
@@ -102,7 +102,7 @@ def running_station(folder: Path, rig: str, processing: Command | Processing) ->
         try:
             for camera in CAMERAS:
                 made.start_node(camera)
-            made.until(lambda: not desk.missing_nodes(), "every node's appearance")
+            made.until(lambda: not desk.roster.missing(), "every node's appearance")
             yield made
         finally:
             server.should_exit = True
@@ -140,7 +140,7 @@ def live_station(
     """A controller that processes every step at once."""
     processing = WarmChild([sys.executable, str(STAND_IN), "--serve", "--seconds", "0.2"])
     with running_station(tmp_path_factory.mktemp("live"), rig_toml("page-ring", CAMERAS), processing) as made:
-        made.desk.quiet = 600.0  # the whole session follows when a test wants it
+        made.desk.processing.quiet = 600.0  # the whole session follows when a test wants it
         yield made
 
 

@@ -1,4 +1,7 @@
-"""The catalogue of sessions: SQLite over the session folders. The folders are the truth; this is rebuilt from them."""
+"""Catalogue of the session folders: tables in memory (SQLite), quick to list.
+
+The folders are the truth; the tables are rebuilt from them and never written to disk.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,6 @@ import json
 import logging
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import RLock
@@ -17,80 +19,87 @@ from ringdic.session.folder import live_results
 logger = logging.getLogger(__name__)
 
 _SCHEMA = """
-create table sessions (name text primary key, rig text, created text, source text, path text, signature text);
+create table sessions (name text primary key, rig text, created text, source text, signature text);
 create table captures (session text, id text, number integer, kind text, record text, primary key (session, id));
 create table runs (session text, run text, finished_at text, summary text, primary key (session, run));
 """
 
 
 class Catalogue:
-    """Sessions, captures and processing runs under one archive folder, quick to list.
+    """Sessions, captures and processing runs of one archive folder; safe to use from several threads.
 
-    Nothing is kept on disk. Safe to use from several threads. Unknown names raise KeyError.
+    Methods raise KeyError for a name that the catalogue does not hold, unless they say otherwise.
     """
 
     def __init__(self, root: Path) -> None:
         self.root = Path(root)
-        self._lock = RLock()
+        self._lock = RLock()  # guards the tables; reading the folders with it held keeps them consistent
         self._db = sqlite3.connect(":memory:", check_same_thread=False)
         self._db.row_factory = sqlite3.Row
         self._db.executescript(_SCHEMA)
         self.sync()
 
     def close(self) -> None:
-        """Let go of the memory; nothing else may be called afterwards."""
+        """Free the tables; nothing else may be called afterwards."""
         with self._lock:
             self._db.close()
 
     def sync(self) -> bool:
-        """Read the session folders that are new or changed, forget those that are gone; whether there were any."""
-        found = {path.name: path for path in self._folders()}
+        """Read the session folders that are new or changed, and drop those that no longer exist.
+
+        Returns whether there were any of either.
+        """
+        folders = {path.name: path for path in self._folders()}
         with self._lock:
-            known = {row["name"]: row["signature"] for row in self._db.execute("select name, signature from sessions")}
-            gone = known.keys() - found.keys()
-            changed = [name for name, path in found.items() if known.get(name) != _signature(path)]
-            for name in gone:
-                with self._transaction():
-                    self._forget(name)
-            for name in changed:
+            rows = self._db.execute("select name, signature from sessions")
+            signatures = {row["name"]: row["signature"] for row in rows}
+            obsolete = signatures.keys() - folders.keys()
+            outdated = [name for name, path in folders.items() if signatures.get(name) != _signature(path)]
+            for name in obsolete:
+                with self._db:
+                    self._delete(name)
+            for name in outdated:
                 self.refresh(name)
-        return bool(gone or changed)
+        return bool(obsolete or outdated)
 
     def refresh(self, name: str) -> None:
-        """Read one session folder anew."""
+        """Read one session folder again, whether it seems changed or not; a folder that is no session is dropped."""
         path = self.root / name
-        with self._lock, self._transaction():
-            self._forget(name)
+        with self._lock, self._db:
+            self._delete(name)
             header = _read_json(path / "session.json")
             if header is None:
                 return
             self._db.execute(
-                "insert into sessions values (?, ?, ?, ?, ?, ?)",
-                (name, header.get("rig"), header.get("created"), header.get("source"), str(path), _signature(path)),
+                "insert into sessions values (?, ?, ?, ?, ?)",
+                (name, header.get("rig"), header.get("created"), header.get("source"), _signature(path)),
             )
             for record in _captures(path):
-                self._keep(name, record)
+                self._insert(name, record)
             for run, finished_at, summary in _runs(path):
                 self._db.execute("insert into runs values (?, ?, ?, ?)", (name, run, finished_at, json.dumps(summary)))
 
     def refresh_capture(self, name: str, capture_id: str) -> dict[str, Any] | None:
-        """Read one capture's record anew and return it, None where there is none: however many captures there are."""
-        with self._lock, self._transaction():
+        """Read one capture's record again and return it, None where there is none; other captures are not read."""
+        with self._lock, self._db:
             if self._db.execute("select 1 from sessions where name = ?", (name,)).fetchone() is None:
                 self.refresh(name)
             record = _record(self.root / name / "captures" / capture_id / "capture.json")
             if record is not None:
-                self._keep(name, record)
+                self._insert(name, record)
             return record
 
     def sessions(self) -> list[dict[str, Any]]:
-        """All sessions, newest first, with the number of captures of each kind and of runs."""
+        """One dictionary for each session, newest first.
+
+        Its keys are name, rig, created, source, captures (the number of each kind) and runs (their number).
+        """
         with self._lock:
             rows = self._db.execute("select name, rig, created, source from sessions order by created desc, name desc")
             return [dict(row) | self._counts(row["name"]) for row in rows.fetchall()]
 
     def session(self, name: str) -> dict[str, Any]:
-        """One session of `sessions`."""
+        """The dictionary of one session, with the keys that `sessions` lists."""
         for session in self.sessions():
             if session["name"] == name:
                 return session
@@ -99,13 +108,13 @@ class Catalogue:
     def path(self, name: str) -> Path:
         """The folder of a session."""
         with self._lock:
-            row = self._db.execute("select path from sessions where name = ?", (name,)).fetchone()
+            row = self._db.execute("select 1 from sessions where name = ?", (name,)).fetchone()
         if row is None:
             raise KeyError(name)
-        return Path(row["path"])
+        return self.root / name
 
     def captures(self, name: str) -> list[dict[str, Any]]:
-        """The capture records of a session, in order."""
+        """The capture records of a session in order of their number; none for an unknown session."""
         query = "select record from captures where session = ? order by number"
         with self._lock:
             return [json.loads(row["record"]) for row in self._db.execute(query, (name,))]
@@ -120,7 +129,7 @@ class Catalogue:
         return dict(json.loads(row["record"]))
 
     def runs(self, name: str) -> list[dict[str, Any]]:
-        """The processing runs of a session, oldest first: run, finished_at, summary."""
+        """The processing runs of a session, oldest first: run, finished_at, summary; none for an unknown session."""
         query = "select run, finished_at, summary from runs where session = ? order by run"
         with self._lock:
             return [
@@ -128,8 +137,8 @@ class Catalogue:
                 for row in self._db.execute(query, (name,))
             ]
 
-    def live(self, name: str) -> tuple[Path, ...]:
-        """Folders of the newest steps that were processed at once, oldest first; none for an unknown session."""
+    def live_steps(self, name: str) -> tuple[Path, ...]:
+        """Result folders of the newest steps that were processed at once, oldest first; none for an unknown session."""
         try:
             return live_results(self.path(name))
         except KeyError:
@@ -141,11 +150,11 @@ class Catalogue:
         (runs,) = self._db.execute("select count(*) from runs where session = ?", (name,)).fetchone()
         return {"captures": counts, "runs": runs}
 
-    def _keep(self, name: str, record: dict[str, Any]) -> None:
+    def _insert(self, name: str, record: dict[str, Any]) -> None:
         row = (name, record["capture_id"], record.get("number", 0), record.get("kind"), json.dumps(record))
         self._db.execute("insert or replace into captures values (?, ?, ?, ?, ?)", row)
 
-    def _forget(self, name: str) -> None:
+    def _delete(self, name: str) -> None:
         self._db.execute("delete from sessions where name = ?", (name,))
         self._db.execute("delete from captures where session = ?", (name,))
         self._db.execute("delete from runs where session = ?", (name,))
@@ -156,11 +165,6 @@ class Catalogue:
                 if not path.name.startswith(".") and (path / "session.json").is_file():
                     yield path
 
-    @contextmanager
-    def _transaction(self) -> Iterator[None]:
-        with self._db:
-            yield
-
 
 def _captures(path: Path) -> Iterator[dict[str, Any]]:
     for file in (path / "captures").glob("*/capture.json"):
@@ -170,7 +174,7 @@ def _captures(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _record(file: Path) -> dict[str, Any] | None:
-    """The record of a capture; None if it is not readable or another capture's."""
+    """The record of a capture; None if it is not readable or names another capture than its folder does."""
     record = _read_json(file)
     return record if record is not None and record.get("capture_id") == file.parent.name else None
 
@@ -196,7 +200,7 @@ def _read_json(path: Path) -> dict[str, Any] | None:
 
 
 def _signature(path: Path) -> str:
-    """Changes when a capture or a run is added, or the session's header is replaced."""
+    """Text that changes when a capture or a run is added to a session folder, or its header is replaced."""
     parts = []
     for name in ("session.json", "captures", "results"):
         try:

@@ -1,1 +1,1 @@
-"""Commands of the controller."""
+"""The commands that the controller adds to ``ringdic``: demo, controller, validate, bench."""

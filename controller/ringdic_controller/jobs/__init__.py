@@ -1,1 +1,1 @@
-"""Processing jobs and the child processes that carry them out."""
+"""Processing jobs and the child processes that run them."""

@@ -1,6 +1,7 @@
-"""The processing's child processes: one for every job, or a warm one that carries out order after order.
+"""Child processes that run the processing: one for every job, or a warm one that serves order after order.
 
-A child prints lines: objects of JSON that tell of progress or of the outcome (see `ringdic.jobs.__main__`), and log.
+A child prints messages, which are JSON objects about progress, outcome or readiness (`ringdic.jobs.__main__` lists
+them), and lines of log.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _KILL_AFTER = 5.0  # seconds that a child has to end by itself
 
 @dataclass(frozen=True)
 class Order:
-    """What to process: a whole session, or with ``step`` (a capture's id) that step alone, at once."""
+    """What to process: the session in a folder or, with ``step`` (a capture's id), that step alone."""
 
     session: Path
     step: str | None = None
@@ -35,9 +36,10 @@ class Order:
 
 @dataclass(frozen=True)
 class Warmth:
-    """How ready the processing is: ``cold`` (starts with its job), ``warming``, ``ready`` or ``ended``.
+    """How ready the processing is: ``state`` is cold (starts with its job), warming, ready or ended.
 
-    compiling : the kernels are being compiled, which happens once. seconds : what warming took, None before.
+    ``compiling`` tells whether the kernels are being compiled, which happens once; ``seconds`` how long warming took,
+    s, or None before it has ended.
     """
 
     state: str
@@ -46,23 +48,23 @@ class Warmth:
 
 
 class Work(Protocol):
-    """An order being carried out."""
+    """An order in progress."""
 
     def lines(self) -> Iterator[str]:
-        """What is printed about it, to its end."""
+        """Lines that the child prints about the order, until the order ends."""
 
     def wait(self) -> int:
-        """0, or the exit code of a child that ended; after the last line."""
+        """Exit code, to be asked for after the last line; 0 of a child that goes on to live."""
 
     def end(self) -> None:
-        """Stop it with everything it started."""
+        """End the child and everything it started, at once."""
 
     def give_way(self) -> None:
-        """Ask it to stop as soon as it can without losing what it has found; it may be done before."""
+        """Ask for a stop as soon as intermediate results are safe; the order may complete before."""
 
 
 class Processing(Protocol):
-    """Carries out one order at a time. ``on_change`` is told, from any thread, that its warmth has changed."""
+    """Serves one order at a time. ``on_change`` is called, from any thread, when the warmth has changed."""
 
     on_change: Callable[[], None]
 
@@ -72,20 +74,20 @@ class Processing(Protocol):
 
     @property
     def warmth(self) -> Warmth:
-        """How ready it is."""
+        """How ready the processing is."""
 
     def warm(self) -> None:
-        """Get ready, if that can be done before there is an order."""
+        """Prepare for orders, where that is possible before the first."""
 
     def begin(self, order: Order) -> Work:
-        """Have an order carried out. OSError if no child can be started."""
+        """Start an order. Raises OSError if no child can be started."""
 
     def close(self) -> None:
         """End the children."""
 
 
 class ChildPerJob:
-    """A child of its own for every order; ``command`` makes its command line of the session's folder."""
+    """Processing with a new child for every order; ``command`` gives its command line from the session's folder."""
 
     live = False
     warmth = Warmth("cold")
@@ -95,28 +97,28 @@ class ChildPerJob:
         self.on_change: Callable[[], None] = lambda: None
 
     def warm(self) -> None:
-        """Nothing can be kept warm."""
+        """Do nothing: there is no child between orders."""
 
     def begin(self, order: Order) -> Work:
-        """Start the child."""
-        return _OwnChild(_start(self._command(order.session)))
+        """Start the order's child."""
+        return _OneOrderChild(_start(self._command(order.session)))
 
     def close(self) -> None:
-        """Nothing runs between jobs."""
+        """Do nothing: there is no child between orders."""
 
 
 class WarmChild:
-    """One child that loads kernels and keeps what it has read between the orders of a session.
+    """Processing by one child that loads the kernels once and caches what it has read between orders.
+
+    A child that ends, by itself or because its order is cancelled, is replaced at once. One that ends before it was
+    ready is replaced only for the next order.
 
     Parameters
     ----------
     command
-        Its command line; it reads orders as lines of JSON and tells when it is ready.
+        Command line of the child; it reads orders as lines of JSON and prints when it is ready.
     settings
-        A file of settings for all orders.
-
-    A child that ends, by itself or by being cancelled, is replaced; a new one that ends before it was ready is not,
-    until the next order.
+        File of settings for all orders; None for the defaults.
     """
 
     live = True
@@ -125,23 +127,23 @@ class WarmChild:
         self._command = list(command)
         self._settings = settings
         self.on_change: Callable[[], None] = lambda: None
-        self._lock = Lock()
+        self._lock = Lock()  # guards the two below: one child at a time, and none after close
         self._child: _ServingChild | None = None
         self._closing = False
 
     @property
     def warmth(self) -> Warmth:
-        """How ready the child is."""
+        """How ready the child is; cold before the first."""
         child = self._child
         return Warmth("cold") if child is None else child.warmth
 
     def warm(self) -> None:
-        """Start the child, if there is none."""
+        """Start the child, unless one is alive."""
         with self._lock:
             self._ready_child()
 
     def begin(self, order: Order) -> Work:
-        """Hand the order to the child; a new one if it has ended."""
+        """Send the order to the child, or to a new one if it has ended. Raises OSError if none can be started."""
         with self._lock:
             child = self._ready_child()
         settings = None if self._settings is None else str(self._settings)
@@ -168,8 +170,8 @@ class WarmChild:
         self.on_change()
 
 
-class _OwnChild:
-    """A child whose life is one order."""
+class _OneOrderChild:
+    """A child that ends with its order."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
@@ -184,19 +186,19 @@ class _OwnChild:
         _end(self._process)
 
     def give_way(self) -> None:
-        """It would lose everything; let it finish."""
+        """Do nothing: a child that ends with its order would lose all intermediate results."""
 
 
 class _ServingChild:
-    """A warm child: its process, what it says, and the order it carries out."""
+    """A warm child process: its warmth, and the order that it serves."""
 
     def __init__(self, command: list[str], on_change: Callable[[_ServingChild], None]) -> None:
         self._process = _start(command, orders=True)
         self._on_change = on_change
-        self._lock = Lock()
-        self._work: _Served | None = None
+        self._lock = Lock()  # guards the work, its number and the child's input; never held while on_change is called
+        self._work: _ServedWork | None = None
         self._number = 0
-        self.warmth = Warmth("warming")
+        self.warmth = Warmth("warming")  # this and the next are written by the following thread alone
         self.has_been_ready = False
         Thread(target=self._follow, name="processing", daemon=True).start()
 
@@ -204,15 +206,19 @@ class _ServingChild:
     def ended(self) -> bool:
         return self.warmth.state == "ended" or self._process.poll() is not None
 
-    def take(self, order: dict[str, Any]) -> _Served:
+    def take(self, order: dict[str, Any]) -> _ServedWork:
         with self._lock:
             self._number += 1
-            work = self._work = _Served(self, self._number)
-        self.tell({**order, "order": work.number})
+            work = _ServedWork(self, self._number)
+            if self.warmth.state == "ended":  # nobody follows the child any more
+                work.put(None)
+            else:
+                self._work = work
+        self.send({**order, "order": work.number})
         return work
 
-    def tell(self, message: dict[str, Any]) -> None:
-        """Write a line to the child; one that has ended will be noticed by whoever follows it."""
+    def send(self, message: dict[str, Any]) -> None:
+        """Write a line to the child; if it has ended, that is noticed by the thread that follows its output."""
         assert self._process.stdin is not None
         with self._lock, suppress(OSError, ValueError):
             self._process.stdin.write(json.dumps(message) + "\n")
@@ -225,18 +231,18 @@ class _ServingChild:
         return self._process.wait()
 
     def _follow(self) -> None:
-        """Pass its lines on to the order that they belong to."""
+        """Pass the child's lines on to the order that they belong to, until the child ends."""
         for line in _lines(self._process):
-            said = message_of(line)
-            if said is not None and "worker" in said:
-                self._tell_warmth(said)
+            message = message_of(line)
+            if message is not None and "worker" in message:
+                self._note_warmth(message)
                 continue
             with self._lock:
                 work = self._work
-                if work is not None and said is not None and "state" in said:
+                if work is not None and message is not None and "state" in message:
                     self._work = None
             if work is not None:
-                work.say(line)
+                work.put(line)
             elif line.strip():
                 logger.info("processing: %s", line.rstrip())
         self._process.wait()
@@ -244,48 +250,49 @@ class _ServingChild:
             self.warmth, work = Warmth("ended"), self._work
             self._work = None
         if work is not None:
-            work.say(None)
+            work.put(None)
         self._on_change(self)
 
-    def _tell_warmth(self, said: dict[str, Any]) -> None:
-        took = said.get("seconds", self.warmth.seconds)
-        self.warmth = Warmth(str(said["worker"]), bool(said.get("compiling", False)), took)
+    def _note_warmth(self, message: dict[str, Any]) -> None:
+        seconds = message.get("seconds", self.warmth.seconds)
+        self.warmth = Warmth(str(message["worker"]), bool(message.get("compiling", False)), seconds)
         self.has_been_ready = self.has_been_ready or self.warmth.state == "ready"
         self._on_change(self)
 
 
-class _Served:
+class _ServedWork:
     """One order of a warm child."""
 
     def __init__(self, child: _ServingChild, number: int) -> None:
         self.number = number
         self._child = child
         self._lines: SimpleQueue[str | None] = SimpleQueue()
-        self._done = False
+        self._complete = False
 
-    def say(self, line: str | None) -> None:
+    def put(self, line: str | None) -> None:
+        """Add a line about the order; None when the child has ended."""
         self._lines.put(line)
 
     def lines(self) -> Iterator[str]:
         while (line := self._lines.get()) is not None:
             yield line
-            said = message_of(line)
-            if said is not None and "state" in said:
-                self._done = True
+            message = message_of(line)
+            if message is not None and "state" in message:
+                self._complete = True
                 return
 
     def wait(self) -> int:
-        return 0 if self._done else self._child.wait()
+        return 0 if self._complete else self._child.wait()
 
     def end(self) -> None:
         self._child.end()
 
     def give_way(self) -> None:
-        self._child.tell({"stop": self.number})
+        self._child.send({"stop": self.number})
 
 
 def message_of(line: str) -> dict[str, Any] | None:
-    """The JSON object of a line about progress, outcome or warmth; None for a line of log."""
+    """The message in a line, a JSON object about progress, outcome or warmth; None for a line of log."""
     if not line.startswith("{"):
         return None
     try:
@@ -297,7 +304,7 @@ def message_of(line: str) -> dict[str, Any] | None:
 
 
 def serving_command() -> list[str]:
-    """The command of a warm child of this interpreter."""
+    """Command line of a warm child that runs this interpreter."""
     return [sys.executable, "-P", "-m", "ringdic.jobs", "--serve"]
 
 
@@ -316,7 +323,7 @@ def _start(command: list[str], orders: bool = False) -> subprocess.Popen[str]:
 
 
 def _lines(child: subprocess.Popen[str]) -> Iterator[str]:
-    """The child's lines until it has ended, even if a grandchild keeps the pipe open."""
+    """Lines that the child prints until it has ended, even if a grandchild keeps the pipe open."""
     lines: SimpleQueue[str | None] = SimpleQueue()
 
     def read() -> None:
@@ -340,7 +347,7 @@ def _lines(child: subprocess.Popen[str]) -> Iterator[str]:
 
 
 def _end(child: subprocess.Popen[str]) -> None:
-    """Ask the child and everything it started to end; insist after a while."""
+    """Ask the child and everything it started to end; kill them if they have not after some seconds."""
     _signal(child, signal.SIGTERM)
     try:
         child.wait(_KILL_AFTER)

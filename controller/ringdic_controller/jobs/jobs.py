@@ -1,14 +1,14 @@
-"""Processing jobs: one at a time, in child processes, with their progress read line by line and their log kept.
+"""Queue of processing jobs: one runs at a time, in a child process; its progress, outcome and log are recorded.
 
-::
+States of a job::
 
     queued → running → done | failed | cancelled
-    queued → superseded (a newer capture of the same session) | cancelled
-    running → queued (a whole session gives way to a single step, and goes on from what it has found)
+    queued → superseded (a newer capture of this session has a job) | cancelled
+    running → queued (a whole session gives way to a single step; it resumes later from its cached results)
 
-The child prints JSON lines: progress ``{"stage", "done", "rate", "left_s", "message"}`` and at the end
+The child process prints JSON lines: progress ``{"stage", "done", "rate", "left_s", "message"}`` and at the end
 ``{"state": "done", "run", "summary"}``, ``{"state": "failed", "error"}`` or ``{"state": "stopped"}``. Every other
-line is log, and so is the begin of every stage.
+line goes to the log, and so does the start of every stage.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from queue import SimpleQueue
 from shutil import rmtree
 from threading import Condition, Thread
-from typing import Any
+from typing import Any, TextIO
 
 from ringdic_controller.jobs.children import ChildPerJob, Command, Order, Processing, Work, message_of
 
@@ -30,14 +31,15 @@ logger = logging.getLogger(__name__)
 
 FINISHED = ("done", "failed", "cancelled", "superseded")
 _PROGRESS = ("stage", "done", "rate", "left_s", "message")
-_NOTICE_EVERY = 0.2  # seconds between two notices of progress alone
+_PROGRESS_INTERVAL = 0.2  # seconds between two reports of progress within a stage
 
 
 @dataclass(frozen=True)
 class Job:
-    """One processing of one session, or with ``step`` (a capture's id) of that step alone, at once.
+    """Processing of one session or, with ``step`` (a capture's id), of that step alone as soon as it is captured.
 
-    ``done`` is the share of the work, 0 … 1; ``left_s`` an estimate or None; ``run`` the number of the run it made.
+    ``done`` is the completed share of the work, 0 … 1; ``left_s`` the estimated remaining time, s, or None; ``run`` the
+    number of the run that was written; ``reason`` the capture that caused the job, or "asked for".
     """
 
     id: str
@@ -59,23 +61,23 @@ class Job:
 
     @property
     def finished(self) -> bool:
-        """Nothing about it will change any more."""
+        """Whether the job has reached a final state."""
         return self.state in FINISHED
 
 
 class Jobs:
-    """The queue of jobs and the thread that works it off.
+    """Job queue with the thread that runs the jobs; safe to use from several threads.
+
+    Single steps run before whole sessions, which give way to them; otherwise jobs run in the order of submission.
 
     Parameters
     ----------
     folder
-        Where each job keeps its record and log.
+        Receives a subfolder with record and log for each job.
     processing
-        What carries out the jobs; or from a session folder to the command line of a child of its own for each.
+        Runs the jobs; or a function from a session folder to the command line of a child process for each job.
     on_change
-        Told of every change, from the working thread.
-
-    Single steps come before whole sessions, which give way to them; the rest in the order of their submission.
+        Called with the job after every change, in the order of the changes, from one thread and with no lock held.
     """
 
     def __init__(
@@ -84,47 +86,54 @@ class Jobs:
         self._folder = Path(folder)
         self._processing: Processing = ChildPerJob(processing) if callable(processing) else processing
         self._on_change = on_change
+        # Guards the five attributes below and the job folders. Neither on_change nor the processing is called with it
+        # held. Whoever waits for a change of the queue waits on it.
+        self._lock = Condition()
         self._jobs: dict[str, Job] = {}
         self._paths: dict[str, Path] = {}
-        self._due: dict[str, float] = {}  # when a queued job may begin, s
-        self._work_now: Work | None = None
-        self._changed = Condition()
+        self._due: dict[str, float] = {}  # earliest start of a queued job, s of the monotonic clock
+        self._current_work: Work | None = None
         self._closing = False
-        self._noticed = 0.0  # when progress was last told, s
+        self._changes: SimpleQueue[Job | None] = SimpleQueue()  # filled with the lock held: in the order of the changes
+        self._progress_time = 0.0  # of the last progress reported, s of the monotonic clock; the worker's alone
         self._load()
         self._worker = Thread(target=self._work, name="jobs", daemon=True)
+        self._reporter = Thread(target=self._report, name="job-changes", daemon=True)
         self._worker.start()
+        self._reporter.start()
 
     def close(self, timeout: float = 10.0) -> None:
-        """Cancel what runs, end the thread and the children."""
-        with self._changed:
+        """Cancel the running job, end its child process and both threads; wait at most ``timeout`` s for each."""
+        with self._lock:
             self._closing = True
             for job in [job for job in self._jobs.values() if job.state == "running"]:
                 self._update(job.id, state="cancelled", finished_at=_now(), left_s=None)
-            work = self._work_now
-            self._changed.notify_all()
+            work = self._current_work
+            self._lock.notify_all()
         self._processing.close()
         if work is not None:
             work.end()
         self._worker.join(timeout)
+        self._changes.put(None)
+        self._reporter.join(timeout)
 
     @property
     def processing(self) -> Processing:
-        """What carries out the jobs."""
+        """What runs the jobs."""
         return self._processing
 
     def list(self) -> list[Job]:
         """All jobs, newest first."""
-        with self._changed:
+        with self._lock:
             return sorted(self._jobs.values(), key=lambda job: job.id, reverse=True)
 
     def get(self, job_id: str) -> Job:
-        """One job; KeyError if there is none."""
-        with self._changed:
+        """The job of this id. Raises KeyError if there is none."""
+        with self._lock:
             return self._jobs[job_id]
 
     def log(self, job_id: str, limit: int = 256_000) -> str:
-        """The end of a job's log, at most ``limit`` bytes."""
+        """The last ``limit`` bytes of a job's log. Raises KeyError if there is no such job."""
         self.get(job_id)
         path = self._folder / job_id / "log.txt"
         try:
@@ -144,12 +153,25 @@ class Jobs:
         step: str | None = None,
         after: float = 0.0,
     ) -> Job:
-        """Queue a job, to be begun after so many seconds at the soonest.
+        """Queue a job and return it.
 
-        It takes the place of a queued automatic job of the same session and kind (a step or the whole).
-        A job of a step is kept until the session's next one.
+        The job supersedes a queued automatic job of this session that also is of a step, or also of the whole
+        session. A step's finished job is deleted when the session's next step is queued.
+
+        Parameters
+        ----------
+        session, path
+            Name and folder of the session.
+        reason
+            The capture that caused the job, or "asked for".
+        automatic
+            Whether a capture caused it; only automatic jobs are superseded.
+        step
+            Id of the capture to process alone; None for the whole session.
+        after
+            Seconds before the job may start.
         """
-        with self._changed:
+        with self._lock:
             alike = [
                 job
                 for job in self._jobs.values()
@@ -158,46 +180,50 @@ class Jobs:
             job = Job(self._new_id(), session, reason, automatic, _now(), step=step)
             if after > 0:
                 job = replace(job, message=f"begins {after:.0f} s after the last capture")
-            self._jobs[job.id], self._paths[job.id] = job, Path(path)
-            self._due[job.id] = time.monotonic() + after
-            self._keep(job)
+            self._paths[job.id], self._due[job.id] = Path(path), time.monotonic() + after
+            self._store(job)
             for old in alike:
                 if old.state == "queued":
                     self._update(old.id, state="superseded", finished_at=_now(), message=f"replaced by job {job.id}")
                 elif step is not None and old.finished:
-                    self._forget(old.id)
-            if step is not None:
-                self._make_way()
-            self._changed.notify_all()
-        self._on_change(job)
+                    self._delete(old.id)
+            work = self._current_work if step is not None and self._session_is_running() else None
+        if work is not None:
+            work.give_way()
         return job
 
     def cancel(self, job_id: str) -> Job:
-        """Stop a job, queued or running; a finished one stays as it is. KeyError if there is none."""
-        with self._changed:
+        """Cancel a queued or running job; a finished one is returned unchanged. Raises KeyError if there is none."""
+        with self._lock:
             job = self._jobs[job_id]
-            if job.state == "queued":
-                return self._update(job_id, state="cancelled", finished_at=_now())
-            if job.state != "running":
+            if job.finished:
                 return job
+            work = self._current_work if job.state == "running" else None
             job = self._update(job_id, state="cancelled", finished_at=_now(), left_s=None)
-            work = self._work_now
         if work is not None:
             work.end()
         return job
 
     def wait(self, job_id: str, timeout: float) -> Job:
-        """The job once it has finished; TimeoutError after ``timeout`` seconds."""
-        with self._changed:
-            if not self._changed.wait_for(lambda: self._jobs[job_id].finished, timeout):
+        """Wait until a job has finished and return it. Raises TimeoutError after ``timeout`` seconds."""
+        with self._lock:
+            if not self._lock.wait_for(lambda: self._jobs[job_id].finished, timeout):
                 raise TimeoutError(f"job {job_id} is still {self._jobs[job_id].state} after {timeout} s")
             return self._jobs[job_id]
 
+    # The two threads
+
+    def _report(self) -> None:
+        """Pass every change on, until the queue of changes is closed."""
+        while (job := self._changes.get()) is not None:
+            self._on_change(job)
+
     def _work(self) -> None:
+        """Run the queued jobs one after the other, until the queue of jobs is closed."""
         while True:
-            with self._changed:
+            with self._lock:
                 while not self._closing and self._next() is None:
-                    self._changed.wait(self._until_due())
+                    self._lock.wait(self._until_due())
                 if self._closing:
                     return
                 job = self._next()
@@ -210,51 +236,58 @@ class Jobs:
                 self._finish(job.id, state="failed", error=f"The processing could not be started: {error}")
 
     def _run(self, job: Job) -> None:
-        """Have it carried out, follow the lines to the end, settle how it went."""
+        """Start the processing of a job, follow its lines to the end and settle the outcome."""
         with (self._folder / job.id / "log.txt").open("a", encoding="utf-8") as log:
             work = self._processing.begin(Order(self._paths[job.id], job.step))
-            with self._changed:
-                self._work_now = work
+            with self._lock:
+                self._current_work = work
                 cancelled = self._jobs[job.id].finished
-                if job.step is None and any(other.step and other.state == "queued" for other in self._jobs.values()):
-                    work.give_way()
+                step_waits = any(other.step and other.state == "queued" for other in self._jobs.values())
             if cancelled:
                 work.end()
-            outcome: dict[str, Any] = {}
-            told = ""
-            for line in work.lines():
-                message = message_of(line)
-                if message is None:
-                    log.write(line)
-                elif "state" in message:
-                    outcome = message
-                else:
-                    self._progress(job.id, message)
-                    step = f"{message.get('stage', '')} {message.get('message', '')}".rstrip()
-                    if step != told:
-                        log.write(f"{datetime.now():%H:%M:%S} {step}\n")
-                        told = step
-                log.flush()
+            elif job.step is None and step_waits:
+                work.give_way()
+            outcome = self._follow(job.id, work, log)
             if outcome.get("error"):
                 log.write(f"{datetime.now():%H:%M:%S} failed: {outcome['error']}\n")
             code = work.wait()
-            with self._changed:
-                self._work_now = None
+            with self._lock:
+                self._current_work = None
         self._settle(job.id, code, outcome)
 
+    def _follow(self, job_id: str, work: Work, log: TextIO) -> dict[str, Any]:
+        """Record progress and log until the work ends; return its last message about a state, {} without one."""
+        outcome: dict[str, Any] = {}
+        last_stage = ""
+        for line in work.lines():
+            message = message_of(line)
+            if message is None:
+                log.write(line)
+            elif "state" in message:
+                outcome = message
+            else:
+                self._progress(job_id, message)
+                stage = f"{message.get('stage', '')} {message.get('message', '')}".rstrip()
+                if stage != last_stage:
+                    log.write(f"{datetime.now():%H:%M:%S} {stage}\n")
+                    last_stage = stage
+            log.flush()
+        return outcome
+
     def _settle(self, job_id: str, code: int, outcome: dict[str, Any]) -> None:
+        """Set the state that follows from the exit code of the processing and its last message."""
         state = outcome.get("state")
         if code == 0 and state == "done":
             self._finish(job_id, state="done", done=1.0, run=outcome.get("run"), message="")
         elif code == 0 and state == "stopped":
-            self._wait_again(job_id)
+            self._queue_again(job_id)
         else:
             sentence = outcome.get("error") or f"The processing ended with exit code {code}; see its log."
             self._finish(job_id, state="failed", error=str(sentence))
 
-    def _wait_again(self, job_id: str) -> None:
-        """Queue a job once more that gave way, unless a newer capture's job waits in its place."""
-        with self._changed:
+    def _queue_again(self, job_id: str) -> None:
+        """Queue a job once more that gave way; it is superseded if a newer capture's job waits for this session."""
+        with self._lock:
             job = self._jobs[job_id]
             if job.finished:  # it was cancelled meanwhile
                 return
@@ -270,55 +303,63 @@ class Jobs:
             else:
                 self._update(job_id, state="queued", stage="", left_s=None, message="gave way to a newer step")
 
-    def _make_way(self) -> None:
-        """Ask the whole session that is being processed to stop; a step comes first."""
-        running = [job for job in self._jobs.values() if job.state == "running" and job.step is None]
-        if running and self._work_now is not None:
-            self._work_now.give_way()
-
     def _finish(self, job_id: str, **changes: Any) -> None:
-        with self._changed:
-            if not self._jobs[job_id].finished:  # a cancelled job stays cancelled
+        """Set a final state, unless the job has one: a cancelled job stays cancelled."""
+        with self._lock:
+            if not self._jobs[job_id].finished:
                 self._update(job_id, finished_at=_now(), left_s=None, **changes)
-            self._changed.notify_all()
 
     def _progress(self, job_id: str, message: dict[str, Any]) -> None:
-        with self._changed:
+        """Take over a message of progress; it is reported only now and then, and not written to disk."""
+        with self._lock:
             job = self._jobs[job_id]
             if job.finished:
                 return
-            known = {name: message[name] for name in _PROGRESS if name in message}
-            self._jobs[job_id] = moved = replace(job, **known)
-        now = time.monotonic()
-        if moved.stage != job.stage or now - self._noticed > _NOTICE_EVERY:
-            self._noticed = now
-            self._on_change(moved)
+            changed = replace(job, **{name: message[name] for name in _PROGRESS if name in message})
+            self._jobs[job_id] = changed
+            now = time.monotonic()
+            if changed.stage != job.stage or now - self._progress_time > _PROGRESS_INTERVAL:
+                self._progress_time = now
+                self._changes.put(changed)
+
+    # With the lock held
 
     def _update(self, job_id: str, **changes: Any) -> Job:
-        job = self._jobs[job_id] = replace(self._jobs[job_id], **changes)
-        self._keep(job)
-        self._changed.notify_all()
-        self._on_change(job)
+        job = replace(self._jobs[job_id], **changes)
+        self._store(job)
         return job
 
+    def _store(self, job: Job) -> None:
+        """Put a new or changed job into the list and on disk, wake whoever waits, and have the change reported."""
+        self._jobs[job.id] = job
+        self._write(job)
+        self._lock.notify_all()
+        self._changes.put(job)
+
     def _next(self) -> Job | None:
-        """The job to begin now: a step before a whole session, the older first."""
+        """The job to start now: a step before a whole session, the older first; None if nothing is due."""
         due = [job for job in self._jobs.values() if job.state == "queued" and self._due[job.id] <= time.monotonic()]
         return min(due, key=lambda job: (job.step is None, job.id), default=None)
 
     def _until_due(self) -> float | None:
-        """Seconds until the next job may begin; None if nothing waits."""
-        waiting = [self._due[job.id] for job in self._jobs.values() if job.state == "queued"]
-        return max(0.0, min(waiting) - time.monotonic()) if waiting else None
+        """Seconds until the next queued job may start; None if none is queued."""
+        times = [self._due[job.id] for job in self._jobs.values() if job.state == "queued"]
+        return max(0.0, min(times) - time.monotonic()) if times else None
 
-    def _forget(self, job_id: str) -> None:
-        del self._jobs[job_id]
+    def _session_is_running(self) -> bool:
+        """Whether the running job processes a whole session."""
+        return any(job.state == "running" and job.step is None for job in self._jobs.values())
+
+    def _delete(self, job_id: str) -> None:
+        for by_id in (self._jobs, self._paths, self._due):
+            by_id.pop(job_id, None)
         rmtree(self._folder / job_id, ignore_errors=True)
 
     def _new_id(self) -> str:
         return f"{1 + max((int(name) for name in self._jobs), default=0):04d}"
 
-    def _keep(self, job: Job) -> None:
+    def _write(self, job: Job) -> None:
+        """Replace a job's record on disk as a whole."""
         folder = self._folder / job.id
         folder.mkdir(parents=True, exist_ok=True)
         partial = folder / "job.json.partial"
@@ -326,7 +367,7 @@ class Jobs:
         partial.replace(folder / "job.json")
 
     def _load(self) -> None:
-        """Earlier jobs; what was not finished when the controller ended has failed."""
+        """Read the jobs of earlier runs of the controller; those that it left unfinished become failed."""
         for path in sorted(self._folder.glob("[0-9]*/job.json")):
             try:
                 job = Job(**json.loads(path.read_text(encoding="utf-8")))
@@ -336,7 +377,7 @@ class Jobs:
             if not job.finished:
                 sentence = "The controller ended before this job did; start it again."
                 job = replace(job, state="failed", error=sentence, finished_at=_now(), left_s=None)
-                self._keep(job)
+                self._write(job)
             self._jobs[job.id] = job
 
 

@@ -11,8 +11,9 @@ from fastapi.staticfiles import StaticFiles
 from ringdic.errors import RingdicError
 from starlette.types import Scope
 
-from ringdic_controller.service.desk import Desk, NotFoundError, RefusedError
-from ringdic_controller.service.routes import captures, jobs, live, newest, results, rig, sessions
+from ringdic_controller.service.desk import Desk
+from ringdic_controller.service.refusals import NotFoundError, RefusedError
+from ringdic_controller.service.routes import captures, events, jobs, live_step, results, rig, sessions
 
 STATIC = Path(__file__).parents[1] / "web" / "static"
 _NO_PAGE = (
@@ -23,7 +24,15 @@ _NO_PAGE = (
 
 
 def create_app(desk: Desk, static: Path = STATIC) -> FastAPI:
-    """The application over a desk. ``static`` is the folder of the bundled page."""
+    """The application that serves a desk and the bundled page.
+
+    Parameters
+    ----------
+    desk
+        Answers the requests.
+    static
+        Folder of the page's files.
+    """
     app = FastAPI(
         title="RingDIC controller",
         version="1",
@@ -34,7 +43,7 @@ def create_app(desk: Desk, static: Path = STATIC) -> FastAPI:
     )
     app.state.desk = desk
     api = APIRouter(prefix="/api/v1", responses={404: {"description": "Not there"}, 409: {"description": "Refused"}})
-    for resource in (rig, sessions, captures, jobs, results, newest, live):
+    for resource in (rig, sessions, captures, jobs, results, live_step, events):
         api.include_router(resource.router)
     app.include_router(api)
     _answer_errors(app)
@@ -43,7 +52,7 @@ def create_app(desk: Desk, static: Path = STATIC) -> FastAPI:
 
 
 def _answer_errors(app: FastAPI) -> None:
-    """Every failure that a caller can mend is one sentence."""
+    """Answer every failure that a client can mend with a status and one sentence."""
 
     def answer(status: int, sentence: str) -> JSONResponse:
         return JSONResponse({"detail": sentence}, status)
@@ -66,8 +75,8 @@ def _answer_errors(app: FastAPI) -> None:
         return answer(422, "The request is not understood: " + "; ".join(faults))
 
 
-class _Hashed(StaticFiles):
-    """Files whose names change with their contents."""
+class _HashedFiles(StaticFiles):
+    """Files whose names contain a hash of their contents, so that clients may keep them for ever."""
 
     async def get_response(self, path: str, scope: Scope) -> Response:
         response = await super().get_response(path, scope)
@@ -85,4 +94,4 @@ def _serve_page(app: FastAPI, static: Path) -> None:
             return HTMLResponse(_NO_PAGE, 503)
         return FileResponse(page, headers={"Cache-Control": "no-cache"})
 
-    app.mount("/assets", _Hashed(directory=static / "assets", check_dir=False), name="assets")
+    app.mount("/assets", _HashedFiles(directory=static / "assets", check_dir=False), name="assets")

@@ -1,4 +1,4 @@
-"""Live state: what changes is published from any thread and followed by any number of event streams."""
+"""Broadcast of events: published from any thread, followed by any number of HTTP event streams."""
 
 from __future__ import annotations
 
@@ -8,29 +8,34 @@ from threading import Lock
 from typing import Any
 
 Event = tuple[str, dict[str, Any]]
-BACKLOG = 200  # events a slow reader may be behind before it gets a fresh snapshot instead
+BACKLOG = 200  # events that a follower may be behind before it gets a new snapshot in their place
 
 
-class Live:
-    """A meeting point of publishers (threads) and followers (coroutines).
+class EventStream:
+    """Stream of named events from publishers (threads) to followers (coroutines).
 
-    A follower gets a snapshot at once and then every event; one that falls behind gets a new snapshot in
-    place of what it missed, so nobody ever shows a stale state and no queue grows without bound.
+    A follower gets a snapshot of the whole state at once and then every event. One that falls behind gets a new
+    snapshot in place of the events that it missed, so that it never shows an outdated state and its queue stays short.
+
+    Parameters
+    ----------
+    snapshot
+        Reads the whole state; called in a thread of its own for every follower.
     """
 
     def __init__(self, snapshot: Callable[[], dict[str, Any]]) -> None:
         self._snapshot = snapshot
+        self._lock = Lock()  # guards the set of followers
         self._followers: set[_Follower] = set()
-        self._lock = Lock()
 
     def publish(self, name: str, payload: dict[str, Any]) -> None:
-        """Tell every follower; returns at once and may be called from any thread."""
+        """Send an event to every follower; returns at once and may be called from any thread."""
         self._offer((name, payload))
 
     def publish_snapshot(self) -> None:
-        """Tell every follower the whole state anew, as it is when the follower's turn comes.
+        """Send the whole state to every follower, read when the follower's turn comes.
 
-        Taken here, it could be told after an event that is newer than it.
+        A snapshot read here could reach a follower after an event that is newer.
         """
         self._offer(None)
 
@@ -58,12 +63,14 @@ class Live:
 
 
 class _Follower:
+    """Queue of the events that one follower has still to read; None stands for a new snapshot."""
+
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._events: asyncio.Queue[Event | None] = asyncio.Queue()
 
     def offer(self, event: Event | None) -> None:
-        """An event to follow; None for a fresh snapshot."""
+        """Add an event, from any thread."""
         try:
             self._loop.call_soon_threadsafe(self._put, event)
         except RuntimeError:  # the loop has closed: nobody follows any more
@@ -77,4 +84,5 @@ class _Follower:
         self._events.put_nowait(event)
 
     async def next(self) -> Event | None:
+        """The oldest event that has not been read; waits for one."""
         return await self._events.get()

@@ -1,4 +1,4 @@
-"""The controller as a service: archive, router, jobs and the web server put together."""
+"""The running controller: archive, link to the nodes, jobs and web server, opened and closed in order."""
 
 from __future__ import annotations
 
@@ -34,10 +34,18 @@ SHUTDOWN_LIMIT = 2  # seconds; an open event stream would keep the server alive 
 def open_desk(
     config: ControllerConfig, processing: Command | Processing | None = None, timing: Timing | None = None
 ) -> Iterator[Desk]:
-    """The desk with everything behind it: archive, router and nodes if the configuration names a rig, jobs.
+    """Open the desk with all it needs: archive, jobs and, if the configuration names a rig, the link to its nodes.
 
-    ``processing`` replaces the warm child that carries out the jobs, ``timing`` the waits of a capture round. Raises
-    InputError for a bad rig.toml.
+    Parameters
+    ----------
+    config
+        The controller's configuration.
+    processing
+        Runs the jobs; None for a warm child process.
+    timing
+        Waits of a capture round; None for the usual ones.
+
+    Raises InputError for a bad rig.toml or a settings file that does not exist.
     """
     text = None
     if config.rig is not None:
@@ -58,17 +66,17 @@ def open_desk(
         cameras = [camera.id for camera in rig.cameras]
         with RigLink(
             rig.name, cameras, config.endpoint, archive, desk.on_event, timing=timing, tolerance_ns=tolerance_ns
-        ) as ring:
-            desk.connect(archive, ring)
+        ) as link:
+            desk.connect(archive, link)
             yield desk
     finally:
         desk.close()
 
 
 def serve_page(desk: Desk, config: ControllerConfig, on_ready: Callable[[str], None] | None = None) -> None:
-    """Serve the page and the HTTP interface until SIGINT or SIGTERM; ``on_ready`` is told the address.
+    """Serve the page and the HTTP interface until SIGINT or SIGTERM.
 
-    Raises InputError if the port is taken.
+    ``on_ready`` is called with the page's address. Raises InputError if the port is taken.
     """
     listener = _listen(config)
     host = f"[{config.host}]" if ":" in config.host else config.host
@@ -84,13 +92,13 @@ def serve_page(desk: Desk, config: ControllerConfig, on_ready: Callable[[str], N
 
 
 def run_controller(config: ControllerConfig, on_ready: Callable[[str], None] | None = None) -> None:
-    """Run the controller until it is told to end. Without a rig it shows the archive's sessions."""
+    """Run the controller until SIGINT or SIGTERM; ``on_ready`` is called with the page's address."""
     with open_desk(config) as desk:
         serve_page(desk, config, on_ready)
 
 
 def free_endpoint(config: ControllerConfig) -> ControllerConfig:
-    """The same configuration with a Zenoh endpoint on loopback whose port is free at this moment."""
+    """Replace a configuration's Zenoh endpoint by one on loopback whose port is free at this moment."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return replace(config, endpoint=f"tcp/127.0.0.1:{probe.getsockname()[1]}")
@@ -98,9 +106,9 @@ def free_endpoint(config: ControllerConfig) -> ControllerConfig:
 
 @contextmanager
 def _ended_by_signal(server: uvicorn.Server) -> Iterator[None]:
-    """SIGINT and SIGTERM end the server and nothing more, so that what was opened is closed in order.
+    """Let SIGINT and SIGTERM end the server and nothing more, so that what was opened is closed in order.
 
-    The server raises the signals that it caught once more when it has ended; they must not end the process then.
+    The server raises the signals that it caught again when it has ended; they must not end the process then.
     """
     if current_thread() is not main_thread():
         yield

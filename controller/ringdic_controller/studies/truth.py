@@ -1,4 +1,4 @@
-"""What was measured against what the virtual rig knows to be true: shape, displacement, stretch, coverage."""
+"""Measured results compared with the exact truth of the virtual rig: shape, displacement, stretch, coverage."""
 
 from __future__ import annotations
 
@@ -37,14 +37,16 @@ class Errors:
 
 
 def errors(results: Results, surface: Surface, steps: Sequence[int] | None = None) -> Errors:
-    """Every vertex and face against the formulas of the surface. The material point is the nearest at the reference.
+    """Errors of every vertex and triangle of the results, by the formulas of the surface.
+
+    The material point of a vertex is the point of the true reference surface nearest to it.
 
     steps : of the surface, one for each step of the results, the first 0; None if they are numbered alike.
     """
     steps = range(len(results.steps)) if steps is None else steps
     theta, z, distance = surface.material_coordinates(results.vertices_ref)
     reference = surface.position(theta, z, 0)
-    middles = face_middles(theta, z, results.faces)
+    middles = face_centroids(theta, z, results.faces)
     displacement, stretches = np.empty((len(steps), len(theta), 3)), np.empty((len(steps), len(results.faces), 2))
     for k, step in enumerate(steps):
         moved = surface.position(theta, z, step) - reference
@@ -55,8 +57,11 @@ def errors(results: Results, surface: Surface, steps: Sequence[int] | None = Non
     return Errors(theta, z, distance, displacement, stretches)
 
 
-def face_middles(theta: Floats, z: Floats, faces: NDArray[np.integer]) -> tuple[Floats, Floats]:
-    """Material coordinates of the middles of triangles (M, 3), (M,) rad and (M,) mm; a triangle may span the seam."""
+def face_centroids(theta: Floats, z: Floats, faces: NDArray[np.integer]) -> tuple[Floats, Floats]:
+    """Material coordinates of the centroids of triangles, theta (M,) rad and z (M,) mm.
+
+    theta, z : (N,) rad and mm, of the vertices. faces : (M, 3); a triangle may span the seam at theta = 0.
+    """
     corners = theta[faces]
     corners = corners[:, :1] + np.mod(corners - corners[:, :1] + np.pi, TURN) - np.pi
     return corners.mean(axis=1), z[faces].mean(axis=1)
@@ -76,7 +81,7 @@ class SurfaceGrid:
 
     @classmethod
     def of(cls, specimen: Specimen) -> SurfaceGrid:
-        """Cells of about half a millimetre."""
+        """The grid over the speckled band of a specimen, in cells of about half a millimetre."""
         low, high = specimen.band
         across, along = round(TURN * 57.0 / _CELL), round((high - low) / _CELL)
         theta, z = np.meshgrid(
@@ -87,10 +92,10 @@ class SurfaceGrid:
         return cls(specimen, theta, z, area * TURN / across * (high - low) / along)
 
     def views(self, cameras: Sequence[VirtualCamera], incidence_deg: float = 60.0) -> tuple[Mask, Mask]:
-        """Which cameras see each cell, at the specimen's step, more upright than an angle and inside their image.
+        """Which cameras see each cell at the specimen's step, inside their image and below an angle of incidence.
 
-        Returns (C, rows, columns) twice: whether it is seen, and whether nothing spoils that view: no bar, no
-        reflection, and the speckles are there.
+        Returns two arrays (C, rows, columns) of bool: whether a camera sees the cell, and whether nothing spoils that
+        view (no bar, no reflection, no worn speckles).
         """
         step, damage = self.specimen.step, self.specimen.damage
         xyz = self.specimen.surface.position(self.theta, self.z, step).reshape(-1, 3)
@@ -111,7 +116,10 @@ class SurfaceGrid:
         return seen.reshape(-1, *self.theta.shape), clean.reshape(-1, *self.theta.shape)
 
     def covered(self, theta: Floats, z: Floats, faces: NDArray[np.integer]) -> Mask:
-        """Which cells lie under triangles (M, 3) between vertices at material coordinates (N,)."""
+        """Which cells lie under the triangles of a mesh, (rows, columns) bool.
+
+        theta, z : (N,) rad and mm, material coordinates of the vertices. faces : (M, 3).
+        """
         picture = np.zeros(self.theta.shape, np.uint8)
         rows, columns = len(self.z), len(self.z[0])
         low, high = self.specimen.band

@@ -64,10 +64,12 @@ class Frame:
 
     @property
     def width(self) -> int:
+        """Columns of the image, px."""
         return int(self.pixels.shape[1])
 
     @property
     def height(self) -> int:
+        """Rows of the image, px."""
         return int(self.pixels.shape[0])
 
     def pgm(self) -> tuple[bytes, bytes]:
@@ -93,7 +95,8 @@ class NodeCamera(Protocol):
         """Names and versions of what the camera runs on."""
         ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Release the camera; it is not used any more."""
 
 
 def check_settings(settings: Mapping[str, Any]) -> None:

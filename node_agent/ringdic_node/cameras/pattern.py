@@ -46,25 +46,28 @@ class PatternCamera:
         self._random = np.random.default_rng([seed, zlib.crc32(camera.encode())])
 
     def lock(self, settings: Mapping[str, Any]) -> Lock:
+        """Check the settings and take them; the pattern does not depend on them."""
         check_settings(settings)
         self._exposure_us = float(settings.get("exposure_us", self._exposure_us))
         return Lock(metadata=dict(settings), sync="simulated")
 
     def capture(self, shot: Shot) -> Frame:
+        """The pattern of this capture, at the moment of the shot."""
         sleep_until(self._clock, shot.fire_at_ns)
         self._clock.sleep(self._delay)
         time_ns = shot.fire_at_ns + round(1000 * self._random.normal(0.0, self._jitter_us))
         return Frame(pattern(self.camera, shot.kind, shot.scene, *self._size), time_ns, self._exposure_us)
 
     def versions(self) -> dict[str, str]:
+        """Names and versions of what the images come from."""
         return {"camera": "pattern"}
 
     def close(self) -> None:
-        pass
+        """Nothing is held open."""
 
 
 def pattern(camera: str, kind: str, scene: int, width: int, height: int) -> npt.NDArray[np.uint8]:
-    """(height, width) uint8: a diagonal ramp x + 2 y, shifted by a checksum of camera, kind and scene."""
+    """Grey levels of a diagonal ramp x + 2 y, shifted by a checksum of camera, kind and scene, (height, width)."""
     shift = zlib.crc32(f"{camera}/{kind}/{scene}".encode())
     y, x = np.mgrid[0:height, 0:width]
     return ((x + 2 * y + shift) % 251).astype(np.uint8)

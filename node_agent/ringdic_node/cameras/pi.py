@@ -250,10 +250,12 @@ class PiCamera:
             raise CameraError(f"the camera cannot be restarted: {error}") from error
 
     def versions(self) -> dict[str, str]:
+        """Versions of picamera2, of libcamera and of the sensor as far as they are known."""
         model = self._camera.camera_properties.get("Model", "unknown")
         return {"camera": f"pi {model}", "picamera2": self._version}
 
     def close(self) -> None:
+        """Stop the stream and release the camera."""
         self._camera.stop()
         self._camera.close()
 

@@ -32,10 +32,12 @@ class PlaybackCamera:
         self._pixels = None if "{" in image else read_pgm(Path(image))
 
     def lock(self, settings: Mapping[str, Any]) -> Lock:
+        """Check the settings and take them; the files are as they are."""
         check_settings(settings)
         return Lock(metadata=dict(settings), sync="simulated")
 
     def capture(self, shot: Shot) -> Frame:
+        """The next file of this kind, at the moment of the shot. Raises CameraError when there is none."""
         pixels = self._pixels
         if pixels is None:
             pixels = read_pgm(Path(self._image.replace("{kind}", shot.kind).replace("{scene}", str(shot.scene))))
@@ -43,10 +45,11 @@ class PlaybackCamera:
         return Frame(pixels, shot.fire_at_ns)
 
     def versions(self) -> dict[str, str]:
+        """Names and versions of what the images come from."""
         return {"camera": "playback"}
 
     def close(self) -> None:
-        pass
+        """Nothing is held open."""
 
 
 def read_pgm(path: Path) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:

@@ -68,11 +68,13 @@ class VirtualNodeCamera:
         self._exposure_us = 5000.0
 
     def lock(self, settings: Mapping[str, Any]) -> Lock:
+        """Check the settings; they decide when the frame of a shot is taken."""
         check_settings(settings)
         self._exposure_us = float(settings.get("exposure_us", self._exposure_us))
         return Lock(metadata={"ExposureTime": self._exposure_us, **settings}, sync="simulated")
 
     def capture(self, shot: Shot) -> Frame:
+        """Render the scene of this shot. Raises CameraError if it cannot be rendered."""
         from ringdic_node.virtual_rig.render import render
         from ringdic_node.virtual_rig.scenes import scene
 
@@ -89,7 +91,8 @@ class VirtualNodeCamera:
         )
 
     def versions(self) -> dict[str, str]:
+        """Names and versions of what the images come from."""
         return {"camera": "virtual"}
 
     def close(self) -> None:
-        pass
+        """Nothing is held open."""

@@ -9,4 +9,5 @@ same: mm, z up the axis of the target, pixel (0, 0) at the centre of the top-lef
 ``texture``   speckles, dots and digits as distances in surface coordinates, averaged over a pixel's footprint
 ``render``    rays from pixels to surfaces
 ``sensor``    point spread, vignetting, noise, gamma, 8 bits
+``folder``    a whole measurement rendered into a folder of images: ``python -m ringdic_node.virtual_rig FOLDER``
 """

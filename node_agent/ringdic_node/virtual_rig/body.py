@@ -33,8 +33,11 @@ def _profile(theta, z):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def point(theta, z, p):  # type: ignore[no-untyped-def]
-    """Position and its derivatives: x y z, d/dtheta x y z, d/dz x y z."""
+def body_point(theta, z, p):  # type: ignore[no-untyped-def]
+    """Position of the material point (theta rad, z mm) of the body p, and its derivatives by theta and z.
+
+    Returns x y z, then d/dtheta of x y z, then d/dz of x y z; mm.
+    """
     if p[0] == CYLINDER:
         c, s = math.cos(theta), math.sin(theta)
         r = p[1]
@@ -71,7 +74,7 @@ def point(theta, z, p):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def approach(o, d, p):  # type: ignore[no-untyped-def]
-    """How near a ray o + t d comes to the limb: clearance, and theta, z, t near where it first meets the surface.
+    """How near a ray o + t d comes to the limb p: clearance, and theta, z, t near where it first meets the surface.
 
     The clearance (mm, negative inside) is the radius less the section's radius at the same angle and height, where
     that is least along the ray.
@@ -116,7 +119,7 @@ def _section(o, d, t, p):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _height_before(height, q):  # type: ignore[no-untyped-def]
-    """The z of the reference that load q lifts to this height."""
+    """The reference height z that load q moves to this height, mm."""
     z = MIDDLE + (height - MIDDLE) / (1.0 + _STRETCH * q)
     for _ in range(2):
         zeta = (z - MIDDLE) / MIDDLE
@@ -134,20 +137,23 @@ def _radius(theta, z, q):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def points(theta, z, p, out):  # type: ignore[no-untyped-def]
-    """Positions and derivatives of many points: out (n, 9)."""
+    """Positions and derivatives, as `body_point` gives them, of points theta, z (n,) of the body p: out (n, 9)."""
     for i in range(len(theta)):
-        out[i] = point(theta[i], z[i], p)
+        out[i] = body_point(theta[i], z[i], p)
 
 
 @nb.njit(cache=True, nogil=True)
 def nearest(xyz, p, out):  # type: ignore[no-untyped-def]
-    """Nearest surface points of xyz (n, 3), by Gauss-Newton: out (n, 3) theta, z, signed distance, outside positive."""
+    """Surface points of the body p nearest to points xyz (n, 3) mm, by Gauss-Newton.
+
+    out : (n, 3), theta in rad, z in mm and the signed distance in mm, positive outside.
+    """
     for i in range(len(xyz)):
         x, y, h = xyz[i]
         theta = math.atan2(y - p[3], x - p[2])
         z = h - p[4]
         for _ in range(60):
-            px, py, pz, tx, ty, tz, zx, zy, zz = point(theta, z, p)
+            px, py, pz, tx, ty, tz, zx, zy, zz = body_point(theta, z, p)
             ex, ey, ez = x - px, y - py, h - pz
             a, b, d = tx * tx + ty * ty + tz * tz, tx * zx + ty * zy + tz * zz, zx * zx + zy * zy + zz * zz
             f, g = tx * ex + ty * ey + tz * ez, zx * ex + zy * ey + zz * ez
@@ -157,7 +163,7 @@ def nearest(xyz, p, out):  # type: ignore[no-untyped-def]
             z += step_z
             if abs(step_theta) < 1e-13 and abs(step_z) < 1e-11:
                 break
-        px, py, pz, tx, ty, tz, zx, zy, zz = point(theta, z, p)
+        px, py, pz, tx, ty, tz, zx, zy, zz = body_point(theta, z, p)
         nx, ny, nz = ty * zz - tz * zy, tz * zx - tx * zz, tx * zy - ty * zx
         out[i, 0] = theta
         out[i, 1] = z

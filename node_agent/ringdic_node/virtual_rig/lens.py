@@ -1,4 +1,4 @@
-"""One simulated camera: pose, intrinsics with skew, and Brown's distortion, forwards and backwards."""
+"""One simulated camera: pose, intrinsics with skew, and Brown's distortion applied and inverted."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ringdic_node.virtual_rig.arrays import Floats
 
 @nb.njit(cache=True, nogil=True)
 def distort(x, y, lens):  # type: ignore[no-untyped-def]
-    """Ideal to distorted normalised coordinates; lens = fx fy s cx cy k1 k2 p1 p2 k3."""
+    """Distorted normalised coordinates of ideal ones x, y; lens = fx fy s cx cy k1 k2 p1 p2 k3."""
     k1, k2, p1, p2, k3 = lens[5], lens[6], lens[7], lens[8], lens[9]
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -25,9 +25,9 @@ def distort(x, y, lens):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def ideal_of_pixel(u, v, lens, x, y):  # type: ignore[no-untyped-def]
-    """Pixel to ideal normalised coordinates x, y by Newton's method from a start, and their derivatives by the pixel.
+    """Ideal normalised coordinates of the pixel (u, v), and their derivatives by the pixel, by Newton's method.
 
-    Returns x, y, dx/du, dx/dv, dy/du, dy/dv.
+    lens : fx fy s cx cy k1 k2 p1 p2 k3. x, y : start of the iteration. Returns x, y, dx/du, dx/dv, dy/du, dy/dv.
     """
     yd = (v - lens[4]) / lens[1]
     xd = (u - lens[3] - lens[2] * yd) / lens[0]
@@ -76,7 +76,7 @@ class VirtualCamera:
 
     @property
     def lens(self) -> Floats:
-        """fx fy s cx cy k1 k2 p1 p2 k3, as the kernels take them."""
+        """Parameters of lens and sensor as the kernels take them, (10,): fx fy s cx cy in px, k1 k2 p1 p2 k3."""
         K = self.K
         return np.array([K[0, 0], K[1, 1], K[0, 1], K[0, 2], K[1, 2], *self.distortion])
 
@@ -86,11 +86,11 @@ class VirtualCamera:
         return np.asarray(-self.R.T @ self.t)
 
     def project(self, xyz: Floats) -> Floats:
-        """World points (n, 3) mm to image pixels (n, 2), distortion included."""
+        """Distorted pixels (n, 2) px of points xyz (n, 3) mm in the world frame."""
         return self.project_local(np.asarray(xyz, dtype=float) @ self.R.T + self.t)
 
     def project_local(self, xyz: Floats) -> Floats:
-        """Points (n, 3) mm in the camera's own frame to image pixels (n, 2)."""
+        """Distorted pixels (n, 2) px of points xyz (n, 3) mm in the camera's own frame."""
         xd, yd = distort(xyz[..., 0] / xyz[..., 2], xyz[..., 1] / xyz[..., 2], self.lens)
         fx, fy, s, cx, cy = self.lens[:5]
         return np.stack([fx * xd + s * yd + cx, fy * yd + cy], axis=-1)

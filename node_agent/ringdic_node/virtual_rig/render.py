@@ -1,7 +1,7 @@
-"""Images of the scenes: for every sample of every pixel the ray, what it meets, and how bright that is.
+"""Images of the scenes by ray tracing: for each sample of a pixel, the surface its ray meets and its brightness.
 
-The print is averaged over a sample's footprint on the surface. A pixel that covers little of a speckled body is one
-sample, any other the mean of ``SAMPLES``² squares. Radiance is linear, 1 saturates.
+The printed pattern is averaged over the sample's footprint on the surface. A pixel whose footprint on a speckled body
+is small takes one sample, any other the mean of ``SAMPLES``² samples on a grid. Radiance is linear; 1 saturates.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic_node.virtual_rig.arrays import Radiance
-from ringdic_node.virtual_rig.body import CYLINDER, approach, point
+from ringdic_node.virtual_rig.body import CYLINDER, approach, body_point
 from ringdic_node.virtual_rig.lens import VirtualCamera, ideal_of_pixel
 from ringdic_node.virtual_rig.rig import paper_rig
 from ringdic_node.virtual_rig.scenes import BoardScene, Scene, Specimen, TargetScene
@@ -41,7 +41,7 @@ _GRAZING = 0.02  # mm, by which the estimated clearance of a ray that meets the 
 
 
 def render(camera: VirtualCamera, scene: Scene, seed: int = 0) -> NDArray[np.uint8]:
-    """The image (height, width) of a scene as a camera delivers it; ``seed`` is that of the sensor's noise."""
+    """The image of a scene as a camera delivers it: (height, width) grey levels. seed : of the sensor's noise."""
     return expose(radiance(camera, scene), seed)
 
 
@@ -53,7 +53,7 @@ def load_renderer(specimen: str = "limb") -> None:
 
 
 def radiance(camera: VirtualCamera, scene: Scene) -> Radiance:
-    """The noise-free image (height, width) of a scene behind the lens, in linear light."""
+    """The noise-free image (height, width) of a scene behind the lens, in linear light where 1 saturates (no unit)."""
     out = np.zeros((camera.height, camera.width), np.float32)
     if isinstance(scene, BoardScene):
         R, t = scene.pose(camera)
@@ -86,7 +86,10 @@ def _widest(scene: Specimen | TargetScene) -> float:
 
 @nb.njit(nogil=True)
 def _background(o, d, per):  # type: ignore[no-untyped-def]
-    """A dark room with rings of LED strips at the cameras' radius. per : width of a pixel at distance 1."""
+    """Radiance of the background: a dark room with rings of LED strips at the cameras' radius.
+
+    per : width of a pixel at distance 1.
+    """
     a = d[0] * d[0] + d[1] * d[1]
     b = o[0] * d[0] + o[1] * d[1]
     c = o[0] * o[0] + o[1] * o[1] - 380.0 * 380.0
@@ -155,7 +158,7 @@ def _corrected(o, d, frame, theta, z, t):  # type: ignore[no-untyped-def]
 @nb.njit(nogil=True)
 def _place(theta, z, p, frame):  # type: ignore[no-untyped-def]
     """The body's place and tangents at theta, z, written to frame: x y z, d/dtheta x y z, d/dz x y z."""
-    values = point(theta, z, p)
+    values = body_point(theta, z, p)
     for i in range(9):
         frame[i] = values[i]
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ringdic_node.virtual_rig.arrays import Image, Radiance
 
 FULL_WELL = 4500.0  # electrons at radiance 1
 READ_NOISE = 3.0  # electrons
@@ -11,23 +12,28 @@ POINT_SPREAD = 0.6  # px, standard deviation of the Gaussian point spread
 _VIGNETTING = 0.18  # loss in the corners
 
 
-def expose(radiance: NDArray[np.float32], seed: int) -> NDArray[np.uint8]:
-    """Grey levels (height, width), sRGB-coded, of a linear image (height, width) behind the lens; the same for the
-    same seed."""
+def expose(radiance: Radiance, seed: int) -> Image:
+    """Grey levels (height, width) of the light that falls on the sensor: vignetting, noise, sRGB coding, 8 bits.
+
+    radiance : (height, width), linear, 1 saturates. seed : of the noise; equal seeds give equal images.
+    """
     light = _vignetted(radiance)
     noise = np.random.default_rng([seed, 4500]).standard_normal(light.shape, dtype=np.float32)
     electrons = np.minimum(light, 1.0) * np.float32(FULL_WELL)
     electrons += noise * np.sqrt(np.maximum(electrons, 0.0) + np.float32(READ_NOISE**2))
-    return np.rint(255.0 * quantise(np.clip(electrons / np.float32(FULL_WELL), 0.0, 1.0))).astype(np.uint8)
+    return np.rint(255.0 * srgb_coded(np.clip(electrons / np.float32(FULL_WELL), 0.0, 1.0))).astype(np.uint8)
 
 
-def quantise(linear: NDArray[np.float32]) -> NDArray[np.float32]:
-    """sRGB coding of linear light 0 … 1 (IEC 61966-2-1)."""
+def srgb_coded(linear: Radiance) -> Radiance:
+    """Values 0 to 1 coded as sRGB from linear light 0 to 1, of any shape (..., ) (IEC 61966-2-1)."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 
-def blurred(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The point spread as two passes of a sampled Gaussian, mirrored at the rim."""
+def blurred(image: Radiance) -> Radiance:
+    """The image (height, width), linear light where 1 saturates (no unit), after the lens's point spread.
+
+    Two passes of a sampled Gaussian; the image is mirrored at its rim.
+    """
     reach = 3
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / POINT_SPREAD) ** 2)
     taps = (taps / taps.sum()).astype(np.float32)
@@ -40,7 +46,7 @@ def blurred(image: NDArray[np.float32]) -> NDArray[np.float32]:
     return image
 
 
-def _vignetted(image: NDArray[np.float32]) -> NDArray[np.float32]:
+def _vignetted(image: Radiance) -> Radiance:
     height, width = image.shape
     y = (np.arange(height, dtype=np.float32) / (height - 1) - 0.5)[:, None]
     x = (np.arange(width, dtype=np.float32) / (width - 1) - 0.5)[None, :]

@@ -87,9 +87,9 @@ def _spot(x, y, radius, ds, dz):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def speckle(s, z, ds, dz, seed):  # type: ignore[no-untyped-def]
-    """Dark share of a random pattern of disks of 1.0 … 1.6 mm on a jittered grid, seamless round the body.
+    """Dark share at arc s, height z (mm) of random disks of 1.0 … 1.6 mm on a jittered grid, seamless round the body.
 
-    ds, dz : mm, standard deviations along s and z of the Gaussian that it is seen through.
+    seed : of the pattern. ds, dz : mm, standard deviations along s and z of the Gaussian that it is seen through.
     """
     ci, cj = math.floor(s / _CELL), math.floor(z / _CELL)
     reach = 0.8 + 0.35 * _CELL + 5.0 * max(ds, dz)  # largest radius, largest displacement, rim of the Gaussian
@@ -142,8 +142,9 @@ def _digit(a, b, number, ws, wz):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def dots(s, z, ws, wz, prints):  # type: ignore[no-untyped-def]
-    """Dark share of the target's print: squares, column numbers above the top row, one disk as a mark.
+    """Dark share of the target's print at arc s, height z: squares, column numbers above the top row, one disk as mark.
 
+    ws, wz : mm, width and height of the sample on the surface.
     prints : (rows, columns, 2) by how much each square is off its place, mm.
     """
     column = math.floor(s / _SPACING + 0.5)
@@ -184,7 +185,10 @@ def _triangle(x):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def checker(x, y, wx, wy):  # type: ignore[no-untyped-def]
-    """Dark share of a checkerboard of unit squares over [0, 15] x [0, 20], white around it."""
+    """Dark share at (x, y) of a checkerboard of unit squares over [0, 15] x [0, 20], white around it.
+
+    wx, wy : width and height of the sample, in squares.
+    """
     if not (-wx < x < 15.0 + wx and -wy < y < 20.0 + wy):
         return 0.0
     inside = min(1.0, max(0.0, min(x, 15.0 - x) / wx + 0.5)) * min(1.0, max(0.0, min(y, 20.0 - y) / wy + 0.5))

@@ -121,4 +121,4 @@ def lens_jacobians(lens: Intrinsics, xy: Floats) -> tuple[Floats, Floats, Floats
         axis=-2,
     )
     inner[..., 5:] = to_px @ by_lens
-    return distorted @ to_px.T + lens.K[:2, 2], inner, to_px @ lens._jacobian_normalised(xy)
+    return distorted @ to_px.T + lens.K[:2, 2], inner, to_px @ lens.jacobian_normalised(xy)

@@ -1,9 +1,12 @@
-"""What the commands show on a terminal: progress bars on standard error, tables of figures."""
+"""What the commands print: progress bars, tables and sentences on standard error, JSON on standard output."""
 
 from __future__ import annotations
 
+import json
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -61,6 +64,11 @@ def show_table(title: str, rows: Sequence[Mapping[str, str]]) -> None:
 def say(sentence: str) -> None:
     """One sentence on standard error."""
     _console.print(sentence, highlight=False, soft_wrap=True, markup=False)
+
+
+def print_json(value: Mapping[str, Any]) -> None:
+    """One JSON object on a line of standard output; numbers of NumPy become JSON numbers."""
+    sys.stdout.write(json.dumps(value, ensure_ascii=False, default=float) + "\n")
 
 
 def _lines() -> Report:

@@ -5,14 +5,13 @@ CSV goes to standard output, or to a file; notes go to standard error.
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ringdic.cli.console import say
+from ringdic.cli.console import print_json, say
 from ringdic.cli.options import (
     AsJson,
     Reference,
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from ringdic.measure.section import Cut
     from ringdic.measure.table import Table
 
-measure = typer.Typer(
+measure_app = typer.Typer(
     name="measure",
     help="Measure on results: places and lengths through time, sections, statistics of regions.",
     no_args_is_help=True,
@@ -41,8 +40,8 @@ Out = Annotated[Path | None, typer.Option(help="CSV file to write; standard outp
 Within = Annotated[float, typer.Option(metavar="MM", help="How far a position may be from the surface.")]
 
 
-@measure.command()
-def point(
+@measure_app.command("point")
+def point_command(
     session: Session,
     at: Annotated[list[str] | None, typer.Option(metavar="X,Y,Z", help="Position, mm; repeatable.")] = None,
     vertex: Annotated[list[int] | None, typer.Option(help="Point by its index from 0; repeatable.")] = None,
@@ -64,16 +63,16 @@ def point(
     positions = [_numbers("--at", text, 3) for text in at or ()]
     if not (positions or vertex or face):
         raise InputError("name a place: --at X,Y,Z, --vertex INDEX or --face INDEX")
-    seen = results_of(session, run, reference, without_rigid_motion, window, seth_hill)
-    mesh = seen.results.mesh
+    results = results_of(session, run, reference, without_rigid_motion, window, seth_hill)
+    mesh = results.results.mesh
     places = [nearest_place(mesh, xyz, within) for xyz in positions]
     places += [place_of_vertex(mesh, index) for index in vertex or ()]
     places += [place_of_face(mesh, index) for index in face or ()]
-    _give(time_series(seen, places, field or ()), out, as_json)
+    _give(time_series(results, places, field or ()), out, as_json)
 
 
-@measure.command()
-def extensometer(
+@measure_app.command("extensometer")
+def extensometer_command(
     session: Session,
     from_: Annotated[str, typer.Option("--from", metavar="X,Y,Z", help="One end in the reference, mm.")],
     to: Annotated[str, typer.Option(metavar="X,Y,Z", help="The other end, mm.")],
@@ -84,17 +83,17 @@ def extensometer(
     as_json: AsJson = False,
 ) -> None:
     """Length between two material places through time, along the surface and straight."""
-    from ringdic.measure.extensometer import extensometer as measured
+    from ringdic.measure.extensometer import extensometer
     from ringdic.measure.place import nearest_place
 
     ends = _numbers("--from", from_, 3), _numbers("--to", to, 3)
-    seen = results_of(session, run, reference)
-    start, end = (nearest_place(seen.results.mesh, xyz, within) for xyz in ends)
-    _give(measured(seen, start, end), out, as_json)
+    results = results_of(session, run, reference)
+    start, end = (nearest_place(results.results.mesh, xyz, within) for xyz in ends)
+    _give(extensometer(results, start, end), out, as_json)
 
 
-@measure.command()
-def section(
+@measure_app.command("section")
+def section_command(
     session: Session,
     z: Annotated[float | None, typer.Option(help="The plane of this height, mm.")] = None,
     theta: Annotated[float | None, typer.Option(help="The half-plane from the axis at this azimuth, degrees.")] = None,
@@ -109,15 +108,15 @@ def section(
     as_json: AsJson = False,
 ) -> None:
     """Fields along a cut of the reference surface, followed through the steps."""
-    from ringdic.measure.section import section as measured
+    from ringdic.measure.section import section
 
     cut = _cut(z, theta, plane)
-    seen = results_of(session, run, reference, without_rigid_motion, window, seth_hill)
-    _give(measured(seen, cut, field or ()), out, as_json)
+    results = results_of(session, run, reference, without_rigid_motion, window, seth_hill)
+    _give(section(results, cut, field or ()), out, as_json)
 
 
-@measure.command()
-def region(
+@measure_app.command("region")
+def region_command(
     session: Session,
     box: Annotated[str | None, typer.Option(metavar="X,Y,Z,X,Y,Z", help="Lower and upper corner, mm.")] = None,
     sphere: Annotated[str | None, typer.Option(metavar="X,Y,Z,R", help="Centre and radius, mm.")] = None,
@@ -138,11 +137,11 @@ def region(
     from ringdic.measure.region import region_statistics
 
     part = _region(box, sphere, patch, faces)
-    seen = results_of(session, run, reference, without_rigid_motion, window, seth_hill)
-    _give(region_statistics(seen, part, field or ()), out, as_json)
+    results = results_of(session, run, reference, without_rigid_motion, window, seth_hill)
+    _give(region_statistics(results, part, field or ()), out, as_json)
 
 
-def strain(
+def strain_command(
     session: Session,
     window: Annotated[list[float] | None, typer.Option(metavar="MM", help="Width; repeatable. 0: no window.")] = None,
     run: Run = None,
@@ -153,9 +152,9 @@ def strain(
     """Study the strain window: strain and its scatter over windows of several widths, without correlating again."""
     from ringdic.measure.window_study import window_study
 
-    seen = results_of(session, run, reference)
+    results = results_of(session, run, reference)
     widths = window or [0.0, 3.0, 5.0, 8.0, 12.0]
-    _give(window_study(seen.results, widths, seen.evaluation.previous), out, as_json)
+    _give(window_study(results.results, widths, results.evaluation.previous), out, as_json)
 
 
 def _cut(z: float | None, theta: float | None, plane: str | None) -> Cut:
@@ -212,6 +211,6 @@ def _give(table: Table, out: Path | None, as_json: bool) -> None:
     for note in table.notes:
         say(note)
     if as_json:
-        typer.echo(json.dumps(table.to_json(), ensure_ascii=False))
+        print_json(table.to_json())
     elif out is None:
         typer.echo(table.to_csv(), nl=False)

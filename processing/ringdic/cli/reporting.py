@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ringdic.cli.console import narrated, say
+from ringdic.cli.console import narrated, print_json, say
 from ringdic.cli.options import AsJson, Reference, Run, Session, Window, WithoutRigidMotion, results_of
 from ringdic.errors import InputError
 from ringdic.progress import Progress
@@ -25,7 +24,7 @@ Opacity = Annotated[float, typer.Option(min=0.0, max=1.0, help="Of the colours o
 Camera = Annotated[str | None, typer.Option(help="Camera whose photographs are used.")]
 
 
-def report(
+def report_command(
     session: Session,
     out: Annotated[Path | None, typer.Option(help="HTML file; report.html beside the results unless given.")] = None,
     run: Run = None,
@@ -34,12 +33,12 @@ def report(
     """One self-contained HTML page of a run: reporting tables, calibration, noise floor, maps."""
     from ringdic.report import write_report
 
-    with narrated() as narrate:
-        written = write_report(session, out, run, lambda done: narrate(Progress("report", done)))
-    _told([written], as_json)
+    with narrated() as show:
+        written = write_report(session, out, run, lambda done: show(Progress("report", done)))
+    _tell_written([written], as_json)
 
 
-def overlay(
+def overlay_command(
     session: Session,
     field: FieldName = "lambda2",
     camera: Annotated[list[str] | None, typer.Option(help="Camera; repeatable. All unless given.")] = None,
@@ -57,8 +56,7 @@ def overlay(
     """A field over the photographs that the cameras took."""
     from PIL import Image
 
-    from ringdic.pictures.overlay import overlay as laid_over
-    from ringdic.pictures.overlay import photograph, with_bar
+    from ringdic.pictures.overlay import overlay, photograph, with_bar
     from ringdic.session.folder import open_session
 
     seen = results_of(session, run, reference, without_rigid_motion, window)
@@ -70,14 +68,14 @@ def overlay(
     out.mkdir(parents=True, exist_ok=True)
     written = []
     for id_ in cameras:
-        picture = laid_over(seen, id_, photograph(captured, name, id_), scale, number, opacity)
+        picture = overlay(seen, id_, photograph(captured, name, id_), scale, number, opacity)
         path = out / f"{field.replace(':', '-')}-{name}-{id_}.png"
         Image.fromarray(with_bar(picture, scale) if bar else picture).save(path)
         written.append(path)
-    _told(written, as_json)
+    _tell_written(written, as_json)
 
 
-def animate(
+def animate_command(
     session: Session,
     out: Annotated[Path, typer.Option(help="The .gif or .mp4 file.")],
     field: FieldName = "lambda2",
@@ -108,7 +106,7 @@ def animate(
         front = mean_azimuth(seen.results.mesh) if azimuth is None else math.radians(azimuth)
         frames = surface_frames(seen, scale, front, size)
     write_animation(out, list(frames), seconds)
-    _told([out], as_json)
+    _tell_written([out], as_json)
 
 
 def _scale(seen: EvaluatedResults, field: str, limits: str | None) -> Scale:
@@ -140,10 +138,10 @@ def _photographed(session: Captured, capture_id: str, seen: EvaluatedResults) ->
     return [camera.id for camera in seen.results.cameras if camera.id in images]
 
 
-def _told(written: list[Path], as_json: bool) -> None:
+def _tell_written(written: list[Path], as_json: bool) -> None:
     if as_json:
         paths = [str(path) for path in written]
-        typer.echo(json.dumps({"written": paths[0] if len(paths) == 1 else paths}, ensure_ascii=False))
+        print_json({"written": paths[0] if len(paths) == 1 else paths})
     else:
         for path in written:
             say(f"written {path}")

@@ -1,21 +1,26 @@
-"""Digital image correlation of two images: where every point of the reference lies in the current image.
+"""Digital image correlation of two images: the displacement of points of a reference image in a current image.
 
-``prepare_reference`` and ``prepare_current`` filter the images once, ``grid`` lays the points, ``correlate`` matches
-them. The room knows images, masks and points only: no camera, no calibration, no session.
+``prepare_reference`` and ``prepare_current`` filter the images once, ``grid`` lays the points, ``correlate_points``
+matches them. The room knows images, masks and points only: no camera, no calibration, no session.
 
-``kernels``      one subset by inverse-compositional Gauss-Newton, and many in parallel
-``spline``       B-spline coefficients and gradients, by the compiled ``filters``
-``propagation``  from matched points to their neighbours, in waves
-``neighbours``   the neighbours' judgement: prediction, outliers, islands
-``seeds``        first matches in time; ``features`` first matches between cameras
-``quadratic``    a quadratic of any field over the neighbours of each point
-``hypotheses``   many given warps tried at each point, for start values that come from geometry
-``command``      the same for two files
+``correlate``      matches of the points of one image pair: start values, refinement, outliers
+``prepared``       reference and current images with their gradients and B-spline coefficients
+``seeds``          start values between images of one camera; ``features`` between cameras
+``hypotheses``     the best of many given affine warps at each point, for start values that come from geometry
+``start_field``    start values of all points from matches on a lattice, by ``lattice_field``
+``propagation``    reliability-guided propagation from matched points to their neighbours
+``neighbours``     neighbours of points, and outliers and extrapolations judged from them
+``quadratic``      least-squares quadratics of any field over the neighbours of each point
+``refinement``     inverse-compositional Gauss-Newton of many points, by the compiled ``kernels``
+``kernels``        the iteration of one subset, on ``subset``, ``interpolation``, ``warps`` and ``lanes``
+``spline``         B-spline coefficients and gradients of an image, by the compiled ``filters``
+``bench``          speed of the correlation on this machine, beside what ``machine`` measures of its processor
+``command``        the correlation of two image files
 """
 
-from ringdic.correlation.correlate import Correlation, correlate_points, refine_alone, start_order
+from ringdic.correlation.correlate import Correlation, as_start_values, correlate_independently, correlate_points
 from ringdic.correlation.grid import grid
-from ringdic.correlation.hypotheses import Row, search_hypotheses, search_row
+from ringdic.correlation.hypotheses import WarpHypotheses, search_hypotheses, search_warps
 from ringdic.correlation.prepared import Current, Reference, prepare_current, prepare_reference
 from ringdic.correlation.refinement import reference_bytes
 from ringdic.correlation.settings import CorrelationSettings
@@ -26,15 +31,15 @@ __all__ = [
     "CorrelationSettings",
     "Current",
     "Reference",
-    "Row",
     "Status",
+    "WarpHypotheses",
+    "as_start_values",
+    "correlate_independently",
     "correlate_points",
     "grid",
     "prepare_current",
     "prepare_reference",
     "reference_bytes",
-    "refine_alone",
     "search_hypotheses",
-    "search_row",
-    "start_order",
+    "search_warps",
 ]

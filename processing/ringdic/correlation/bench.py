@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ringdic.arrays import Floats, Mask
 from ringdic.correlation.correlate import Correlation, correlate_points, load_kernels, on_threads
 from ringdic.correlation.grid import grid
-from ringdic.correlation.machine import Machine, demand, measure_machine
+from ringdic.correlation.machine import Machine, kernel_cost, measure_machine
 from ringdic.correlation.prepared import prepare_current, prepare_reference
 from ringdic.correlation.refinement import refine
 from ringdic.correlation.settings import CorrelationSettings
@@ -195,7 +195,7 @@ def _measure(
 
 def _roofline(settings: CorrelationSettings, run: dict[str, Any], machine: Machine) -> dict[str, float]:
     """What the kernel asks of a core for a point, and how near it comes to what the core can do."""
-    asked = demand(settings, run["iterations"])
+    asked = kernel_cost(settings, run["iterations"])
     seconds = 1.0 / run["kernel_points_per_cpu_second"]
     return {
         "pixels": asked.pixels,

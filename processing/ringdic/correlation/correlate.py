@@ -1,4 +1,4 @@
-"""Correlation of one pair of images: displacement, derivatives and their uncertainty at every point."""
+"""Correlation of one pair of images: displacement, its derivatives and its standard uncertainty at every point."""
 
 from __future__ import annotations
 
@@ -12,49 +12,53 @@ from functools import cache
 import numba
 import numpy as np
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Pixels
 from ringdic.correlation import kernels
-from ringdic.correlation.features import feature_starts
-from ringdic.correlation.hypotheses import search_hypotheses
+from ringdic.correlation.features import feature_start_values
+from ringdic.correlation.hypotheses import search_warps
 from ringdic.correlation.prepared import Current, Reference, prepare_current, prepare_reference
 from ringdic.correlation.propagation import Progress, Propagation
-from ringdic.correlation.seeds import flow_starts, search_starts, spread
+from ringdic.correlation.seeds import even_sample, flow_start_values, template_start_values
 from ringdic.correlation.settings import CorrelationSettings
 from ringdic.correlation.status import Status
 from ringdic.errors import InputError
 
-StartValues = Callable[[Reference, Current, Floats, int], Floats]
+StartMethod = Callable[[Reference, Current, Pixels, int], Floats]
 
 log = logging.getLogger(__name__)
 
-# Name, method, and whether it tells of all points at once as cheaply as of a few.
-_METHODS: tuple[tuple[str, StartValues, bool], ...] = (
-    ("optical flow", flow_starts, True),
-    ("template search", search_starts, False),
-    ("features", feature_starts, False),
+# Name, method, and whether start values of all points cost hardly more than those of a few.
+_METHODS: tuple[tuple[str, StartMethod, bool], ...] = (
+    ("optical flow", flow_start_values, True),
+    ("template search", template_start_values, False),
+    ("features", feature_start_values, False),
 )
-_ENOUGH = 0.99  # share of the points that have a match before the next method is asked
-_ALIKE = 0.4  # ZNCC before the refinement below which none is worth while
-_SEED_ZNCC = 0.75
-_DENSE_ZNCC = 0.9  # what a point started by itself must reach; others wait for what their neighbours say
-_TRUSTED = 0.6  # share of a method's seeds that must hold
-# Columns of the 12 parameters of a kernel, in the order u v ux uy vx vy, then uxx uxy uyy vxx vxy vyy.
+_ENOUGH = 0.99  # share of the points that are matched before no further method is tried
+_START_ZNCC = 0.4  # least ZNCC of a start value that is refined
+_SEED_ZNCC = 0.75  # least ZNCC of a seed's match
+_DENSE_ZNCC = 0.9  # least ZNCC of a point's match from its own start value; below it is left to propagation
+_TRUSTED = 0.6  # share of a method's seeds that must be matched for it to suit the pair
+# Columns of a kernel's 12 parameters in the order of start values: u v ux uy vx vy, then uxx uxy uyy vxx vxy vyy.
 _COLUMNS = [0, 6, 1, 2, 7, 8, 3, 4, 5, 9, 10, 11]
 
 
 @dataclass(frozen=True)
 class Correlation:
-    """Matches of n points; NaN where status is not 0.
+    """Matches of n points of a reference image in a current image; NaN where the status is not GOOD.
 
-    xy : (n, 2) px on the reference. uv : (n, 2) px, current minus reference position.
-    gradient : (n, 2, 2), d u_i / d x_j. curvature : (n, 2, 3), second derivatives by xx, xy, yy, 1/px.
-    zncc, c_ls : (n,), c_ls = 2 (1 - zncc). iterations : (n,). status : (n,), see ``Status``.
-    sigma : (n, 2) px, standard uncertainty of uv, √2 σ √(H⁻¹) with the whole inverse.
-    seconds : by stage: prepare, start, refine.
+    xy : (n, 2) float64, px, positions in the reference image.
+    uv : (n, 2) float64, px, displacement: current minus reference position.
+    gradient : (n, 2, 2) float64, no unit, derivatives d u_i / d x_j of the displacement.
+    curvature : (n, 2, 3) float64, 1/px, second derivatives of the displacement by xx, xy, yy.
+    zncc, c_ls : (n,) float64, no unit, zero-mean normalised cross-correlation and c_ls = 2 (1 - zncc).
+    iterations : (n,) int64. status : (n,) int64, values of ``Status``.
+    sigma : (n, 2) float64, px, standard uncertainty of uv: √2 σ √(H⁻¹), σ the noise of an image and H⁻¹ the inverse of
+        the whole normal matrix.
+    seconds : time by stage: prepare (filtering), start (start values), refine.
     """
 
-    xy: Floats
-    uv: Floats
+    xy: Pixels
+    uv: Pixels
     gradient: Floats
     curvature: Floats
     zncc: Floats
@@ -66,66 +70,90 @@ class Correlation:
 
     @property
     def good(self) -> Mask:
-        """Matched points. (n,) bool."""
+        """Whether a point is matched. (n,) bool."""
         return self.status == Status.GOOD
 
 
 def correlate_points(
     reference: Reference,
     current: Current,
-    xy: Floats,
+    xy: Pixels,
     settings: CorrelationSettings,
     *,
     start: Floats | None = None,
-    follow: bool = False,
+    prefer_neighbour: bool = False,
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Correlation:
-    """Match points of the reference image in the current image.
+    """Match points of a reference image in a current image.
 
-    xy : (n, 2) px, whole or fractional, inside the reference's mask. start : (n, 6) u v ux uy vx vy, or (n, 12) with
-    the second derivatives uxx uxy uyy vxx vxy vyy after them; NaN where unknown: the other points are reached by
-    propagation. Without start values they are found in the images. First order holds second derivatives as given.
-    follow : start values are less sure than what a match tells of the point beside it, and give way where they agree.
-    threads : cores to use, all by default; the result does not depend on it. progress(done, total) is called after
-    every wave. Call it from one thread at a time: it is parallel inside.
+    Points with a start value are refined from it, the others are reached by reliability-guided propagation from their
+    neighbours. Then matches that contradict their neighbours are rejected. Call it from one thread at a time: it runs
+    in parallel inside.
+
+    Parameters
+    ----------
+    reference, current : the images, prepared with the same settings.
+    xy : (n, 2) float64, px, whole or fractional, inside the reference's mask.
+    start : (n, 6) float64, start values u v ux uy vx vy (u, v in px), or (n, 12) with the second derivatives uxx uxy
+        uyy vxx vxy vyy (1/px) after them, which first order holds as given; NaN where unknown. None to find start
+        values in the images.
+    prefer_neighbour : a point beside one just matched starts from that match instead, where the two agree: for start
+        values that are less certain than a neighbour's match.
+    threads : number of threads; all cores by default. The results do not depend on it.
+    progress : called with the numbers of matched and of all points after every wave.
+
+    Returns
+    -------
+    matches : of the n points.
+
+    Raises InputError if there is no point or no start value, or if the images were prepared for other settings.
     """
     xy = _checked(reference, current, xy, settings)
     with on_threads(threads):
         load_kernels()
         began = time.perf_counter()
-        assert reference.slopes  # computed when first asked for
+        assert reference.gradient  # computed when first asked for
         seconds = {"prepare": time.perf_counter() - began, "start": 0.0, "refine": 0.0}
         points = Propagation(reference, current, xy, settings, progress)
         if start is None:
             _match_automatically(points, seconds)
         else:
-            _match_from(points, _parameters(start, len(xy)), seconds, follow)
+            _match_from(points, _parameters(start, len(xy)), seconds, prefer_neighbour)
     seconds["prepare"] += points.filtering
     seconds["refine"] -= points.filtering
     return _result(points, seconds)
 
 
-def refine_alone(
-    reference: Reference, current: Current, xy: Floats, settings: CorrelationSettings, start: Floats
+def correlate_independently(
+    reference: Reference, current: Current, xy: Pixels, settings: CorrelationSettings, start: Floats
 ) -> Correlation:
-    """Match points of the reference image each from its own start value alone: no neighbour leads to it or judges it.
+    """Match points of a reference image each from its own start value, without propagation and without a test of
+    outliers.
 
-    xy, start : as for :func:`correlate`. current is filtered as it is: where a subset leaves its box, a point is lost.
+    Parameters
+    ----------
+    reference, current : the images, prepared with the same settings. The current image is used in its box as it is:
+        where a subset leaves that, the point is lost.
+    xy : (n, 2) float64, px, points of the reference image.
+    start : (n, 6) or (n, 12) float64, px and derivatives, as for :func:`correlate_points`; NaN leaves a point out.
     """
     xy = _checked(reference, current, xy, settings)
     load_kernels()
-    points = Propagation(reference, current, xy, settings, region=current, bare=np.zeros(len(xy), bool), alone=True)
+    textureless = np.zeros(len(xy), bool)  # the kernel tests each subset
+    points = Propagation(reference, current, xy, settings, region=current, textureless=textureless, independent=True)
     given = np.flatnonzero(np.isfinite(start).all(axis=1))
     began = time.perf_counter()
     if len(given):
-        points.attempt(given, _parameters(start, len(xy))[given])
+        points.refine_from(given, _parameters(start, len(xy))[given])
     seconds = {"prepare": points.filtering, "start": 0.0, "refine": time.perf_counter() - began - points.filtering}
     return _result(points, seconds)
 
 
-def _checked(reference: Reference, current: Current, xy: Floats, settings: CorrelationSettings) -> Floats:
-    """The points (n, 2) as the kernels take them. InputError where they or the images do not fit the settings."""
+def _checked(reference: Reference, current: Current, xy: Pixels, settings: CorrelationSettings) -> Floats:
+    """The points (n, 2) px as the kernels take them. Raises InputError where they or the images do not fit the
+    settings.
+    """
     xy = np.ascontiguousarray(xy, dtype=np.float64)
     if current.degree != settings.degree:
         raise InputError(f"the current image was prepared for degree {current.degree}, not {settings.interpolation}")
@@ -138,7 +166,10 @@ def _checked(reference: Reference, current: Current, xy: Floats, settings: Corre
 
 @cache
 def load_kernels() -> None:
-    """Compile or load all that a correlation runs, once a process, so that no timing contains it."""
+    """Compile all kernels that a correlation runs, or load them from numba's cache, once per process.
+
+    Called before anything is timed.
+    """
     image = np.random.default_rng(0).normal(128.0, 30.0, (64, 64))
     settings = CorrelationSettings(radius=6, step=6)
     xy = np.stack(np.meshgrid(np.arange(16.0, 48.0, 6.0), np.arange(16.0, 48.0, 6.0)), axis=-1).reshape(-1, 2)
@@ -147,10 +178,12 @@ def load_kernels() -> None:
 
 
 def _match_automatically(points: Propagation, seconds: dict[str, float]) -> None:
-    """Seeds by one method after the other until nearly every point is matched, each carried on by propagation.
+    """Match the points from start values that are found in the images, by one method after the other until enough are
+    matched.
 
-    A method most of whose seeds hold suits the pair and is used at once. The few seeds that an unsuitable one gets
-    through may be false: they wait until the others have had their turn, and only serve points nobody reached.
+    Each method gives start values at a sample of the points still open. Where most of them lead to matches, the method
+    suits the pair: its matches are adopted and propagated at once. The few matches of an unsuitable method may be
+    false: they wait until the other methods have been tried and then serve only points that none of these reached.
     """
     doubtful = []
     for name, method, dense in _METHODS:
@@ -158,13 +191,13 @@ def _match_automatically(points: Propagation, seconds: dict[str, float]) -> None
         if len(open_points) <= (1.0 - _ENOUGH) * _worth(points):
             break
         began = time.perf_counter()
-        chosen = spread(points.xy[open_points])
-        asked = open_points if dense else open_points[chosen]
-        start = method(points.reference, points.current, points.xy[asked], points.settings.radius)
-        seeds = open_points[chosen]
-        trial = _try_seeds(points, seeds, start[chosen] if dense else start)
+        sample = even_sample(points.xy[open_points])
+        seeds = open_points[sample]
+        index = open_points if dense else seeds
+        start = method(points.reference, points.current, points.xy[index], points.settings.radius)
+        trial = _try_seeds(points, seeds, start[sample] if dense else start)
         share = float(trial.good.sum() / max((trial.status != Status.NO_TEXTURE).sum(), 1))
-        log.debug("%s: %d of %d seeds hold", name, int(trial.good.sum()), len(seeds))
+        log.debug("%s: %d of %d seeds matched", name, int(trial.good.sum()), len(seeds))
         seconds["start"] += time.perf_counter() - began - trial.filtering
         seconds["prepare"] += trial.filtering
         if share < _TRUSTED:
@@ -172,7 +205,7 @@ def _match_automatically(points: Propagation, seconds: dict[str, float]) -> None
             continue
         points.adopt(seeds, trial)
         points.region = points.region or trial.region
-        _carry_on(points, seconds, asked[~points.good[asked]], start[~points.good[asked]])
+        _carry_on(points, seconds, index[~points.good[index]], start[~points.good[index]])
     for _, seeds, trial in sorted(doubtful, key=lambda entry: -entry[0]):
         if len(_open(points)) > (1.0 - _ENOUGH) * _worth(points):
             points.adopt(seeds, trial)
@@ -180,34 +213,38 @@ def _match_automatically(points: Propagation, seconds: dict[str, float]) -> None
 
 
 def _open(points: Propagation) -> Indices:
+    """Indices of the points that have texture and no match."""
     return np.flatnonzero(~points.good & (points.status != Status.NO_TEXTURE))
 
 
 def _worth(points: Propagation) -> int:
-    """The number of points with texture enough to be matched."""
+    """Number of points with enough texture to be matched."""
     return int((points.status != Status.NO_TEXTURE).sum())
 
 
 def _try_seeds(points: Propagation, seeds: Indices, start: Floats) -> Propagation:
-    """The seeds (k,) refined from start values (k, 12), apart from the other points, where they look alike at all."""
-    bare = points.status[seeds] == Status.NO_TEXTURE
-    trial = Propagation(points.reference, points.current, points.xy[seeds], points.settings, bare=np.asarray(bare))
+    """Refinement of the seeds (k,) from start values (k, 12), in a propagation of their own.
+
+    Start values at which the images are too dissimilar are left out.
+    """
+    textureless = np.asarray(points.status[seeds] == Status.NO_TEXTURE)
+    trial = Propagation(points.reference, points.current, points.xy[seeds], points.settings, textureless=textureless)
     known = np.asarray(np.isfinite(start).all(axis=1))
     warps = np.where(known[:, None], start, np.nan)[:, None, _COLUMNS[:6]]
-    _, alike, _ = search_hypotheses(points.reference, points.current, trial.xy, warps, points.settings.radius)
-    found = np.flatnonzero(known & (alike > _ALIKE))
-    if not len(found):
-        return trial
-    trial.attempt(found, start[found], max(_SEED_ZNCC, points.settings.zncc_min))
+    _, zncc, _ = search_warps(points.reference, points.current, trial.xy, warps, points.settings.radius)
+    similar = np.flatnonzero(known & (zncc > _START_ZNCC))
+    if len(similar):
+        trial.refine_from(similar, start[similar], max(_SEED_ZNCC, points.settings.zncc_min))
     return trial
 
 
-def _match_from(points: Propagation, start: Floats, seconds: dict[str, float], follow: bool) -> None:
+def _match_from(points: Propagation, start: Floats, seconds: dict[str, float], prefer_neighbour: bool) -> None:
+    """Refine the points that have a start value (n, 12), then propagate to all others."""
     began = time.perf_counter()
     given = np.flatnonzero(np.isfinite(start).all(axis=1))
     if not len(given):
         raise InputError("no point has a start value; leave them out to have them found")
-    points.attempt(given, start[given], follow=follow)
+    points.refine_from(given, start[given], prefer_neighbour=prefer_neighbour)
     seconds["refine"] += time.perf_counter() - began
     _carry_on(points, seconds)
 
@@ -215,22 +252,25 @@ def _match_from(points: Propagation, start: Floats, seconds: dict[str, float], f
 def _carry_on(
     points: Propagation, seconds: dict[str, float], index: Indices | None = None, start: Floats | None = None
 ) -> None:
-    """All points from their own start values where given, then from neighbour to neighbour, and the judgement."""
+    """Refine points (k,) from start values (k, 12), if given, propagate to all others and reject outliers."""
     began = time.perf_counter()
     if index is not None and start is not None:
         known = np.isfinite(start).all(axis=1) & (points.status[index] != Status.NO_TEXTURE)
-        points.attempt(index[known], start[known], max(_DENSE_ZNCC, points.settings.zncc_min), follow=True)
+        points.refine_from(
+            index[known], start[known], max(_DENSE_ZNCC, points.settings.zncc_min), prefer_neighbour=True
+        )
     points.propagate()
     points.retry_from_fit()
     if points.reject_outliers():
         points.propagate()
         points.retry_from_fit()
         points.reject_outliers()
-    points.hold_curvature()
+    points.retry_with_neighbour_curvature()
     seconds["refine"] += time.perf_counter() - began
 
 
 def _parameters(start: Floats, n: int) -> Floats:
+    """Start values (n, 6) or (n, 12) in the order of the kernels' parameters. (n, 12)."""
     start = np.asarray(start, dtype=np.float64)
     if start.shape not in ((n, 6), (n, 12)):
         raise ValueError(f"start values must be ({n}, 6) or ({n}, 12), not {start.shape}")
@@ -239,12 +279,17 @@ def _parameters(start: Floats, n: int) -> Floats:
     return out
 
 
-def start_order(parameters: Floats) -> Floats:
-    """Parameters (n, 12) of the kernels in the order in which start values are given. (n, 12)."""
+def as_start_values(parameters: Floats) -> Floats:
+    """Reorder parameters of the kernels to start values.
+
+    parameters : (n, 12) float64, px and derivatives, u ux uy uxx uxy uyy v vx vy vxx vxy vyy.
+    Returns (n, 12), u v ux uy vx vy uxx uxy uyy vxx vxy vyy.
+    """
     return np.asarray(parameters[:, _COLUMNS])
 
 
 def _result(points: Propagation, seconds: dict[str, float]) -> Correlation:
+    """The matches of a propagation, NaN where a point is not good."""
     p = points.parameters.copy()
     p[~points.good] = np.nan
     return Correlation(
@@ -262,14 +307,14 @@ def _result(points: Propagation, seconds: dict[str, float]) -> Correlation:
 
 
 def usable_threads(count: int | None) -> int:
-    """The number of threads a correlation runs on when ``count`` are asked for; all cores for None."""
+    """Number of threads that a correlation uses when ``count`` are asked for; all cores for None."""
     cores = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     return min(count, cores) if count else cores
 
 
 @contextmanager
 def on_threads(count: int | None) -> Iterator[None]:
-    """Inside, the kernels run on so many threads; all cores for None."""
+    """Context in which the kernels run on a number of threads; on all cores for None. Raises InputError below 1."""
     before = numba.get_num_threads()
     if count is not None and count < 1:
         raise InputError(f"the number of threads must be at least 1, not {count}")

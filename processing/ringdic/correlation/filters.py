@@ -1,7 +1,7 @@
-"""A row of taps along the rows of an image and along its columns, compiled: separable filters of a box of an image.
+"""Compiled separable filters of a box of an image.
 
-An image goes on beyond its border as in a mirror, the pixel of the border once. All sums run over the taps in their
-order, so a pixel's value depends neither on the box nor on the number of threads.
+Beyond its border an image is mirrored at the centre of the border pixel. All sums run over the taps in their order, so
+a pixel's value depends neither on the box nor on the number of threads.
 """
 
 from __future__ import annotations
@@ -10,17 +10,19 @@ import numba as nb
 import numpy as np
 
 from ringdic.correlation.interpolation import FAST
-from ringdic.correlation.lanes import LANES, load, number, pointer, ramp, store
+from ringdic.correlation.lanes import LANES, load, load_one, pointer, ramp, store
 
 _U = np.uint64
 _L = np.uint64(LANES)
-_BLOCK = 4 * LANES  # columns that are summed at once
-_COLUMNS = 64  # that one thread takes at a time: 2000 rows of them are half a megabyte
+_BLOCK = 4 * LANES  # columns whose sums are kept in registers at once
+_COLUMNS = 64  # columns that one thread takes at a time: 2000 rows of them are half a megabyte
 
 
 @nb.njit(cache=True, nogil=True)
-def mirrored(at, count):  # type: ignore[no-untyped-def]
-    """The pixel of a row of ``count`` that a place inside or beyond it shows."""
+def mirror_index(at, count):  # type: ignore[no-untyped-def]
+    """Index of the pixel that an index ``at`` inside or outside a row of ``count`` pixels shows, mirrored at the
+    border.
+    """
     while at < 0 or at >= count:
         at = -at if at < 0 else 2 * (count - 1) - at
     return at
@@ -28,10 +30,13 @@ def mirrored(at, count):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True, cache=True, fastmath=FAST)
 def _block(source, first, stride, taps, count, out, to):  # type: ignore[no-untyped-def]
-    """_BLOCK sums of ``count`` taps, the first over source[first ...], the next ``stride`` further, to out[to ...]."""
+    """Sums over ``count`` taps for _BLOCK neighbouring positions.
+
+    The first tap reads source[first ...], each further tap ``stride`` further on; the sums go to out[to ...].
+    """
     a = b = c = d = ramp(source) * np.float32(0)
     for k in range(_U(count)):
-        at, tap = first + k * stride, number(taps, k)
+        at, tap = first + k * stride, load_one(taps, k)
         a += tap * load(source, at)
         b += tap * load(source, at + _L)
         c += tap * load(source, at + _L + _L)
@@ -44,21 +49,24 @@ def _block(source, first, stride, taps, count, out, to):  # type: ignore[no-unty
 
 @nb.njit(nogil=True, cache=True)
 def _line(row, begin, line):  # type: ignore[no-untyped-def]
-    """line (m,) becomes the row of an image from column ``begin`` on."""
+    """Fill line (m,) with a row of an image from column ``begin`` on, mirrored beyond its border."""
     if begin >= 0 and begin + len(line) <= len(row):
         shown = row[begin : begin + len(line)]
         for k in range(_U(len(line))):
             line[k] = shown[k]
     else:
         for k in range(len(line)):
-            line[k] = row[mirrored(begin + k, len(row))]
+            line[k] = row[mirror_index(begin + k, len(row))]
 
 
 @nb.njit(nogil=True, cache=True, parallel=True)
-def separable(image, along_x, along_y, left, top, out):  # type: ignore[no-untyped-def]
-    """out (h, w): taps along x and along y, odd in number, centred on the pixels of an image from (left, top) on.
+def separable_filter(image, along_x, along_y, left, top, out):  # type: ignore[no-untyped-def]
+    """Filter a box of an image along x and along y.
 
-    A few columns at a time, so that what is filtered along x stays in the cache until it has been filtered along y.
+    image : (h, w); along_x, along_y : taps, odd in number, centred on the pixel; left, top : the box's first pixel; out
+        :
+    (rows, columns), filled. Columns are taken a few at a time, so that what is filtered along x is still in the cache
+    when it is filtered along y.
     """
     rows, width = out.shape
     reach_x, reach_y = len(along_x) // 2, len(along_y) // 2
@@ -67,7 +75,7 @@ def separable(image, along_x, along_y, left, top, out):  # type: ignore[no-untyp
         line, spare = np.empty(_COLUMNS + 2 * reach_x, out.dtype), np.empty(_COLUMNS, out.dtype)
         part = np.empty((rows + 2 * reach_y, _COLUMNS), out.dtype)
         for i in range(len(part)):
-            _line(image[mirrored(top - reach_y + i, image.shape[0])], left + first - reach_x, line)
+            _line(image[mirror_index(top - reach_y + i, image.shape[0])], left + first - reach_x, line)
             for j in range(0, _COLUMNS, _BLOCK):
                 _block(pointer(line), _U(j), _U(1), pointer(along_x), len(along_x), pointer(part[i]), _U(j))
         whole = first + _COLUMNS <= width

@@ -1,4 +1,8 @@
-"""Many affine warps tried at each point, for start values that a calibration and a proxy surface suggest."""
+"""Search among many given affine warps of a subset for the one with the highest ZNCC.
+
+The warps come from outside, for instance from a calibration and a proxy surface that suggest where a match may lie. The
+best of them is a start value for the refinement.
+"""
 
 from __future__ import annotations
 
@@ -9,31 +13,36 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Pixels
 from ringdic.correlation.prepared import Current, Reference
 
-_MANY = 16  # warps a point from which on they are first tried on fewer pixels
-_THINNED = 2  # every so many of the pixels each way at first
-_DOUBT = 0.3  # ZNCC that the first trial may be off: three standard deviations of 80 pixels that are not alike
+_MANY = 16  # warps per point from which on a first trial on fewer pixels pays
+_THINNED = 2  # stride of the first trial, in strides of the final one
+_DOUBT = 0.3  # error of the first trial's ZNCC: three standard deviations for 80 pixels of unrelated texture
 _ANY_PIXEL = np.zeros((0, 0), bool)  # in place of a mask: all pixels count
 
 
 @dataclass(frozen=True)
-class Row:
-    """K warps at each of n points, evenly between a few of them: a match moves evenly along a line of sight.
+class WarpHypotheses:
+    """K affine warps to be tried at each of n points, interpolated linearly between J knots.
 
-    knots : (n, J, 6) warps, u v ux uy vx vy; NaN where not to be tried. places : (K,), where the warps lie, 2.25 being
-    a quarter of the way from knot 2 to knot 3.
+    As the depth of a point changes, its match moves evenly along an epipolar line, so that a few warps computed
+    exactly, the knots, give all others.
+
+    knots : (n, J, 6) float64, warps u v ux uy vx vy (u, v in px, the gradients without a unit); NaN where not to be
+        tried.
+    knot_coordinates : (K,) float64, where the K warps lie among the knots, no unit; 2.25 is a quarter of the way from
+        knot 2 to knot 3.
     """
 
     knots: Floats
-    places: Floats
+    knot_coordinates: Floats
 
     @property
     def warps(self) -> Floats:
-        """All of them. (n, K, 6)."""
-        below = np.minimum(self.places.astype(np.int64), max(self.knots.shape[1] - 2, 0))
-        share = (self.places - below)[:, None]
+        """All K warps at each point, u v ux uy vx vy with u, v in px. (n, K, 6)."""
+        below = np.minimum(self.knot_coordinates.astype(np.int64), max(self.knots.shape[1] - 2, 0))
+        share = (self.knot_coordinates - below)[:, None]
         above = np.minimum(below + 1, self.knots.shape[1] - 1)
         between = self.knots[:, below] + share * (self.knots[:, above] - self.knots[:, below])
         return np.where(share == 0.0, self.knots[:, below], np.where(share == 1.0, self.knots[:, above], between))
@@ -41,50 +50,76 @@ class Row:
 
 @dataclass(frozen=True)
 class BestWarps:
-    """The best of the warps tried at each of n points.
+    """The warp with the highest ZNCC among those tried at each of n points.
 
-    warps : (n, 6), NaN where none stays inside the current image. zncc : (n,), then -1. second_peak : (n,), the best
-    ZNCC of a warp that leads elsewhere, or -1. which : (n,), the number of the best.
+    warps : (n, 6) float64, u v ux uy vx vy (u, v in px); NaN where no warp keeps the subset inside the current image.
+    zncc : (n,) float64, its ZNCC; -1 where there is none.
+    second_peak : (n,) float64, highest ZNCC of a warp whose displacement clearly differs; -1 where there is none.
+    index : (n,) int64, which of the K warps it is.
     """
 
     warps: Floats
     zncc: Floats
     second_peak: Floats
-    which: Indices
+    index: Indices
 
 
-def search_hypotheses(
+def search_warps(
     reference: Reference,
     current: Current,
-    xy: Floats,
+    xy: Pixels,
     warps: Floats,
     radius: int,
     *,
     stride: int = 2,
     separation: float = 4.0,
 ) -> tuple[Floats, Floats, Floats]:
-    """The best of K affine warps at each of n points, by ZNCC over every second pixel of a circular subset.
+    """Best of K given affine warps at each point, by ZNCC over every second pixel of a circular subset.
 
-    xy : (n, 2) px on the reference; warps : (n, K, 6), u v ux uy vx vy at the point, NaN where not to be tried.
-    Returns best (n, 6), its zncc (n,), and second_peak (n,), the best ZNCC of a warp whose displacement differs by
-    more than ``separation`` px. NaN (zncc -1) where no warp stays inside the current image.
+    Parameters
+    ----------
+    reference, current : the images; pixels outside the reference's mask do not count.
+    xy : (n, 2) float64, px, points of the reference image.
+    warps : (n, K, 6) float64, u v ux uy vx vy at the points (u, v in px); NaN where not to be tried.
+    radius : px, of the subset. stride : px, spacing of the pixels that are compared.
+    separation : px, by which another warp's displacement must differ to count for the second peak.
+
+    Returns
+    -------
+    warps : (n, 6), the best; NaN where no warp keeps the subset inside the current image.
+    zncc : (n,), its ZNCC; -1 where there is none.
+    second_peak : (n,), highest ZNCC among the warps that differ by more than ``separation``.
+
+    Raises ValueError if the shapes do not agree.
     """
     if warps.ndim != 3 or warps.shape[::2] != (len(xy), 6) or xy.shape != (len(xy), 2):
         raise ValueError(f"warps must be (n, K, 6) for xy (n, 2), not {warps.shape} for {xy.shape}")
-    row = Row(warps, np.arange(warps.shape[1], dtype=np.float64))
-    found = _search(reference.image, reference.mask, reference.box, current, xy, row, radius, stride, separation, -1.0)
-    return found.warps, found.zncc, found.second_peak
+    hypotheses = WarpHypotheses(warps, np.arange(warps.shape[1], dtype=np.float64))
+    best = _search(
+        reference.image, reference.mask, reference.box, current, xy, hypotheses, radius, stride, separation, -1.0
+    )
+    return best.warps, best.zncc, best.second_peak
 
 
-def search_row(
-    image: NDArray, current: Current, xy: Floats, row: Row, radius: int, *, least: float = -1.0, separation: float = 4.0
+def search_hypotheses(
+    image: NDArray,
+    current: Current,
+    xy: Pixels,
+    hypotheses: WarpHypotheses,
+    radius: int,
+    *,
+    zncc_min: float = -1.0,
+    separation: float = 4.0,
 ) -> BestWarps:
-    """The best warp of a row at each of n points xy (n, 2) px of an image, all pixels of which count.
+    """Best of the interpolated warp hypotheses at each point, by ZNCC over every second pixel of a circular subset.
 
-    As :func:`search_hypotheses`. least : a ZNCC below which a match is of no use: points that the first trial shows to
-    stay below it keep the ZNCC of that trial.
+    image : (h, w) grey levels of the reference; all its pixels count. xy : (n, 2) float64, px, points of it.
+    hypotheses : the warps of these points into the current image. radius : px, of the subset.
+    zncc_min : points for which a first trial on fewer pixels shows that no warp reaches this ZNCC keep the ZNCC of that
+        trial, which saves time. separation : px, by which another warp's displacement must differ to count for the
+        second peak.
     """
-    return _search(image, _ANY_PIXEL, (0, 0), current, xy, row, radius, 2, separation, least)
+    return _search(image, _ANY_PIXEL, (0, 0), current, xy, hypotheses, radius, 2, separation, zncc_min)
 
 
 def _search(
@@ -92,34 +127,40 @@ def _search(
     mask: Mask,
     corner: tuple[int, ...],
     current: Current,
-    xy: Floats,
-    row: Row,
+    xy: Pixels,
+    hypotheses: WarpHypotheses,
     radius: int,
     stride: int,
     separation: float,
-    least: float,
+    zncc_min: float,
 ) -> BestWarps:
+    """Allocate the results, run the kernel over all points and return what it finds.
+
+    mask : (h, w) bool, the pixels of ``image`` that count in a box whose upper left corner is at ``corner`` (x, y) px;
+        an
+    empty mask lets all count.
+    """
     n = len(xy)
-    found = BestWarps(np.full((n, 6), np.nan), np.full(n, -1.0), np.full(n, -1.0), np.zeros(n, np.int64))
-    _best(
+    best = BestWarps(np.full((n, 6), np.nan), np.full(n, -1.0), np.full(n, -1.0), np.zeros(n, np.int64))
+    _best_warps(
         image,
         mask,
         corner[0],
         corner[1],
         current.image,
         np.ascontiguousarray(xy, dtype=np.float64),
-        np.ascontiguousarray(row.knots, dtype=np.float64),
-        row.places,
+        np.ascontiguousarray(hypotheses.knots, dtype=np.float64),
+        hypotheses.knot_coordinates,
         radius,
         stride,
         separation,
-        least,
-        found.warps,
-        found.zncc,
-        found.second_peak,
-        found.which,
+        zncc_min,
+        best.warps,
+        best.zncc,
+        best.second_peak,
+        best.index,
     )
-    return found
+    return best
 
 
 _FAST = {"contract", "reassoc", "arcp", "nsz"}
@@ -127,9 +168,10 @@ _FAST = {"contract", "reassoc", "arcp", "nsz"}
 
 @nb.njit(cache=True, nogil=True, fastmath=_FAST)
 def _pixels(grey, mask, left_of_mask, top_of_mask, jx, iy, off_x, off_y, radius, stride, px):  # type: ignore[no-untyped-def]
-    """Every so many pixels of the circular subset that the mask leaves: dx, dy and grey level less its mean, in px.
+    """Pixels of a circular subset that lie in the mask, every ``stride``-th each way.
 
-    Returns their number and the norm of the levels.
+    Fills px (3, most) with dx, dy from the point and the grey level less the mean of all. (jx, iy) is the pixel nearest
+    to the point, off_x and off_y its distance from it. Returns the number of pixels and the norm of their levels.
     """
     n, total, all_count = 0, 0.0, mask.size == 0
     height, width = grey.shape if all_count else mask.shape
@@ -150,11 +192,13 @@ def _pixels(grey, mask, left_of_mask, top_of_mask, jx, iy, off_x, off_y, radius,
 
 
 @nb.njit(cache=True, nogil=True, fastmath=_FAST)
-def _placed(shape, x0, y0, warp, px, n, radius, nearest, at, share):  # type: ignore[no-untyped-def]
-    """Where n pixels of a subset about (x0, y0) lie under a warp (6,); false where one leaves the image of that shape.
+def _positions(shape, x0, y0, warp, px, n, radius, nearest, at, share):  # type: ignore[no-untyped-def]
+    """Positions of n pixels of a subset in the current image under a warp; false where one lies outside the image.
 
-    Fills at (n,), the number of the pixel that is nearest, or to the upper left; then also share (2, n), how far from
-    that one to the next. Counted from the subset's corner, single precision is enough.
+    shape : (h, w) of the current image; x0, y0 : the point; warp : (6,); px : (3, n), offsets of the pixels.
+    Fills at (n,), flat index of the pixel to the upper left (``nearest``: of the nearest pixel), and, unless
+    ``nearest``, share (2, n), the fraction of a pixel from there to the position. Positions are measured from the
+    corner of the subset, so that single precision is enough.
     """
     kind, half = np.float32, 0.5 if nearest else 0.0
     wide = (radius + 1.0) * (1.0 + abs(warp[2]) + abs(warp[3]))
@@ -183,8 +227,11 @@ def _placed(shape, x0, y0, warp, px, n, radius, nearest, at, share):  # type: ig
 
 
 @nb.njit(cache=True, nogil=True, fastmath=_FAST)
-def _read(image, columns, n, nearest, at, share, level):  # type: ignore[no-untyped-def]
-    """Fills level (n,) with the grey levels of the flat image of so many columns at the places at and share."""
+def _grey_levels(image, columns, n, nearest, at, share, level):  # type: ignore[no-untyped-def]
+    """Grey levels of a flat image at n positions, into level (n,): of the nearest pixel, or interpolated bilinearly.
+
+    at (n,) and share (2, n) are as ``_positions`` fills them; columns : the width of the image.
+    """
     kind, one = np.float32, np.uint64(1)
     if nearest:
         for m in range(np.uint64(n)):
@@ -200,14 +247,15 @@ def _read(image, columns, n, nearest, at, share, level):  # type: ignore[no-unty
 
 
 @nb.njit(cache=True, nogil=True, fastmath=_FAST)
-def _alike(image, shape, x0, y0, warp, px, n, norm, radius, nearest, at, share, level):  # type: ignore[no-untyped-def]
-    """ZNCC of n pixels px (3, n) with the flat image under a warp (6,), bilinear or of the nearest pixels.
+def _zncc(image, shape, x0, y0, warp, px, n, norm, radius, nearest, at, share, level):  # type: ignore[no-untyped-def]
+    """ZNCC of a subset of n pixels px (3, n) with the flat current image under a warp (6,).
 
-    -1 where they leave the image or the warp is NaN. at, share, level : scratch.
+    Grey levels are those of the nearest pixels (``nearest``) or bilinear. norm : of the subset's levels about their
+    mean. -1 where a pixel lies outside the image, the warp is NaN or the image is even. at, share, level : scratch.
     """
-    if n < 8 or not norm > 0.0 or not _placed(shape, x0, y0, warp, px, n, radius, nearest, at, share):
+    if n < 8 or not norm > 0.0 or not _positions(shape, x0, y0, warp, px, n, radius, nearest, at, share):
         return -1.0
-    _read(image, shape[1], n, nearest, at, share, level)
+    _grey_levels(image, shape[1], n, nearest, at, share, level)
     s_g = s_gg = s_fg = 0.0
     for m in range(np.uint64(n)):
         g = float(level[m])
@@ -219,8 +267,8 @@ def _alike(image, shape, x0, y0, warp, px, n, norm, radius, nearest, at, share, 
 
 
 @nb.njit(cache=True, nogil=True)
-def _between(knots, place, warp):  # type: ignore[no-untyped-def]
-    """Fills the warp (6,) at a place among the knots (J, 6)."""
+def _interpolate_knots(knots, place, warp):  # type: ignore[no-untyped-def]
+    """Fill the warp (6,) that lies at a coordinate among the knots (J, 6)."""
     at = int(place)
     share = place - at
     for c in range(6):
@@ -230,17 +278,18 @@ def _between(knots, place, warp):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
-def _best(  # type: ignore[no-untyped-def]
-    grey, mask, left_of_mask, top_of_mask, image, xy, knots, places, radius, stride, separation, least,
-    best, zncc, second_peak, which,
+def _best_warps(  # type: ignore[no-untyped-def]
+    grey, mask, left_of_mask, top_of_mask, image, xy, knots, knot_coordinates, radius, stride, separation, zncc_min,
+    best, zncc, second_peak, index,
 ):  # fmt: skip
-    """The best warp of each point's row, bilinear in the current image; the last four arrays are filled.
+    """Find the best of each point's K warps; fills best (n, 6), zncc, second_peak and index (n,).
 
-    grey, image : the whole images, xy : (n, 2) px in them; mask : (h, w) of the box whose corner is given, or empty.
-    Of many warps those that a quarter of the pixels, read without interpolation, shows to be far from the best, or from
-    any use, keep that first score.
+    grey, image : the whole reference and current images; xy : (n, 2) px in the reference; mask : (h, w) bool of the box
+    whose corner is given, or empty. From ``_MANY`` warps on, all of them are first compared on a quarter of the pixels
+    with nearest-pixel grey levels. Warps that this shows to be far below the best, or below ``zncc_min``, keep that
+    score; the others are compared bilinearly on all pixels.
     """
-    count, flat = len(places), image.ravel()
+    count, flat = len(knot_coordinates), image.ravel()
     for k in nb.prange(xy.shape[0]):
         x0, y0 = xy[k, 0], xy[k, 1]
         jx, iy = math.floor(x0 + 0.5), math.floor(y0 + 0.5)
@@ -253,25 +302,25 @@ def _best(  # type: ignore[no-untyped-def]
                 grey, mask, left_of_mask, top_of_mask, jx, iy, jx - x0, iy - y0, radius, _THINNED * stride, px
             )
             for h in range(count):
-                _between(knots[k], places[h], warp)
-                score[h] = _alike(flat, image.shape, x0, y0, warp, px, n, norm, radius, True, pixel, share, level)
+                _interpolate_knots(knots[k], knot_coordinates[h], warp)
+                score[h] = _zncc(flat, image.shape, x0, y0, warp, px, n, norm, radius, True, pixel, share, level)
                 highest = max(highest, score[h])
             limit = max(highest - _DOUBT, -0.99)
-        if highest > least - _DOUBT or count < _MANY:
+        if highest > zncc_min - _DOUBT or count < _MANY:
             n, norm = _pixels(grey, mask, left_of_mask, top_of_mask, jx, iy, jx - x0, iy - y0, radius, stride, px)
             for h in range(count):
                 if score[h] > limit:
-                    _between(knots[k], places[h], warp)
-                    score[h] = _alike(flat, image.shape, x0, y0, warp, px, n, norm, radius, False, pixel, share, level)
+                    _interpolate_knots(knots[k], knot_coordinates[h], warp)
+                    score[h] = _zncc(flat, image.shape, x0, y0, warp, px, n, norm, radius, False, pixel, share, level)
         at = 0
         for h in range(count):
             if score[h] > score[at]:
                 at = h
-        which[k], zncc[k] = at, score[at]
+        index[k], zncc[k] = at, score[at]
         if score[at] > -1.0:
-            _between(knots[k], places[at], best[k])
+            _interpolate_knots(knots[k], knot_coordinates[at], best[k])
             for h in range(count):
                 if score[h] > second_peak[k]:
-                    _between(knots[k], places[h], warp)
+                    _interpolate_knots(knots[k], knot_coordinates[h], warp)
                     if math.hypot(warp[0] - best[k, 0], warp[1] - best[k, 1]) > separation:
                         second_peak[k] = score[h]

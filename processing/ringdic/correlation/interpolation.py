@@ -1,14 +1,19 @@
 """B-spline interpolation of LANES pixels of a row at once.
 
 While the fractional position t = t0 + s l + q l² of the lanes l = 0, 1 … stays inside one pixel interval, lane l needs
-the coefficients at base + l + tap: every tap is one contiguous load for all lanes, no gather. Where t crosses one
-whole number there is one tap more, and the weights move along by a select. The two axes are independent: four cases.
+the coefficients at base + l + tap: every tap is one contiguous load for all lanes, without a gather. Where t crosses
+one whole number there is one tap more, and a select moves the weights along. The two axes are independent, which gives
+four cases.
 
-With larger gradients the pixels lie within 32 coefficients of a row: every tap is picked from two loads by a
-permutation, in as many rows as the lanes reach. Beyond that (a stretch of 1.7 or more) each pixel finds its own taps.
+With larger gradients the pixels lie within 32 coefficients of a row: each tap is picked from two loads by a
+permutation, in as many rows as the lanes reach. Beyond that (a stretch of 1.7 or more) each pixel is interpolated
+alone.
 
-Weights are those of the B-spline times 6 (cubic) or 120 (quintic), so g is 36 or 14400 times the grey level: the
-criterion does not mind a contrast.
+Weights are those of the B-spline times 6 (cubic) or 120 (quintic), so that g is 36 or 14400 times the grey level: the
+criterion is invariant to contrast.
+
+Common parameters: c, pointer to the coefficients, whose rows are ``stride`` apart; p, index of the first tap of lane 0;
+tx, sx, qx, the position t0 + s l + q l² along x, and ty, sy, qy along y; wx, wy, weights of the taps.
 """
 
 from __future__ import annotations
@@ -19,18 +24,31 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from ringdic.correlation.lanes import LANES, WINDOW, absolute, floor, load, number, picked, put, ramp, select, store
+from ringdic.correlation.lanes import (
+    LANES,
+    WINDOW,
+    absolute,
+    floor,
+    gather,
+    load,
+    load_one,
+    ramp,
+    select,
+    store,
+    store_one,
+)
 
 FAST = {"contract", "reassoc", "arcp", "nsz"}
-# What the pixels of a vector cross: nothing, a whole number along an axis or both; WIDE + n: n of them in y, any in x.
+# Cases of a vector by the pixel borders that its positions cross: 0, none; one along x, one along y, their sum for
+# both; WIDE + n, n along y and any number along x; SCATTERED, more than the window of ``_wide`` reaches.
 ACROSS_X, ACROSS_Y, WIDE, SCATTERED = 1, 2, 4, -1
-REACH_OF_WINDOW = WINDOW - 1 - 5  # px that the window leaves the pixels for six taps
+REACH_OF_WINDOW = WINDOW - 1 - 5  # px that a vector's positions may span so that the window holds six taps of each
 _F, _U = np.float32, np.uint64
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _cubic(t):  # type: ignore[no-untyped-def]
-    """Cubic B-spline at the taps -1 … 2 for a fraction t, times 6."""
+    """Weights of the cubic B-spline at the taps -1 … 2 for a fraction t, times 6."""
     s, t2 = _F(1) - t, t * t
     s2 = s * s
     return s2 * s, t2 * (_F(3) * t - _F(6)) + _F(4), s2 * (_F(3) * s - _F(6)) + _F(4), t2 * t
@@ -38,7 +56,10 @@ def _cubic(t):  # type: ignore[no-untyped-def]
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _quintic(t):  # type: ignore[no-untyped-def]
-    """Quintic B-spline at the taps -2 … 3 for a fraction t, times 120: even and odd parts about t = ½ share factors."""
+    """Weights of the quintic B-spline at the taps -2 … 3 for a fraction t, times 120.
+
+    The even and odd parts about t = ½ share factors.
+    """
     t2, q = t * t, _F(5) * t - _F(2.5)
     h, f = t2 - t, t2 * t2 * t
     h2 = h * h
@@ -52,7 +73,7 @@ def _quintic(t):  # type: ignore[no-untyped-def]
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _cubic_across(t):  # type: ignore[no-untyped-def]
-    """The five taps where t in [0, 2) may cross 1."""
+    """Weights of the cubic B-spline at five taps for t in [0, 2), which may lie in either of two pixel intervals."""
     k, zero = t >= _F(1), _F(0)
     a, b, c, d = _cubic(select(k, t - _F(1), t))
     return select(k, zero, a), select(k, a, b), select(k, b, c), select(k, c, d), select(k, d, zero)
@@ -60,7 +81,7 @@ def _cubic_across(t):  # type: ignore[no-untyped-def]
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _quintic_across(t):  # type: ignore[no-untyped-def]
-    """The seven taps where t in [0, 2) may cross 1."""
+    """Weights of the quintic B-spline at seven taps for t in [0, 2), which may lie in either of two pixel intervals."""
     k, zero = t >= _F(1), _F(0)
     a, b, c, d, e, f = _quintic(select(k, t - _F(1), t))
     first, second, third = select(k, zero, a), select(k, a, b), select(k, b, c)
@@ -68,13 +89,14 @@ def _quintic_across(t):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
-def largest(one, other):  # type: ignore[no-untyped-def]
-    """The larger, lane by lane."""
+def maximum(one, other):  # type: ignore[no-untyped-def]
+    """The larger of two vectors ``one`` and ``other``, lane by lane."""
     return select(one >= other, one, other)
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _positive(t):  # type: ignore[no-untyped-def]
+    """Each lane of t, or 0 where it is negative."""
     return select(t >= _F(0), t, _F(0))
 
 
@@ -97,7 +119,7 @@ def _quintic_at(t):  # type: ignore[no-untyped-def]
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _cubic_slope(t):  # type: ignore[no-untyped-def]
-    """Derivative of _cubic by t."""
+    """Derivative by t of the weights of ``_cubic``."""
     s = _F(1) - t
     b = t * (_F(9) * t - _F(12))
     a, d = -_F(3) * s * s, _F(3) * t * t
@@ -106,7 +128,7 @@ def _cubic_slope(t):  # type: ignore[no-untyped-def]
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _quintic_slope(t):  # type: ignore[no-untyped-def]
-    """Derivative of _quintic by t."""
+    """Derivative by t of the weights of ``_quintic``."""
     s, t2 = _F(1) - t, t * t
     a, f = -_F(5) * s * s * s * s, _F(5) * t2 * t2
     b = -_F(50) + t * (_F(40) + t * (_F(60) + t * (_F(25) * t - _F(80))))
@@ -117,26 +139,30 @@ def _quintic_slope(t):  # type: ignore[no-untyped-def]
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _row4(c, p, w):  # type: ignore[no-untyped-def]
+    """Weighted sum of 4 taps of a row, w their weights."""
     return w[0] * load(c, p) + w[1] * load(c, p + _U(1)) + w[2] * load(c, p + _U(2)) + w[3] * load(c, p + _U(3))
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _row5(c, p, w):  # type: ignore[no-untyped-def]
+    """Weighted sum of 5 taps of a row, w their weights."""
     return _row4(c, p, w) + w[4] * load(c, p + _U(4))
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _row6(c, p, w):  # type: ignore[no-untyped-def]
+    """Weighted sum of 6 taps of a row, w their weights."""
     return _row5(c, p, w) + w[5] * load(c, p + _U(5))
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _row7(c, p, w):  # type: ignore[no-untyped-def]
+    """Weighted sum of 7 taps of a row, w their weights."""
     return _row6(c, p, w) + w[6] * load(c, p + _U(6))
 
 
 def _make_sum(row: Any, taps: int) -> Any:
-    """Σ of so many rows, each with the taps of ``row``."""
+    """Compile the weighted sum over a number of rows, each with the taps of ``row``."""
 
     @nb.njit(forceinline=True, fastmath=FAST)
     def spline(c, p, stride, wx, wy):  # type: ignore[no-untyped-def]
@@ -159,9 +185,9 @@ _q66, _q76, _q67, _q77 = _make_sum(_row6, 6), _make_sum(_row7, 6), _make_sum(_ro
 
 @nb.njit(fastmath=FAST, nogil=True, cache=True)
 def _wide(c, p, stride, tx, sx, qx, ty, sy, qy, rows, quintic, g):  # type: ignore[no-untyped-def]
-    """Any gradients that 32 coefficients of a row cover: taps picked by permutation, ``rows`` more rows of them.
+    """Interpolate pixels that lie within 32 coefficients of a row, taps picked by permutation, into LANES numbers at g.
 
-    g : where to put the grey levels.
+    rows : how many rows of coefficients the pixels reach over, beside those of the taps.
     """
     e = ramp(c)
     x, y = e * (e * qx + sx) + tx + e, e * (e * qy + sy) + ty
@@ -170,16 +196,16 @@ def _wide(c, p, stride, tx, sx, qx, ty, sy, qy, rows, quintic, g):  # type: igno
     if quintic:
         w, row = _quintic(t), y + _F(2)
         for _ in range(rows + _U(6)):
-            taps = w[0] * picked(c, p, whole) + w[1] * picked(c, p, whole + _F(1)) + w[2] * picked(c, p, whole + _F(2))
-            taps += w[3] * picked(c, p, whole + _F(3)) + w[4] * picked(c, p, whole + _F(4))
-            out += _quintic_at(row) * (taps + w[5] * picked(c, p, whole + _F(5)))
+            taps = w[0] * gather(c, p, whole) + w[1] * gather(c, p, whole + _F(1)) + w[2] * gather(c, p, whole + _F(2))
+            taps += w[3] * gather(c, p, whole + _F(3)) + w[4] * gather(c, p, whole + _F(4))
+            out += _quintic_at(row) * (taps + w[5] * gather(c, p, whole + _F(5)))
             row -= _F(1)
             p += stride
     else:
         v, row = _cubic(t), y + _F(1)
         for _ in range(rows + _U(4)):
-            taps = v[0] * picked(c, p, whole) + v[1] * picked(c, p, whole + _F(1))
-            taps += v[2] * picked(c, p, whole + _F(2)) + v[3] * picked(c, p, whole + _F(3))
+            taps = v[0] * gather(c, p, whole) + v[1] * gather(c, p, whole + _F(1))
+            taps += v[2] * gather(c, p, whole + _F(2)) + v[3] * gather(c, p, whole + _F(3))
             out += _cubic_at(row) * taps
             row -= _F(1)
             p += stride
@@ -188,7 +214,7 @@ def _wide(c, p, stride, tx, sx, qx, ty, sy, qy, rows, quintic, g):  # type: igno
 
 @nb.njit(fastmath=FAST, nogil=True, cache=True)
 def _scattered(c, p, stride, tx, sx, qx, ty, sy, qy, quintic, g):  # type: ignore[no-untyped-def]
-    """The same for any gradient: every lane finds its own taps. g : where to put them."""
+    """Interpolate pixels anywhere, one after the other, into LANES numbers at g."""
     for lane in range(LANES):
         e = _F(lane)
         x, y = tx + e * (sx + e * qx), ty + e * (sy + e * qy)
@@ -199,17 +225,18 @@ def _scattered(c, p, stride, tx, sx, qx, ty, sy, qy, quintic, g):  # type: ignor
             wx, wy = _quintic(x - _F(j)), _quintic(y - _F(i))
             for k in range(6):
                 for m in range(6):
-                    out += wy[k] * wx[m] * number(c, first + _U(k) * stride + _U(m))
+                    out += wy[k] * wx[m] * load_one(c, first + _U(k) * stride + _U(m))
         else:
             vx, vy = _cubic(x - _F(j)), _cubic(y - _F(i))
             for k in range(4):
                 for m in range(4):
-                    out += vy[k] * vx[m] * number(c, first + _U(k) * stride + _U(m))
-        put(g, lane, out)
+                    out += vy[k] * vx[m] * load_one(c, first + _U(k) * stride + _U(m))
+        store_one(g, lane, out)
 
 
 @nb.njit(nogil=True, cache=True)
 def _general(c, p, stride, case, tx, sx, qx, ty, sy, qy, quintic, g):  # type: ignore[no-untyped-def]
+    """Interpolate by ``_wide`` or ``_scattered``, as the case demands."""
     if case == SCATTERED:
         _scattered(c, p, stride, tx, sx, qx, ty, sy, qy, quintic, g)
     else:
@@ -217,15 +244,19 @@ def _general(c, p, stride, case, tx, sx, qx, ty, sy, qy, quintic, g):  # type: i
 
 
 def make_interpolation(quintic: bool) -> Any:
-    """The interpolation of one degree."""
+    """Compile the interpolation with a cubic or a quintic B-spline.
+
+    The function that it returns gives the grey levels of LANES pixels of the current image, for any of the cases.
+    """
     weights, across = (_quintic, _quintic_across) if quintic else (_cubic, _cubic_across)
     still, over_x, over_y, over = (_q66, _q76, _q67, _q77) if quintic else (_c44, _c54, _c45, _c55)
 
     @nb.njit(forceinline=True, fastmath=FAST)
     def interpolate(c, p, stride, case, tx, sx, qx, ty, sy, qy, spare):  # type: ignore[no-untyped-def]
-        """Grey levels of the current image, those whose taps begin at p + lane where t < 1.
+        """Grey levels of LANES pixels of the current image, in the scale of the weights.
 
-        c : pointer to the coefficients; case : what the lanes cross; spare : pointer to LANES numbers of scratch.
+        p : index of the first tap of lane 0 for t in [0, 1). case : what the lanes cross, as ``_locate_vectors`` of the
+            kernels computes it. spare : pointer to LANES numbers of scratch.
         """
         e = ramp(c)
         x, y = e * (e * qx + sx) + tx, e * (e * qy + sy) + ty
@@ -246,8 +277,12 @@ def make_interpolation(quintic: bool) -> Any:
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
-def between_pixels(c, p, stride, tx, ty, quintic):  # type: ignore[no-untyped-def]
-    """f, ∂f/∂x and ∂f/∂y of LANES pixels with the same fractions tx, ty; p : the pixel to the upper left."""
+def value_and_gradient(c, p, stride, tx, ty, quintic):  # type: ignore[no-untyped-def]
+    """Grey level f and its derivatives ∂f/∂x and ∂f/∂y of LANES pixels of a row with the same fractions of position.
+
+    c : pointer to the coefficients, rows ``stride`` apart. p : index of the pixel to the upper left of the first one.
+    tx, ty : fractions of the positions, in px. quintic : whether the spline is of degree 5, else 3.
+    """
     if quintic:
         p -= _U(2) * stride + _U(2)
         wx, wy, sx, sy = _quintic(tx), _quintic(ty), _quintic_slope(tx), _quintic_slope(ty)

@@ -1,19 +1,24 @@
-"""Inverse-compositional Gauss-Newton of one subset, and of many on all cores. Plain numbers and arrays only.
+"""Compiled inverse-compositional Gauss-Newton (IC-GN) of subsets: one subset, and many on all cores.
 
-Parameters of a subset, 12: u ux uy uxx uxy uyy v vx vy vxx vxy vyy, so that a pixel at (dx, dy) from the centre
-(x, y) lies in the current image at x + dx + u + ux dx + uy dy + ½ uxx dx² + uxy dx dy + ½ uyy dy², likewise in y
-(Lu & Cary 2000). First order keeps the second derivatives as they come in (zero, or a known curvature): its free
-parameters are six. Criterion: zero-mean normalised sum of squared differences; scheme: Baker & Matthews (2004).
+The functions take plain numbers and arrays only.
 
-Shape of the code. A subset is packed once into vectors of LANES pixels of one row (``subset``): weight (1, or 0 outside
-the subset and the mask), f and its gradient, so a circle and a mask cost nothing. In an iteration every vector finds
-its place in the current image (``_place``); then one pass interpolates it (``interpolation``) and adds it to all the
-sums that a step needs (``_accumulate``), no value of a pixel is stored. The Hessian comes from moments
-Σ q dx^i dy^k of the products of the gradients, no steepest-descent image is stored either.
+Parameters of a subset, 12: u ux uy uxx uxy uyy v vx vy vxx vxy vyy, so that a pixel at (dx, dy) from the centre (x, y)
+lies in the current image at x + dx + u + ux dx + uy dy + ½ uxx dx² + uxy dx dy + ½ uyy dy², likewise in y (Lu & Cary
+2000). First order keeps the second derivatives at their start values (zero, or a known curvature): its free parameters
+are six. Criterion: zero-mean normalised sum of squared differences; scheme: Baker & Matthews (2004).
 
-What the digits hang on: t is small, so single precision resolves it to 1e-7 px; f and g are taken about a level near
-their mean; lanes are summed in single precision over a strip, everything after that in double. With float64 images
+Structure. A subset is packed once into vectors of LANES pixels of one row (``subset``): the grey level f and its
+gradient, zero for pixels outside the subset or the mask, so that a circle and a mask cost nothing. An iteration first
+computes the position of every vector in the current image (``_locate_vectors``). One pass over the vectors then
+interpolates the grey levels g (``interpolation``) and adds them to all the sums that a step needs (``_accumulate``); no
+value of a pixel is stored. The Hessian comes from the moments Σ q dx^i dy^k of products q of the gradients; no
+steepest-descent image is stored either.
+
+Precision. With float32 images, fractions of pixels resolve 1e-7 px; f and g are taken about a level near their mean;
+lanes are summed in single precision over a strip of the subset, everything after that in double. With float64 images
 all of it is double.
+
+``kernels.md`` beside this file says why it is built so and what each part gains.
 """
 
 # Numba's cache follows the file of the compiled function alone: after a change in what it imports, remove __pycache__.
@@ -32,21 +37,21 @@ from ringdic.correlation.interpolation import (
     REACH_OF_WINDOW,
     SCATTERED,
     WIDE,
-    largest,
     make_interpolation,
+    maximum,
 )
 from ringdic.correlation.lanes import (
     BITS,
     LANES,
-    chosen,
     floor,
+    lane_sum,
     load,
+    mask_from_bits,
     pointer,
     ramp,
     select,
     store,
-    store_whole,
-    total,
+    store_integers,
 )
 from ringdic.correlation.spline import PAD
 from ringdic.correlation.subset import (
@@ -54,14 +59,16 @@ from ringdic.correlation.subset import (
     GY,
     MOMENTS,
     REF,
-    add,
-    level_at,
+    add_to_row,
+    centre_level,
     moments,
     normal_matrix,
     pack,
-    take,
+    pack_interior,
+    read_cache,
     template,
     well_inside,
+    write_cache,
 )
 from ringdic.correlation.warps import cholesky, compose_inverse, compose_inverse_affine, solve_cholesky, variance
 
@@ -69,25 +76,28 @@ GOOD, NO_CONVERGENCE, OUTSIDE, NO_TEXTURE = 0, 2, 5, 6
 N_PARAMETERS = 12
 _F, _U = np.float32, np.uint64
 _L = np.uint64(LANES)
-_LAST_DIGIT = 1e-5  # px; steps below it that shrink no more are the rounding of single precision
-_CAUTION = 2.0  # the steps may come to shrink half as fast as the last one did, or as those of other points
-_SHOWN = 4  # points of a chunk that must have made two steps before others may stop after one
-_ALIKE = 2.0  # times their 1 - ZNCC that such a point may have
-_HOPELESS = 6  # steps after which it is foretold whether a point will be there in time
-_SPAN = 3  # steps over which that is judged
+_ROUNDING = 1e-5  # px; steps below it that no longer shrink are rounding errors of single precision
+_SLOWER = 2.0  # safety factor on the predicted length of the next step: steps may shrink half as fast
+_SAMPLE = 4  # points of a chunk that must have made two steps before another may stop after one
+_SIMILAR = 2.0  # largest 1 - ZNCC of a point that may stop after one step, times the mean of those points
+_JUDGED_FROM = 6  # steps from which on a point is given up that will not converge in the steps left
+_SPAN = 3  # steps over which the speed of convergence is then judged
 _CHUNK = 64  # points that share their scratch memory
-_SURE = 0.9  # ZNCC of a match that others may follow
+_RELIABLE = 0.9  # least ZNCC of a match that the next point may start from
 _PAD = PAD
 
 
 @nb.njit(fastmath=FAST, nogil=True, cache=True)
-def _place(fx, fy, p, corner, n, place, cell):  # type: ignore[no-untyped-def]
-    """Where n vectors lie in the current image, LANES of them at a time.
+def _locate_vectors(fx, fy, p, corner, n, place, cell):  # type: ignore[no-untyped-def]
+    """Positions of n vectors of pixels in the current image under the warp p (12,), LANES vectors at a time.
 
-    fx, fy : fraction of the centre's position; corner : (2, m), dx and dy of lane 0, m the multiple of LANES from n on.
-    place : (4, m) fraction and slope, tx sx ty sy, filled; cell : (3, m) int32, filled: column and row of the first
-    tap but for the degree's offset, counted from the centre's pixel, and the case. A vector's own dx and dy are whole
-    and added last, so the rest is small and exact enough in single precision.
+    fx, fy : fraction of the centre's position. corner : (2, m), dx and dy of lane 0 of each vector, m the multiple of
+        LANES from n on.
+    place : (4, m), filled: tx sx ty sy, fraction of the position of lane 0 and slope from lane to lane, in x and in y.
+    cell : (3, m) int32, filled: column and row of the pixel at the position, counted from the centre's, and the case of
+        the interpolation.
+
+    A vector's own dx and dy are whole numbers and added last, so that the rest is small and single precision is enough.
     """
     kind = place.dtype.type
     ux, uy, vx, vy = kind(p[1]), kind(p[2]), kind(p[7]), kind(p[8])
@@ -103,15 +113,15 @@ def _place(fx, fy, p, corner, n, place, cell):  # type: ignore[no-untyped-def]
         y = dx * (qy * dx + yx * dy + vx) + dy * (my * dy + vy) + fy
         sx, sy = (qx + qx) * dx + xy * dy + ux, (qy + qy) * dx + yx * dy + vx
         x_far, y_far = far * (sx + far * qx) + x, far * (sy + far * qy) + y
-        j, i = floor(_smallest(x, x_far) - bend_x), floor(_smallest(y, y_far) - bend_y)
-        wide, high = floor(largest(x, x_far) + bend_x) - j, floor(largest(y, y_far) + bend_y) - i
+        j, i = floor(_minimum(x, x_far) - bend_x), floor(_minimum(y, y_far) - bend_y)
+        wide, high = floor(maximum(x, x_far) + bend_x) - j, floor(maximum(y, y_far) + bend_y) - i
         window = select(
-            largest(x, x_far + far) + bend_x - j >= kind(REACH_OF_WINDOW), kind(SCATTERED), high + kind(WIDE)
+            maximum(x, x_far + far) + bend_x - j >= kind(REACH_OF_WINDOW), kind(SCATTERED), high + kind(WIDE)
         )
-        store_whole(number, v, j + dx)
-        store_whole(number, v + step, i + dy)
+        store_integers(number, v, j + dx)
+        store_integers(number, v + step, i + dy)
         near = wide * kind(ACROSS_X) + high * kind(ACROSS_Y)
-        store_whole(number, v + step + step, select(largest(wide, high) >= one + one, window, near))
+        store_integers(number, v + step + step, select(maximum(wide, high) >= one + one, window, near))
         store(shape, v, x - j)
         store(shape, v + step, sx)
         store(shape, v + step + step, y - i)
@@ -119,13 +129,17 @@ def _place(fx, fy, p, corner, n, place, cell):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
-def _smallest(one, other):  # type: ignore[no-untyped-def]
+def _minimum(one, other):  # type: ignore[no-untyped-def]
+    """The smaller of two vectors, lane by lane."""
     return select(one >= other, other, one)
 
 
 @nb.njit(nogil=True, cache=True)
-def _inside(shape, x, y, p, reach):  # type: ignore[no-untyped-def]
-    """Whether all pixels within ``reach`` of the centre clearly lie inside the current image."""
+def _clearly_inside(shape, x, y, p, reach):  # type: ignore[no-untyped-def]
+    """Whether all pixels within ``reach`` of the centre certainly lie inside the current image.
+
+    shape : of the padded coefficients. x, y : the centre. p : (12,), the warp.
+    """
     x0, y0, r = x + p[0], y + p[6], float(reach)
     reach_x = r * (1.0 + abs(p[1]) + abs(p[2]) + r * (0.5 * abs(p[3]) + abs(p[4]) + 0.5 * abs(p[5])))
     reach_y = r * (1.0 + abs(p[7]) + abs(p[8]) + r * (0.5 * abs(p[9]) + abs(p[10]) + 0.5 * abs(p[11])))
@@ -134,8 +148,11 @@ def _inside(shape, x, y, p, reach):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, cache=True)
-def _stays(shape, x, y, p, corner, bits):  # type: ignore[no-untyped-def]
-    """Whether the pixels that count lie in the image, and the others in its padding."""
+def _all_pixels_inside(shape, x, y, p, corner, bits):  # type: ignore[no-untyped-def]
+    """Whether the pixels of the subset lie in the current image, and the other lanes of its vectors in the padding.
+
+    shape : of the padded coefficients. x, y : the centre. p : (12,), the warp. corner, bits : of the vectors.
+    """
     last_x, last_y = float(shape[1] - 2 * _PAD - 1), float(shape[0] - 2 * _PAD - 1)
     x0, y0 = x + p[0], y + p[6]
     for v in range(bits.shape[0]):
@@ -151,30 +168,31 @@ def _stays(shape, x, y, p, corner, bits):  # type: ignore[no-untyped-def]
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _by_power(at, row, x, q0, q1, q2, second):  # type: ignore[no-untyped-def]
-    """Lanes of q φ of a strip added to three or six rows of scratch; q_k : Σ q dy^k."""
+    """Add a strip's sums of q φ to three rows of scratch, to six for second order; q_k : Σ q dy^k of each lane."""
     qx = q0 * x
-    add(at, row, q0)
-    add(at, row + 1, qx)
-    add(at, row + 2, q1)
+    add_to_row(at, row, q0)
+    add_to_row(at, row + 1, qx)
+    add_to_row(at, row + 2, q1)
     if second:
-        add(at, row + 3, _F(0.5) * (qx * x))
-        add(at, row + 4, q1 * x)
-        add(at, row + 5, _F(0.5) * q2)
+        add_to_row(at, row + 3, _F(0.5) * (qx * x))
+        add_to_row(at, row + 4, q1 * x)
+        add_to_row(at, row + 5, _F(0.5) * q2)
 
 
 def _make_pass(quintic: bool, second: bool) -> Any:
-    """The pass over a subset of one degree and order."""
+    """Compile the pass over a subset for one degree of the spline and one order of the shape functions."""
     interpolate = make_interpolation(quintic)
 
     @nb.njit(fastmath=FAST, nogil=True)
     def accumulate(  # type: ignore[no-untyped-def]
         coef, stride, origin, place, cell, bend, px, bits, corner, strips, level, scratch, sums
     ):  # fmt: skip
-        """One pass over the subset in the current image, g taken about ``level``.
+        """Interpolate the subset in the current image, g about ``level``, and sum what a step needs.
 
-        coef : flat, origin : index of the centre's first tap; place, cell of the vectors; bend : (2,) their quadratic
-        terms; scratch : (17, LANES). sums : (16,), Σg, Σg², Σfg, spare, then Σ g ∂f/∂x φ_k (6) and Σ g ∂f/∂y φ_k (6)
-        with φ = 1 dx dy dx²/2 dxdy dy²/2.
+        coef : flat coefficients; origin : index of the centre's first tap; place, cell : of the vectors; bend : (2,),
+            their
+        quadratic terms; px, bits, corner, strips : the packed subset; scratch : (17, LANES). sums : (16,), filled: Σg,
+        Σg², Σfg, unused, then Σ g ∂f/∂x φ_k (6) and Σ g ∂f/∂y φ_k (6) with φ = 1 dx dy dx²/2 dxdy dy²/2.
         """
         ref, gx, gy = pointer(px[REF]), pointer(px[GX]), pointer(px[GY])
         c, at_sum, spare, qx, qy = pointer(coef), pointer(scratch), pointer(scratch[16]), bend[0], bend[1]
@@ -186,7 +204,7 @@ def _make_pass(quintic: bool, second: bool) -> Any:
                 p = _U(origin + np.int64(cell[1, v]) * np.int64(stride) + np.int64(cell[0, v]))
                 tx, sx, ty, sy = place[0, v], place[1, v], place[2, v], place[3, v]
                 g = interpolate(c, p, stride, cell[2, v], tx, sx, qx, ty, sy, qy, spare)
-                g = select(chosen(bits[v]), g - level, _F(0))
+                g = select(mask_from_bits(bits[v]), g - level, _F(0))
                 sg += g
                 sgg += g * g
                 sfg += g * load(ref, at)
@@ -199,14 +217,14 @@ def _make_pass(quintic: bool, second: bool) -> Any:
                     a2 += ga * (y * y)
                     b2 += gb * (y * y)
             x = ramp(c) + corner[0, strips[s]]
-            add(at_sum, 0, sg)
-            add(at_sum, 1, sgg)
-            add(at_sum, 2, sfg)
+            add_to_row(at_sum, 0, sg)
+            add_to_row(at_sum, 1, sgg)
+            add_to_row(at_sum, 2, sfg)
             _by_power(at_sum, 4, x, a0, a1, a2, second)
             _by_power(at_sum, 10, x, b0, b1, b2, second)
         for k in range(16):
             if k < 3 or k in (4, 5, 6, 10, 11, 12) or (second and k > 3):
-                sums[k] = total(load(at_sum, _U(k) * _L))
+                sums[k] = lane_sum(load(at_sum, _U(k) * _L))
 
     return accumulate
 
@@ -217,6 +235,7 @@ _quintic_first, _quintic_second = _make_pass(True, False), _make_pass(True, True
 
 @nb.njit(nogil=True, cache=True)
 def _accumulate(quintic, second, *given):  # type: ignore[no-untyped-def]
+    """Run the pass over a subset that is compiled for this degree and order."""
     if quintic:
         if second:
             _quintic_second(*given)
@@ -230,9 +249,9 @@ def _accumulate(quintic, second, *given):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _step(H, sums, sum_J, sum_fJ, mean_g, ratio, terms, b, d):  # type: ignore[no-untyped-def]
-    """The increment d (12,) of the parameters from one pass, and by how much it lowers the sum of squares.
+    """Increment d (12,) of the parameters from the sums of one pass; returns by how much it lowers the sum of squares.
 
-    b : (2 terms,) scratch.
+    H : Cholesky factor of the normal matrix. ratio : of the norms of f and g. b : (2 terms,) scratch.
     """
     for k in range(terms):
         b[k] = ratio * (sums[4 + k] - mean_g * sum_J[k]) - sum_fJ[k]
@@ -247,8 +266,8 @@ def _step(H, sums, sum_J, sum_fJ, mean_g, ratio, terms, b, d):  # type: ignore[n
 
 
 @nb.njit(cache=True, nogil=True)
-def _length(d, radius):  # type: ignore[no-untyped-def]
-    """Square of the motion of the subset's rim under an increment, px²."""
+def _step_square(d, radius):  # type: ignore[no-untyped-def]
+    """Mean square displacement, px², of the subset's rim under an increment d (12,)."""
     r2 = float(radius * radius)
     first = d[1] ** 2 + d[2] ** 2 + d[7] ** 2 + d[8] ** 2
     second = d[3] ** 2 + d[5] ** 2 + d[9] ** 2 + d[11] ** 2 + 4 * (d[4] ** 2 + d[10] ** 2)
@@ -256,88 +275,60 @@ def _length(d, radius):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def _foretold(moved, previous, second, unlike, shown):  # type: ignore[no-untyped-def]
-    """Square of the next step's length, after one of square ``moved`` and before that ``previous``, 0 for none.
+def _next_step_square(step_square, previous, second, unlike, convergence):  # type: ignore[no-untyped-def]
+    """Predicted square of the next step's length, from the squares of the last step and of the one before (0 for none).
 
-    Steps shrink as the last two tell. After a single one they shrink as those of other points of the same images did,
-    where this one's 1 - ZNCC, ``unlike``, is like theirs. second : whether it was the point's second step. shown : (3,)
-    sums over those points: their number, by what factor their second step was shorter, and their 1 - ZNCC; brought up
-    to date.
+    Steps shrink by the factor between the last two. After a first step, the factor is taken from other points of the
+    same images, if this point's 1 - ZNCC, ``unlike``, is like theirs. second : whether this was the point's second
+    step; then it is added to convergence (3,), sums over such points: their number, their shrinkage factors, and their
+    1 - ZNCC.
     """
     if previous == 0.0:
-        if shown[0] < _SHOWN or unlike * shown[0] > _ALIKE * shown[2]:
-            return moved
-        shrinking = shown[1] / shown[0]
+        if convergence[0] < _SAMPLE or unlike * convergence[0] > _SIMILAR * convergence[2]:
+            return step_square
+        shrinkage = convergence[1] / convergence[0]
     else:
-        shrinking = math.sqrt(moved / previous)
+        shrinkage = math.sqrt(step_square / previous)
         if second:
-            shown[0] += 1.0
-            shown[1] += min(shrinking, 1.0)
-            shown[2] += unlike
-    return moved * min(_CAUTION * shrinking, 1.0) ** 2
-
-
-@nb.njit(cache=True, nogil=True)
-def _keep(kept, size, H, sum_J, sum_fJ, mean_f, norm_f, pixels):  # type: ignore[no-untyped-def]
-    """What does not depend on the current image, written to a row of ``width_of_subset`` numbers."""
-    at = 3
-    kept[0], kept[1], kept[2] = mean_f, norm_f, pixels
-    for i in range(size):
-        kept[at], kept[at + 1] = sum_J[i], sum_fJ[i]
-        at += 2
-        for j in range(i + 1):
-            kept[at] = H[i, j]
-            at += 1
-
-
-@nb.njit(cache=True, nogil=True)
-def _recall(kept, size, H, sum_J, sum_fJ):  # type: ignore[no-untyped-def]
-    """The same read. Returns the mean of f, its norm about that, and the number of pixels."""
-    at = 3
-    for i in range(size):
-        sum_J[i], sum_fJ[i] = kept[at], kept[at + 1]
-        at += 2
-        for j in range(i + 1):
-            H[i, j] = kept[at]
-            at += 1
-    return kept[0], kept[1], kept[2]
-
-
-def width_of_subset(order: int) -> int:
-    """Numbers of a subset that do not depend on the current image."""
-    size = 6 * order
-    return 3 + 2 * size + size * (size + 1) // 2
+            convergence[0] += 1.0
+            convergence[1] += min(shrinkage, 1.0)
+            convergence[2] += unlike
+    return step_square * min(_SLOWER * shrinkage, 1.0) ** 2
 
 
 @nb.njit(forceinline=True, nogil=True)
 def _refine_point(  # type: ignore[no-untyped-def]
     image, gx, gy, coef_ref, stride_ref, mask, shape_ref, coef, shape, x_ref, y_ref, x_cur, y_cur, p,
     corner, corner_f, offset, uncut, strips, radius, terms, quintic, tolerance, max_iterations, texture, noise,
-    kept, known, row_kept, shown, px, bits, place, cell, bend, lanes, H, moment, vectors, A, B,
+    cache, cached, cache_row, convergence, px, bits, place, cell, bend, lanes, H, moment, vectors, A, B,
 ):  # fmt: skip
-    """IC-GN of one subset from the parameters p (12,), refined in place.
+    """IC-GN of one subset from the parameters p (12,), refined in place; returns status, ZNCC, iterations, sigma of u,
+    of v.
 
-    (x_ref, y_ref) and (x_cur, y_cur) : the centre in the two images' own crops; corner, uncut, strips : the template,
-    corner_f the same as floats, filled up to a multiple of LANES; offset : (n,) of lane 0 from the centre in the
-    reference's crop; kept, known : what was found of subsets before, this one's in row ``row_kept``, -1 for none;
-    shown : (3,), how steps have shrunk so far, see ``_foretold``; the rest is scratch. Returns status, ZNCC,
-    iterations, sigma of u and of v (px).
+    (x_ref, y_ref) and (x_cur, y_cur) : the centre in the two images' own crops. corner, uncut, strips : the template;
+    corner_f the same as floats, filled up to a multiple of LANES. offset : (n,), of lane 0 from the centre in the
+    reference's crop. cache, cached, cache_row : rows of values that ``write_cache`` stored, which of them are filled,
+    and this subset's row, -1 for none. convergence : (3,), see ``_next_step_square``. The rest is scratch. Sigma is in
+    px.
+
+    One function of more than a screen on purpose: it is inlined into the loop over the points (a call would hand over
+    some forty arrays, a twentieth of a point's time), and its parts share nearly all of their variables.
     """
     n, size, second, kind = corner.shape[1], 2 * terms, terms == 6, px.dtype.type
     sums, sum_J, sum_fJ, b, d = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4]
     d[:] = 0.0
     column, row = math.floor(x_ref), math.floor(y_ref)
-    level = level_at(image, shape_ref, x_ref, y_ref)
+    level = centre_level(image, shape_ref, x_ref, y_ref)
     direct = x_ref == column and y_ref == row and well_inside(shape_ref, x_ref, y_ref, radius)
     if not direct:
         pack(
             image, gx, gy, coef_ref, stride_ref, mask, shape_ref, x_ref, y_ref, radius, quintic, corner, uncut, px, bits
         )
     at_centre = row * shape_ref[1] + column
-    if row_kept >= 0 and known[row_kept]:
+    if cache_row >= 0 and cached[cache_row]:
         if direct:
-            take(image, gx, gy, mask, at_centre, offset, level, uncut, px, bits)
-        mean_f, norm_f, pixels = _recall(kept[row_kept], size, H, sum_J, sum_fJ)
+            pack_interior(image, gx, gy, mask, at_centre, offset, level, uncut, px, bits)
+        mean_f, norm_f, pixels = read_cache(cache[cache_row], size, H, sum_J, sum_fJ)
     else:
         sum_f, sum_ff, count = moments(
             direct, second,
@@ -354,21 +345,23 @@ def _refine_point(  # type: ignore[no-untyped-def]
         spread = math.sqrt((0.5 * (H[0, 0] - H[terms, terms])) ** 2 + H[terms, 0] ** 2)
         if not half_trace - spread > pixels * texture * texture or not norm_f > 0.0 or not cholesky(H, size):
             return NO_TEXTURE, np.nan, 0, np.nan, np.nan
-        if row_kept >= 0:
-            _keep(kept[row_kept], size, H, sum_J, sum_fJ, mean_f, norm_f, pixels)
-            known[row_kept] = True
+        if cache_row >= 0:
+            write_cache(cache[cache_row], size, H, sum_J, sum_fJ, mean_f, norm_f, pixels)
+            cached[cache_row] = True
 
     stride, first_tap = _U(shape[1]), 2 if quintic else 1
-    last_digit = _LAST_DIGIT if px.itemsize == 4 else 0.0
+    rounding = _ROUNDING if px.itemsize == 4 else 0.0
     about = (level + mean_f) * (14400.0 if quintic else 36.0)  # in the scale of the interpolated g
     status, zncc, iterations, previous = NO_CONVERGENCE, np.nan, 0, 0.0
     limit, earlier = tolerance * tolerance, (np.inf, np.inf)
     for _ in range(max_iterations):
         iterations += 1
-        if not _inside(shape, x_cur, y_cur, p, radius + LANES) and not _stays(shape, x_cur, y_cur, p, corner, bits):
+        if not _clearly_inside(shape, x_cur, y_cur, p, radius + LANES) and not _all_pixels_inside(
+            shape, x_cur, y_cur, p, corner, bits
+        ):
             return OUTSIDE, np.nan, iterations, np.nan, np.nan
         column, row = math.floor(x_cur + p[0]), math.floor(y_cur + p[6])
-        _place(kind(x_cur + p[0] - column), kind(y_cur + p[6] - row), p, corner_f, n, place, cell)
+        _locate_vectors(kind(x_cur + p[0] - column), kind(y_cur + p[6] - row), p, corner_f, n, place, cell)
         origin = (row + _PAD - first_tap) * shape[1] + column + _PAD - first_tap
         bend[0], bend[1] = 0.5 * p[3], 0.5 * p[9]
         about = float(kind(about))
@@ -384,25 +377,25 @@ def _refine_point(  # type: ignore[no-untyped-def]
         zncc = min((sums[2] - mean_f * sums[0]) / (norm_f * norm_g), 1.0)
         gain = _step(H, sums, sum_J, sum_fJ, mean_g, norm_f / norm_g, terms, b, d)
         about += mean_g
-        moved = _length(d, radius)
-        if not moved < 4.0 * radius * radius:
+        step_square = _step_square(d, radius)
+        if not step_square < 4.0 * radius * radius:
             break
         if not (compose_inverse(p, d, A, B) if second else compose_inverse_affine(p, d)):
             break
-        left = _foretold(moved, previous, iterations == 2, 1.0 - zncc, shown)
-        if left < limit or 0.0 < previous <= moved < last_digit * last_digit:
+        next_square = _next_step_square(step_square, previous, iterations == 2, 1.0 - zncc, convergence)
+        if next_square < limit or 0.0 < previous <= step_square < rounding * rounding:
             status = GOOD
-            zncc = min(zncc + 0.5 * gain / (norm_f * norm_f), 1.0)  # where the last step leads
+            zncc = min(zncc + 0.5 * gain / (norm_f * norm_f), 1.0)  # after the last step
             break
-        if iterations >= _HOPELESS and moved >= last_digit * last_digit:
-            shrinking = math.log(earlier[1] / moved) / _SPAN
-            if not iterations + math.log(moved / limit) / shrinking < max_iterations:
+        if iterations >= _JUDGED_FROM and step_square >= rounding * rounding:
+            shrinkage = math.log(earlier[1] / step_square) / _SPAN
+            if not iterations + math.log(step_square / limit) / shrinkage < max_iterations:
                 break
         earlier = (previous, earlier[0])
-        previous = moved
+        previous = step_square
     if status != GOOD:
         return status, zncc, iterations, np.nan, np.nan
-    # Residual variance f' - r g' holds both images' noise: √2 σ.
+    # The residual f' - r g' contains the noise of both images: its standard deviation is √2 σ.
     scatter = math.sqrt(2.0) * noise
     if not noise > 0.0:
         scatter = norm_f * math.sqrt(max(2.0 * (1.0 - zncc), 0.0) / (pixels - size - 2))
@@ -411,8 +404,11 @@ def _refine_point(  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def _follow(source, offset, reach, p):  # type: ignore[no-untyped-def]
-    """p (12,) becomes what the source's parameters (12,) are at an offset (2,) px, unless they say otherwise than p."""
+def _start_from_previous(source, offset, reach, p):  # type: ignore[no-untyped-def]
+    """Replace the start values p (12,) by another point's match, extrapolated by an offset (2,) px, if the two agree.
+
+    source : (12,), parameters of that match. reach : px, largest offset. They agree if they differ by less than 1 px.
+    """
     dx, dy = offset
     if max(abs(dx), abs(dy)) > reach:
         return
@@ -428,7 +424,9 @@ def _follow(source, offset, reach, p):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _scratch(rows, columns, kind):  # type: ignore[no-untyped-def]
-    """(rows, columns) of the type of ``kind``, from a multiple of 64 bytes on: a vector is one line of the cache."""
+    """Scratch array (rows, columns) of the type of ``kind``, aligned to 64 bytes so that a vector is one line of the
+    cache.
+    """
     raw = np.empty(rows * columns + 64 // kind.itemsize, kind.dtype)
     skip = (-raw.ctypes.data % 64) // kind.itemsize
     return raw[skip : skip + rows * columns].reshape(rows, columns)
@@ -437,19 +435,27 @@ def _scratch(rows, columns, kind):  # type: ignore[no-untyped-def]
 @nb.njit(cache=True, nogil=True, parallel=True)
 def refine_points(  # type: ignore[no-untyped-def]
     image, gx, gy, coef_ref, mask, origin_ref, coef, origin_cur, xy, order, parameters, known,
-    radius, circle, terms, quintic, tolerance, max_iterations, texture, noise, follow,
-    kept, known_subset, row_kept, status, zncc, iterations, sigma,
+    radius, circle, terms, quintic, tolerance, max_iterations, texture, noise, neighbour_reach,
+    cache, cached, cache_row, status, zncc, iterations, sigma,
 ):  # fmt: skip
-    """IC-GN of many subsets in parallel; chunks of them are independent of one another, so of the number of threads.
+    """IC-GN of many subsets in parallel, in independent chunks, so that results do not depend on the number of threads.
 
-    image, gx, gy, mask : (h, w) crop of the reference at origin_ref (x, y), coef_ref its coefficients, padded.
-    coef : padded coefficients of the crop of the current image at origin_cur.
-    xy : (n, 2) px. order : (n,), that in which the points are taken. parameters : (n, 12), start values in and results
-    out. known : (n,) bool, points to refine.
-    follow : px; a point no farther from the one before it starts from that one's result where it is a good match and
-    agrees with the point's own start value; 0 never. kept : (N, width_of_subset), what was found of N subsets of this
-    reference before, and known_subset : (N,) bool, of which; both filled; row_kept : (n,), each point's row, -1 for
-    none. status, zncc, iterations (n,) and sigma (n, 2) are filled where known.
+    Parameters
+    ----------
+    image, gx, gy, mask : (h, w), grey levels, their gradient and the mask of the reference's crop at origin_ref (x, y).
+    coef_ref : padded coefficients of that crop. coef : padded coefficients of the current image's crop at origin_cur.
+    xy : (n, 2) px, points. order : (n,), the order in which they are taken.
+    parameters : (n, 12), start values, replaced by the results. known : (n,) bool, points to refine.
+    radius, circle : of the subset, px, and whether it is a circle or a square.
+    terms : free parameters of each displacement, 3 or 6. quintic : whether the spline is of degree 5, else 3.
+    tolerance : px, of a step's effect on the subset's rim. max_iterations : after which a point is given up.
+    texture : least root-mean-square gradient. noise : standard deviation of the grey levels, 0 to take it from the
+        residual.
+    neighbour_reach : px; a point no farther from the previous one starts from that one's result if this is a reliable
+        match and agrees with the point's own start value; 0 for never.
+    cache : (N, width_of_subset), values of N subsets of this reference. cached : (N,) bool, rows that are filled.
+        cache_row : (n,), each point's row, -1 for none. The first two are filled on the way.
+    status, zncc, iterations, sigma : (n,), the last (n, 2) px; results, filled where known.
     """
     corner, uncut, strips = template(radius, circle)
     flat_ref, flat, n = coef_ref.ravel(), coef.ravel(), corner.shape[1]
@@ -463,17 +469,17 @@ def refine_points(  # type: ignore[no-untyped-def]
         bits, cell, bend = np.empty(n, BITS), np.empty((3, m), np.int32), np.empty(2, coef.dtype)
         H, moment, vectors = np.empty((2 * terms, 2 * terms)), np.empty((7, 15)), np.empty((5, 16))
         A, B = np.empty((6, 6)), np.empty((6, 6))
-        before, shown = -1, np.zeros(3)
+        before, convergence = -1, np.zeros(3)
         for k in order[chunk * _CHUNK : (chunk + 1) * _CHUNK]:
             if known[k]:
                 if before >= 0:
-                    _follow(parameters[before], xy[k] - xy[before], follow, parameters[k])
+                    _start_from_previous(parameters[before], xy[k] - xy[before], neighbour_reach, parameters[k])
                 result = _refine_point(
                     image_, gx_, gy_, flat_ref, _U(coef_ref.shape[1]), mask_, image.shape, flat, coef.shape,
                     xy[k, 0] - origin_ref[0], xy[k, 1] - origin_ref[1], xy[k, 0] - origin_cur[0],
                     xy[k, 1] - origin_cur[1], parameters[k], corner, corner_f, offset, uncut, strips,
                     radius, terms, quintic, tolerance, max_iterations, texture, noise,
-                    kept, known_subset, row_kept[k], shown,
+                    cache, cached, cache_row[k], convergence,
                     px, bits, place, cell, bend, lanes, H, moment, vectors, A, B,
                 )  # fmt: skip
                 status[k] = result[0]
@@ -481,4 +487,4 @@ def refine_points(  # type: ignore[no-untyped-def]
                 iterations[k] = result[2]
                 sigma[k, 0] = result[3]
                 sigma[k, 1] = result[4]
-                before = k if follow > 0.0 and result[0] == GOOD and result[1] > _SURE else -1
+                before = k if neighbour_reach > 0.0 and result[0] == GOOD and result[1] > _RELIABLE else -1

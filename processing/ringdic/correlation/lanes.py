@@ -1,10 +1,12 @@
-"""LANES numbers at once, as a value of numba's: a LLVM vector with arithmetic, loads, selects and sums.
+"""A vector of LANES numbers as a value in numba code: an LLVM vector with arithmetic, loads, selects and sums.
 
-A loop over pixels that numba is to vectorise keeps no sums in registers from one row to the next, and which of
-its loads become gathers is the optimiser's choice. With the vector as a value nothing is left to it, and the code of
-an equation stays the code of the equation: + - * with vectors and scalars, ``>=``, ``select``, ``load``, ``total``.
-There are sixteen of them where the processor works on 512 bits at once, else eight: AMD's Zen 4 takes 512 bits in two
-halves, so they gain nothing there, and narrower vectors waste fewer pixels at the rim of a subset.
+Where numba vectorises a loop over pixels, sums do not stay in registers from one row to the next, and the optimiser
+decides which loads become gathers. With the vector as a value both are certain, and the code of an equation still reads
+as the equation: + - * with vectors and scalars, ``>=``, ``select``, ``load``, ``lane_sum``. LANES is 16 where the
+processor computes 512 bits at once, else 8: AMD's Zen 4 takes 512 bits in two halves, so that they gain nothing there,
+and narrower vectors waste fewer pixels at the rim of a subset.
+
+In all functions ``start`` is a pointer from ``pointer``, and ``index`` counts numbers from there.
 """
 
 from __future__ import annotations
@@ -24,23 +26,23 @@ from numba.extending import lower_builtin, models, register_model
 
 
 def _avx512() -> bool:
-    """Whether numba compiles for a processor with AVX-512: this one, or that of NUMBA_CPU_FEATURES."""
+    """Whether numba compiles for a processor with AVX-512: this one, or the one that NUMBA_CPU_FEATURES describes."""
     asked = numba.config.CPU_FEATURES  # type: ignore[attr-defined]
     return bool(get_host_cpu_features().get("avx512f")) if asked is None else "+avx512f" in asked.split(",")
 
 
 _AVX512 = _avx512()
 LANES = 16 if _AVX512 and get_host_cpu_name() != "znver4" else 8
-WINDOW = 32  # numbers that ``picked`` picks from
+WINDOW = 32  # numbers that ``gather`` reaches
 BITS = np.uint16 if LANES == 16 else np.uint8  # one bit a lane
 _BITS = types.uint16 if LANES == 16 else types.uint8
-intrinsic: Any = extending.intrinsic  # its own type hides the arguments of what it makes
-_FLAGS = ("contract", "reassoc", "arcp", "nsz")  # no order of sums is promised, NaN is
+intrinsic: Any = extending.intrinsic  # typed Any: its declared type hides the arguments of the functions it defines
+_FLAGS = ("contract", "reassoc", "arcp", "nsz")  # sums may be reordered; NaN is respected
 _INDEX = ir.VectorType(ir.IntType(32), LANES)
 
 
 class Lanes(types.Type):
-    """LANES numbers of one float type."""
+    """Numba type of a vector of LANES floats of one type."""
 
     def __init__(self, dtype: types.Float) -> None:
         super().__init__(f"Lanes({dtype})")
@@ -48,7 +50,7 @@ class Lanes(types.Type):
 
 
 class LaneMask(types.Type):
-    """LANES truth values."""
+    """Numba type of a vector of LANES truth values."""
 
     def __init__(self) -> None:
         super().__init__("Choice")
@@ -58,6 +60,7 @@ _CHOICE = LaneMask()
 
 
 def _vector(dtype: types.Float) -> ir.VectorType:
+    """LLVM type of a vector of floats."""
     return ir.VectorType(ir.FloatType() if dtype == types.float32 else ir.DoubleType(), LANES)
 
 
@@ -74,18 +77,19 @@ class _ChoiceModel(models.PrimitiveModel):
 
 
 def _repeat(builder: Any, scalar: Any) -> Any:
-    """The vector whose lanes are all the scalar."""
+    """LLVM vector whose lanes are all equal to a scalar."""
     vector = ir.VectorType(scalar.type, LANES)
     first = builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0))
     return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), ir.Constant(_INDEX, [0] * LANES))
 
 
 def _as_lanes(context: Any, builder: Any, value: Any, kind: Any, lanes: Lanes) -> Any:
+    """LLVM vector of a value that is a vector already or a scalar to be repeated."""
     return value if isinstance(kind, Lanes) else _repeat(builder, context.cast(builder, value, kind, lanes.dtype))
 
 
 def _define(symbol: Callable[..., Any], result: Callable[[Lanes], Any], emit: Callable[[Any, Any, Any], Any]) -> None:
-    """One operator between vectors, or a vector and a scalar on either side."""
+    """Define an operator between two vectors, or between a vector and a scalar on either side."""
 
     @infer_global(symbol)
     class _Typing(AbstractTemplate):
@@ -105,6 +109,7 @@ def _define(symbol: Callable[..., Any], result: Callable[[Lanes], Any], emit: Ca
 
 
 def _arithmetic(method: str) -> Callable[[Any, Any, Any], Any]:
+    """Emitter of an LLVM instruction with the flags of fast arithmetic."""
     return lambda builder, x, y: getattr(builder, method)(x, y, flags=_FLAGS)
 
 
@@ -120,7 +125,10 @@ _define(operator.ge, lambda k: _CHOICE, lambda b, x, y: b.fcmp_ordered(">=", x, 
 
 @intrinsic
 def pointer(typingctx, array):  # type: ignore[no-untyped-def]
-    """Where an array's numbers begin. It does not keep the array: one that an argument holds, or the caller."""
+    """Pointer to the first number of an array.
+
+    It does not keep the array alive: an argument or the caller must hold it.
+    """
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         return cgutils.create_struct_proxy(sig.args[0])(context, builder, args[0]).data
@@ -129,12 +137,13 @@ def pointer(typingctx, array):  # type: ignore[no-untyped-def]
 
 
 def _address(builder: Any, start: Any, index: Any, kind: ir.Type) -> Any:
+    """LLVM address of a number or vector at an index from a pointer."""
     return builder.bitcast(builder.gep(start, [index]), kind.as_pointer())
 
 
 @intrinsic
 def load(typingctx, start, index):  # type: ignore[no-untyped-def]
-    """The numbers from start[index] on."""
+    """Load the LANES numbers from start[index] on."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         return builder.load(_address(builder, args[0], args[1], _vector(sig.return_type.dtype)), align=_width(sig) // 8)
@@ -143,13 +152,14 @@ def load(typingctx, start, index):  # type: ignore[no-untyped-def]
 
 
 def _width(sig: Any) -> int:
+    """Bits of the numbers that the first argument points to."""
     dtype = sig.args[0].dtype
     return int(dtype.bitwidth)
 
 
 @intrinsic
 def store(typingctx, start, index, value):  # type: ignore[no-untyped-def]
-    """start[index] and those after it become the value's."""
+    """Store the lanes of a value to start[index] and those after it."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         builder.store(args[2], _address(builder, args[0], args[1], args[2].type), align=_width(sig) // 8)
@@ -159,8 +169,8 @@ def store(typingctx, start, index, value):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def number(typingctx, start, index):  # type: ignore[no-untyped-def]
-    """start[index]."""
+def load_one(typingctx, start, index):  # type: ignore[no-untyped-def]
+    """Load the single number start[index]."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         return builder.load(builder.gep(args[0], [args[1]]))
@@ -169,8 +179,8 @@ def number(typingctx, start, index):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def put(typingctx, start, index, value):  # type: ignore[no-untyped-def]
-    """start[index] becomes the value."""
+def store_one(typingctx, start, index, value):  # type: ignore[no-untyped-def]
+    """Store a single value to start[index]."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         builder.store(context.cast(builder, args[2], value, start.dtype), builder.gep(args[0], [args[1]]))
@@ -180,8 +190,8 @@ def put(typingctx, start, index, value):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def store_whole(typingctx, start, index, value):  # type: ignore[no-untyped-def]
-    """start[index] and those after it, int32, become the value's whole numbers."""
+def store_integers(typingctx, start, index, value):  # type: ignore[no-untyped-def]
+    """Store the lanes of a value, cut to whole numbers, as int32 to start[index] and those after it."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         builder.store(builder.fptosi(args[2], _INDEX), _address(builder, args[0], args[1], _INDEX), align=4)
@@ -191,8 +201,8 @@ def store_whole(typingctx, start, index, value):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def chosen(typingctx, bits):  # type: ignore[no-untyped-def]
-    """The choice whose lane k is bit k of a number of type BITS."""
+def mask_from_bits(typingctx, bits):  # type: ignore[no-untyped-def]
+    """Mask whose lane k is bit k of ``bits``, a number of type BITS."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         return builder.bitcast(args[0], ir.VectorType(ir.IntType(1), LANES))
@@ -201,8 +211,8 @@ def chosen(typingctx, bits):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def marked(typingctx, start, index):  # type: ignore[no-untyped-def]
-    """Which of the bytes from start[index] on are not zero, as bits of a number of type BITS."""
+def nonzero_bits(typingctx, start, index):  # type: ignore[no-untyped-def]
+    """Number of type BITS whose bit k says whether the byte start[index + k] is not zero."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         kind = ir.VectorType(ir.IntType(8), LANES)
@@ -213,8 +223,8 @@ def marked(typingctx, start, index):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def population(typingctx, bits):  # type: ignore[no-untyped-def]
-    """How many bits of such a number are set."""
+def bit_count(typingctx, bits):  # type: ignore[no-untyped-def]
+    """Number of bits that are set in ``bits``, a number of type BITS."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         return builder.zext(_call(builder, f"ctpop.i{LANES}", args[0].type, args[0]), ir.IntType(64))
@@ -224,7 +234,7 @@ def population(typingctx, bits):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def ramp(typingctx, start):  # type: ignore[no-untyped-def]
-    """0, 1, 2 …, of the pointer's type."""
+    """The vector 0, 1, 2 … of the type that ``start`` points to."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         return ir.Constant(_vector(sig.return_type.dtype), [float(k) for k in range(LANES)])
@@ -234,7 +244,7 @@ def ramp(typingctx, start):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def select(typingctx, choice, one, other):  # type: ignore[no-untyped-def]
-    """Lane by lane ``one`` where the choice is true, else ``other``; either may be a scalar."""
+    """Lane by lane ``one`` where the mask ``choice`` is true, else ``other``; either may be a scalar."""
     lanes = one if isinstance(one, Lanes) else other
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
@@ -245,6 +255,7 @@ def select(typingctx, choice, one, other):  # type: ignore[no-untyped-def]
 
 
 def _call(builder: Any, name: str, kind: Any, *args: Any, fast: bool = False) -> Any:
+    """LLVM call of an intrinsic function."""
     function = cgutils.get_or_insert_function(
         builder.module, ir.FunctionType(kind, [a.type for a in args]), f"llvm.{name}"
     )
@@ -252,12 +263,13 @@ def _call(builder: Any, name: str, kind: Any, *args: Any, fast: bool = False) ->
 
 
 def _suffix(lanes: Lanes) -> str:
+    """Suffix of the names of LLVM's intrinsic functions for a vector type."""
     return f"v{LANES}f{lanes.dtype.bitwidth}"
 
 
 @intrinsic
 def floor(typingctx, value):  # type: ignore[no-untyped-def]
-    """The whole number at or below, lane by lane."""
+    """Largest whole number not above each lane of ``value``."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         return _call(builder, f"floor.{_suffix(value)}", args[0].type, args[0])
@@ -267,7 +279,7 @@ def floor(typingctx, value):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def absolute(typingctx, value):  # type: ignore[no-untyped-def]
-    """The absolute value, lane by lane."""
+    """Absolute value of each lane of ``value``."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         return _call(builder, f"fabs.{_suffix(value)}", args[0].type, args[0])
@@ -276,8 +288,8 @@ def absolute(typingctx, value):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def total(typingctx, value):  # type: ignore[no-untyped-def]
-    """The sum of the lanes, in double precision from there on."""
+def lane_sum(typingctx, value):  # type: ignore[no-untyped-def]
+    """Sum of the lanes of ``value``, as a double."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         kind = args[0].type.element
@@ -290,8 +302,8 @@ def total(typingctx, value):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def picked(typingctx, start, index, which):  # type: ignore[no-untyped-def]
-    """start[index + which], ``which`` a whole number below WINDOW for each lane."""
+def gather(typingctx, start, index, which):  # type: ignore[no-untyped-def]
+    """Load start[index + which] for each lane, ``which`` holding whole numbers below WINDOW."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         lane = builder.fptosi(args[2], _INDEX)

@@ -1,8 +1,9 @@
-"""A field known at points of a regular lattice, read between them.
+"""Interpolation of a field, with its gradients, from the points of a regular lattice.
 
-A value between four corners is the mean of what their values say and of what their gradients say, each weighed by
-nearness: the two err by the same amount to either side, so a quadratic field is met exactly. Where a corner is missing
-the others say by their gradients alone what lies beside them.
+Between four lattice points the interpolated value is a mean, weighted bilinearly, of two estimates: the corners'
+values, and the values extrapolated from each corner with its gradient. The errors of the two are equal and opposite for
+a quadratic field, which is therefore interpolated exactly. Where a corner is missing, the other corners' extrapolations
+alone are used.
 """
 
 from __future__ import annotations
@@ -14,17 +15,26 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats
+from ringdic.arrays import Floats, Pixels
 
-ALL = 1.0 - 1e-9  # weight of the known corners from which on none of those that have a say is missing
+COMPLETE = 1.0 - 1e-9  # weight from which on no corner that counts is missing
 
 
-def between_corners(lattice: NDArray[Any], values: Floats, spacing: float, xy: Floats) -> tuple[Floats, Floats]:
-    """Values at points xy (n, 2) px from those at a lattice, and the weight of the corners that were known.
+def interpolate_lattice(lattice: NDArray[Any], values: Floats, spacing: float, xy: Pixels) -> tuple[Floats, Floats]:
+    """Interpolate displacements and further values from a lattice at given points.
 
-    lattice : (m, 2) px, multiples of ``spacing``. values : (m, k) u v du/dx du/dy dv/dx dv/dy and any others that go
-    from corner to corner in a straight line; rows with NaN are not known.
-    Returns (n, k), NaN where no corner is known, and (n,) between 0 and 1.
+    Parameters
+    ----------
+    lattice : (m, 2) float64 or integer, px, multiples of ``spacing``.
+    values : (m, k) float64, first u v (px) and du/dx du/dy dv/dx dv/dy (no unit), then any others, which are
+        interpolated bilinearly; a row with NaN counts as missing.
+    spacing : px, of the lattice.
+    xy : (n, 2) float64, px, points to interpolate at.
+
+    Returns
+    -------
+    values : (n, k), NaN where all four corners are missing.
+    weight : (n,), sum of the bilinear weights of the corners that are there, 0 to 1, no unit; 1 where none is missing.
     """
     known = np.isfinite(values).all(axis=1)
     if not known.any():
@@ -40,7 +50,11 @@ def between_corners(lattice: NDArray[Any], values: Floats, spacing: float, xy: F
 
 @nb.njit(cache=True, nogil=True)
 def _blend(values, row, low, spacing, xy, out, weight):  # type: ignore[no-untyped-def]
-    """row : (columns, rows) of the lattice's values, -1 where there are none; low : (2,) its first column and row."""
+    """Interpolation of ``interpolate_lattice`` at each point, into out (n, k) and weight (n,).
+
+    row : (columns, rows), index into values of each lattice point, -1 where it is missing; low : (2,), the lattice's
+        first column and row, in spacings.
+    """
     columns, rows = row.shape
     for p in range(len(xy)):
         out[p], weight[p] = 0.0, 0.0
@@ -48,8 +62,8 @@ def _blend(values, row, low, spacing, xy, out, weight):  # type: ignore[no-untyp
             out[p] = np.nan
             continue
         column, line = math.floor(xy[p, 0] / spacing), math.floor(xy[p, 1] / spacing)
-        for turn in range(2):  # first what the corners weigh, then what they say
-            slopes = 0.5 if weight[p] > ALL else 1.0
+        for turn in range(2):  # first the sum of the corners' weights, then their weighted values
+            slopes = 0.5 if weight[p] > COMPLETE else 1.0  # a full set of values already makes half the change
             for i in range(2):
                 for j in range(2):
                     c, r = column + i - low[0], line + j - low[1]
@@ -60,9 +74,9 @@ def _blend(values, row, low, spacing, xy, out, weight):  # type: ignore[no-untyp
                     if turn == 0:
                         weight[p] += near
                     elif near > 0.0:
-                        told, near = values[row[c, r]], near / weight[p]
-                        out[p] += near * told
-                        out[p, 0] += near * slopes * (told[2] * dx + told[3] * dy)
-                        out[p, 1] += near * slopes * (told[4] * dx + told[5] * dy)
+                        row_values, near = values[row[c, r]], near / weight[p]
+                        out[p] += near * row_values
+                        out[p, 0] += near * slopes * (row_values[2] * dx + row_values[3] * dy)
+                        out[p, 1] += near * slopes * (row_values[4] * dx + row_values[5] * dy)
         if not weight[p] > 0.0:
             out[p] = np.nan

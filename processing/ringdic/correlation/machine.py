@@ -1,6 +1,6 @@
-"""What the processor under the correlation can do, and what a point asks of it: the two sides of a roofline.
+"""Roofline of the correlation: what one core of the processor can do, and what the kernel asks of it for a point.
 
-Measured in time of the process on one core, so other programs disturb little.
+Measured in time of the process on one core, so that other programs disturb little.
 """
 
 from __future__ import annotations
@@ -17,20 +17,22 @@ from ringdic.correlation.kernels import template
 from ringdic.correlation.lanes import LANES, load, pointer, store
 from ringdic.correlation.settings import CorrelationSettings
 
-# Vector operations of the passes over a subset, LANES pixels each, counted in the kernels: to pack f and its gradient
-# and sum the moments (by order); to interpolate in one pixel interval (place, weights of both axes, rows of taps) and
-# to add to the sums of a step (by order), to find the place.
-_ONCE = {1: 4 + 21, 2: 4 + 31}
-_INTERPOLATE = {3: 4 + 2 * 9 + 4 * 4 + 4, 5: 4 + 2 * 23 + 6 * 6 + 6}
-_STEP = {1: 10, 2: 14}
-_PLACE = 3
+# Operations on a vector of LANES pixels, counted in the kernels.
+_ONCE = {1: 4 + 21, 2: 4 + 31}  # per point: pack f and its gradient, and sum the moments; by order
+_INTERPOLATE = {3: 4 + 2 * 9 + 4 * 4 + 4, 5: 4 + 2 * 23 + 6 * 6 + 6}  # position, weights, rows of taps; by degree
+_STEP = {1: 10, 2: 14}  # add to the sums of a step; by order
+_LOCATE = 3  # position of the vector in the current image
 _LINE = 16  # numbers of single precision in a cache line
-_BYTES = 4 * 4 + 1  # of a pixel: f, its gradient, a coefficient of the current image, the mask
+_BYTES = 4 * 4 + 1  # per pixel: f, its gradient, a coefficient of the current image, the mask
 
 
 @dataclass(frozen=True)
 class Machine:
-    """One core: clock (GHz), fused multiply-adds of LANES numbers a second, memory read (bytes a second)."""
+    """Speed of one core.
+
+    clock : GHz. operations : fused multiply-adds of LANES numbers per second. bandwidth : bytes read from memory per
+        second.
+    """
 
     clock: float
     operations: float
@@ -38,8 +40,11 @@ class Machine:
 
 
 @dataclass(frozen=True)
-class Demand:
-    """What one point asks for: pixels, vectors of LANES, vector operations and bytes that come from memory."""
+class KernelCost:
+    """Cost of one point of a correlation.
+
+    pixels : of the subset. vectors : of LANES pixels that hold them. operations : on vectors. bytes : read from memory.
+    """
 
     pixels: int
     vectors: int
@@ -47,22 +52,24 @@ class Demand:
     bytes: float
 
     def bound(self, machine: Machine) -> float:
-        """Points a second that one core can reach at most."""
+        """Largest number of points per second that one core can reach: the arithmetic's bound or the memory's, the
+        lower of the two.
+        """
         return 1.0 / max(self.operations / machine.operations, self.bytes / machine.bandwidth)
 
 
-def demand(settings: CorrelationSettings, iterations: float) -> Demand:
-    """What a point of these settings asks for with so many iterations."""
+def kernel_cost(settings: CorrelationSettings, iterations: float) -> KernelCost:
+    """Cost of one point of a correlation with given settings and number of iterations."""
     corner, bits, _ = template(settings.radius, settings.subset == "circle")
     vectors = corner.shape[1]
-    each = _INTERPOLATE[settings.degree] + _STEP[settings.order] + _PLACE
-    operations = vectors * (_ONCE[settings.order] + iterations * each)
+    per_iteration = _INTERPOLATE[settings.degree] + _STEP[settings.order] + _LOCATE
+    operations = vectors * (_ONCE[settings.order] + iterations * per_iteration)
     pixels = int(np.unpackbits(bits.view(np.uint8)).sum())
-    return Demand(pixels, vectors, operations, float(_BYTES * min(settings.step, 2 * settings.radius + 1) ** 2))
+    return KernelCost(pixels, vectors, operations, float(_BYTES * min(settings.step, 2 * settings.radius + 1) ** 2))
 
 
 def measure_machine() -> Machine:
-    """The core this runs on."""
+    """Measure the clock, the vector arithmetic and the memory bandwidth of the core that this runs on."""
     line = _aligned(np.full(LANES + _LINE, 1e-8, np.float32))
     block = np.ones(2**24, np.float32)
     turns = 200_000
@@ -74,6 +81,7 @@ def measure_machine() -> Machine:
 
 
 def _least(work: Callable[[], object], runs: int = 15) -> float:
+    """Shortest time in seconds of several runs of some work."""
     work()
     best = np.inf
     for _ in range(runs):
@@ -84,14 +92,14 @@ def _least(work: Callable[[], object], runs: int = 15) -> float:
 
 
 def _aligned(numbers: NDArray[np.float32]) -> NDArray[np.float32]:
-    """LANES of the numbers, from the begin of a cache line on; there must be a line more of them."""
+    """LANES of the numbers from the begin of a cache line on; there must be a line more of them."""
     skip = (-numbers.ctypes.data % (4 * _LINE)) // 4
     return numbers[skip : skip + LANES]
 
 
 @nb.njit(cache=True, nogil=True)
 def _chain(turns):  # type: ignore[no-untyped-def]
-    """Six dependent operations of one cycle a turn (Marsaglia 2003)."""
+    """Chain of six dependent operations a turn, of one cycle each (xorshift, Marsaglia 2003)."""
     x = np.uint64(88172645463325252)
     for _ in range(turns):
         x ^= x << np.uint64(13)
@@ -102,7 +110,7 @@ def _chain(turns):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, fastmath={"contract"})
 def _multiply(turns, line):  # type: ignore[no-untyped-def]
-    """Ten independent fused multiply-adds a turn."""
+    """Ten independent fused multiply-adds of vectors a turn."""
     at, first = pointer(line), np.uint64(0)
     x = load(at, first)
     a = b = c = d = e = f = g = h = i = k = x

@@ -1,4 +1,8 @@
-"""Which points of a correlation are neighbours, and what they say about one another."""
+"""Neighbours of the points of a correlation, and what their matches say about one another.
+
+Matches are extrapolated from point to point by their derivatives: to give start values, to fit affine fields, and to
+find outliers.
+"""
 
 from __future__ import annotations
 
@@ -8,19 +12,21 @@ import numba as nb
 import numpy as np
 import scipy
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Pixels
 
 COUNT = 8
 _AROUND = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
-_MOST_CELLS = 64  # of a grid a point of it; a sparser one has its neighbours looked for
-# A jump across one grid step that no real surface makes, px; grows with the scatter of the field.
-_LEAST_JUMP = 0.5
-_SCATTERS = 8.0
-_LEAST_ISLAND = 4
+_MOST_CELLS = 64  # per point, of a grid that neighbours are read from; those of sparser points come from a k-d tree
+_MIN_DEVIATION = 0.5  # px; smaller deviations from the neighbours are never outliers
+_MAX_SCATTER_RATIO = 8.0  # deviation of an outlier, in standard deviations of all deviations
+_MIN_ISLAND = 4  # points of a group that is kept
 
 
-def point_neighbours(xy: Floats, step: float) -> Indices:
-    """The up to eight nearest points within 1.6 steps of each point, nearest first, -1 where there is none. (n, 8)."""
+def point_neighbours(xy: Pixels, step: float) -> Indices:
+    """Up to eight nearest points within 1.6 steps of each point.
+
+    xy : (n, 2) float64, px. step : px, grid spacing. Returns indices (n, 8), nearest first, -1 where there are fewer.
+    """
     if len(xy) < 2:
         return np.full((len(xy), COUNT), -1, np.int64)
     cell = (xy - xy.min(axis=0)) / step
@@ -39,8 +45,13 @@ def point_neighbours(xy: Floats, step: float) -> Indices:
     return index[~own].reshape(len(xy), COUNT)
 
 
-def predicted(xy: Floats, parameters: Floats, source: Indices, target: Indices) -> Floats:
-    """Parameters (k, 12) of target points extrapolated from source points with their derivatives."""
+def extrapolate(xy: Pixels, parameters: Floats, source: Indices, target: Indices) -> Floats:
+    """Extrapolate the warps of source points to target points by their derivatives (second-order Taylor series).
+
+    xy : (n, 2) float64, px. parameters : (n, 12) float64, px and derivatives. source, target : (k,) int64, indices of
+        points.
+    Returns (k, 12), the parameters at the targets.
+    """
     out = parameters[source]
     d = xy[target] - xy[source]
     dx, dy = d[:, 0], d[:, 1]
@@ -52,44 +63,55 @@ def predicted(xy: Floats, parameters: Floats, source: Indices, target: Indices) 
     return out
 
 
-def inconsistent(
-    xy: Floats,
+def inconsistent_points(
+    xy: Pixels,
     parameters: Floats,
     good: Mask,
     near: Indices,
-    jump: Floats,
+    deviation: Floats,
     stale: Mask,
 ) -> Mask:
-    """Good points that contradict the median of what their good neighbours predict; if none does, small islands. (n,).
+    """Good points whose displacement contradicts their neighbours; if there are none, points of small isolated groups.
 
-    The median of affine predictions is the robust local fit: half the neighbours may be wrong.
-    jump : (n,) px, how far each lies from that median, as this function left it; stale : (n,) bool, what has changed
-    since, all at first. Both are brought up to date.
+    A point is compared with the median of what its good neighbours extrapolate for it, which is robust: up to half of
+    the neighbours may be wrong.
+
+    Parameters
+    ----------
+    xy : (n, 2) float64, px. parameters : (n, 12) float64, px and derivatives. good : (n,) bool.
+    near : (n, 8) int64, indices of neighbours, -1 for none.
+    deviation : (n,) float64, px, distance of each point from that median as the last call left it; brought up to date.
+    stale : (n,) bool, points whose match has changed since, at first all; cleared.
+
+    Returns
+    -------
+    bad : (n,) bool.
     """
-    _jumps(xy, parameters, good, near, stale, jump)
+    _deviations(xy, parameters, good, near, stale, deviation)
     stale[:] = False
-    known = np.isfinite(jump)
-    scatter = 1.4826 * np.median(jump[known]) if known.any() else 0.0
-    limit = max(_LEAST_JUMP, _SCATTERS * scatter)
-    bad = known & (jump > limit)
+    known = np.isfinite(deviation)
+    scatter = 1.4826 * np.median(deviation[known]) if known.any() else 0.0
+    limit = max(_MIN_DEVIATION, _MAX_SCATTER_RATIO * scatter)
+    bad = known & (deviation > limit)
     if bad.any():
         return bad
-    return _islands(xy, parameters, good, near, 2.0 * limit, _LEAST_ISLAND)
+    return _islands(xy, parameters, good, near, 2.0 * limit, _MIN_ISLAND)
 
 
 @nb.njit(cache=True, nogil=True)
-def _expected(xy, parameters, source, target, at):  # type: ignore[no-untyped-def]
-    """The displacement along x (at 0) or y (at 6) that a point expects of another."""
+def _extrapolate_displacement(xy, parameters, source, target, at):  # type: ignore[no-untyped-def]
+    """Displacement along x (at 0) or y (at 6) at one point, extrapolated from another."""
     dx, dy, p, s = xy[target, 0] - xy[source, 0], xy[target, 1] - xy[source, 1], parameters, source
     curved = 0.5 * p[s, at + 3] * dx * dx + p[s, at + 4] * dx * dy + 0.5 * p[s, at + 5] * dy * dy
     return p[s, at] + p[s, at + 1] * dx + p[s, at + 2] * dy + curved
 
 
 @nb.njit(cache=True, nogil=True, parallel=True)
-def _jumps(xy, parameters, good, near, stale, jump):  # type: ignore[no-untyped-def]
-    """Distance (n,) px of each good point from the median of what its good neighbours expect; NaN without any.
+def _deviations(xy, parameters, good, near, stale, deviation):  # type: ignore[no-untyped-def]
+    """Distance (n,) px of each good point from the median of its neighbours' extrapolations, into deviation; NaN
+    without any.
 
-    Only where the point or a neighbour is stale (n,).
+    Only points that are stale (n,) or have a stale neighbour are computed.
     """
     for k in nb.prange(len(xy)):
         changed = stale[k]
@@ -97,24 +119,24 @@ def _jumps(xy, parameters, good, near, stale, jump):  # type: ignore[no-untyped-
             changed |= near[k, slot] >= 0 and stale[near[k, slot]]
         if not changed:
             continue
-        jump[k] = np.nan
+        deviation[k] = np.nan
         if not good[k]:
             continue
-        expected, m = np.empty((2, near.shape[1])), 0
+        predictions, m = np.empty((2, near.shape[1])), 0
         for slot in range(near.shape[1]):
             source = near[k, slot]
             if source >= 0 and good[source]:
-                expected[0, m] = _expected(xy, parameters, source, k, 0)
-                expected[1, m] = _expected(xy, parameters, source, k, 6)
+                predictions[0, m] = _extrapolate_displacement(xy, parameters, source, k, 0)
+                predictions[1, m] = _extrapolate_displacement(xy, parameters, source, k, 6)
                 m += 1
         if m:
-            u, v = _median(expected[0], m), _median(expected[1], m)
-            jump[k] = math.hypot(parameters[k, 0] - u, parameters[k, 6] - v)
+            u, v = _median(predictions[0], m), _median(predictions[1], m)
+            deviation[k] = math.hypot(parameters[k, 0] - u, parameters[k, 6] - v)
 
 
 @nb.njit(cache=True, nogil=True)
 def _median(values, count):  # type: ignore[no-untyped-def]
-    """Median of the first few values: those with half of the others below them, without a branch that is not known."""
+    """Median of the first ``count`` values, without sorting and without branches that a processor cannot predict."""
     low, high = 0.0, 0.0
     for k in range(count):
         rank = 0
@@ -127,84 +149,94 @@ def _median(values, count):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _agree(xy, parameters, one, other, limit):  # type: ignore[no-untyped-def]
-    """Whether either of two points lies where the other expects it."""
+    """Whether one of two points lies within ``limit`` px of where the other's extrapolation puts it."""
     for source, target in ((one, other), (other, one)):
-        u = _expected(xy, parameters, source, target, 0) - parameters[target, 0]
-        v = _expected(xy, parameters, source, target, 6) - parameters[target, 6]
+        u = _extrapolate_displacement(xy, parameters, source, target, 0) - parameters[target, 0]
+        v = _extrapolate_displacement(xy, parameters, source, target, 6) - parameters[target, 6]
         if u * u + v * v <= limit * limit:
             return True
     return False
 
 
 @nb.njit(cache=True, nogil=True)
-def _hangs_together(xy, parameters, good, near, limit, k, found, most):  # type: ignore[no-untyped-def]
-    """The number of good points that point k hangs together with by mutual agreement, ``most`` if more.
+def _connected_count(xy, parameters, good, near, limit, k, members, max_count):  # type: ignore[no-untyped-def]
+    """Number of good points in the connected group of point k, ``max_count`` if there are more.
 
-    found : (at least most,) scratch.
+    Neighbours are connected if they agree (``_agree``). members : (at least max_count,) scratch.
     """
-    found[0], count, at = k, 1, 0
-    while at < count < most:
+    members[0], count, at = k, 1, 0
+    while at < count < max_count:
         for slot in range(near.shape[1]):
-            other, new = near[found[at], slot], True
+            other, new = near[members[at], slot], True
             if other < 0 or not good[other]:
                 continue
             for m in range(count):
-                new &= found[m] != other
-            if new and _agree(xy, parameters, found[at], other, limit):
-                found[count] = other
+                new &= members[m] != other
+            if new and _agree(xy, parameters, members[at], other, limit):
+                members[count] = other
                 count += 1
-                if count == most:
+                if count == max_count:
                     break
         at += 1
     return count
 
 
 @nb.njit(cache=True, nogil=True, parallel=True)
-def _islands(xy, parameters, good, near, limit, least):  # type: ignore[no-untyped-def]
-    """Good points (n,) that hang together with fewer than ``least``, themselves included; none where nothing hangs
-    together with four times as many."""
-    out, many, most = np.zeros(len(xy), np.bool_), False, 4 * least
-    found = np.empty(most, np.int64)
+def _islands(xy, parameters, good, near, limit, min_count):  # type: ignore[no-untyped-def]
+    """Good points (n,) in connected groups of fewer than ``min_count``.
+
+    None if no group has at least four times as many points.
+    """
+    out, many, max_count = np.zeros(len(xy), np.bool_), False, 4 * min_count
+    members = np.empty(max_count, np.int64)
     for k in range(len(xy)):
-        many = good[k] and _hangs_together(xy, parameters, good, near, limit, k, found, most) == most
+        many = good[k] and _connected_count(xy, parameters, good, near, limit, k, members, max_count) == max_count
         if many:
             break
     if not many:
         return out
     for k in nb.prange(len(xy)):
-        few = np.empty(least, np.int64)
-        out[k] = good[k] and _hangs_together(xy, parameters, good, near, limit, k, few, least) < least
+        few = np.empty(min_count, np.int64)
+        out[k] = good[k] and _connected_count(xy, parameters, good, near, limit, k, few, min_count) < min_count
     return out
 
 
-def local_fit(
-    xy: Floats,
+def local_affine_fit(
+    xy: Pixels,
     parameters: Floats,
     good: Mask,
     near: Indices,
     wanted: Indices,
     count: int = 12,
 ) -> Floats:
-    """Parameters (k, 12) of wanted points from an affine least-squares fit of so many good points near them.
+    """Parameters of unmatched points from an affine least-squares fit of the good points around each.
 
-    near : (n, 8), neighbours; they lead from point to point. NaN where they lead to fewer than six good ones.
+    Parameters
+    ----------
+    xy : (n, 2) float64, px. parameters : (n, 12) float64, px and derivatives. good : (n,) bool.
+    near : (n, 8) int64, indices of neighbours, -1 for none; good points are collected from neighbour to neighbour.
+    wanted : (k,) int64, indices of the points to fit for. count : of good points in a fit.
+
+    Returns
+    -------
+    fit : (k, 12), px and derivatives; NaN where fewer than six good points can be reached.
     """
     out = np.full((len(wanted), parameters.shape[1]), np.nan)
-    _fits(xy, parameters, good, near, wanted, count, out)
+    _fit_affine(xy, parameters, good, near, wanted, count, out)
     return out
 
 
 @nb.njit(cache=True, nogil=True)
-def _ring_by_ring(good, near, k, count, seen, stamp):  # type: ignore[no-untyped-def]
-    """Good points around point k, from neighbour to neighbour until at least ``count`` are found.
+def _nearest_rings(good, near, k, count, seen, stamp):  # type: ignore[no-untyped-def]
+    """Indices of good points around point k, ring by ring of neighbours, until there are at least ``count``.
 
-    seen : (n,), what is not ``stamp`` has not been looked at; filled.
+    seen : (n,) scratch; a point that has been visited holds ``stamp``.
     """
-    reached, picked = [np.int64(k)], [np.int64(k)]
-    picked.pop()
+    reached, sample = [np.int64(k)], [np.int64(k)]
+    sample.pop()
     seen[k] = stamp
     begin = 0
-    while len(picked) < count and begin < len(reached):
+    while len(sample) < count and begin < len(reached):
         end = len(reached)
         for at in range(begin, end):
             for slot in range(near.shape[1]):
@@ -213,20 +245,20 @@ def _ring_by_ring(good, near, k, count, seen, stamp):  # type: ignore[no-untyped
                     seen[other] = stamp
                     reached.append(other)
                     if good[other]:
-                        picked.append(other)
+                        sample.append(other)
         begin = end
-    return np.array(picked)
+    return np.array(sample)
 
 
 @nb.njit(cache=True, nogil=True)
-def _fits(xy, parameters, good, near, wanted, count, out):  # type: ignore[no-untyped-def]
-    """The affine fits of ``local_fit``: the nearest of the points that are found ring by ring, by normal equations."""
+def _fit_affine(xy, parameters, good, near, wanted, count, out):  # type: ignore[no-untyped-def]
+    """Affine fits of ``local_affine_fit`` into out (k, 12), by normal equations."""
     seen = np.full(len(xy), -1, np.int64)
     for w in range(len(wanted)):
-        picked = _ring_by_ring(good, near, wanted[w], count, seen, w)
-        if len(picked) < 6:
+        sample = _nearest_rings(good, near, wanted[w], count, seen, w)
+        if len(sample) < 6:
             continue
-        off = xy[picked] - xy[wanted[w]]
+        off = xy[sample] - xy[wanted[w]]
         square = off[:, 0] ** 2 + off[:, 1] ** 2
         nearest = np.argsort(square, kind="mergesort")[:count]
         side = math.sqrt(np.mean(square[nearest]))
@@ -236,10 +268,10 @@ def _fits(xy, parameters, good, near, wanted, count, out):  # type: ignore[no-un
             for i in range(3):
                 for j in range(3):
                     N[i, j] += row[i] * row[j]
-                b[i, 0] += row[i] * parameters[picked[at], 0]
-                b[i, 1] += row[i] * parameters[picked[at], 6]
+                b[i, 0] += row[i] * parameters[sample[at], 0]
+                b[i, 1] += row[i] * parameters[sample[at], 6]
         for i in range(3):
-            N[i, i] += 1e-9 * len(nearest)  # points in a row tell nothing across it: no gradient is taken there
+            N[i, i] += 1e-9 * len(nearest)  # points on a line do not determine the gradient across it: it becomes zero
         fit = np.linalg.solve(N, b)
         out[w] = 0.0
         for axis in range(2):

@@ -1,4 +1,6 @@
-"""Images made ready for correlation, once for all the pairs they take part in."""
+"""Reference and current images prepared for correlation: gradients and B-spline coefficients, computed once for all
+pairs.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Mask
+from ringdic.arrays import Mask, Pixels
 from ringdic.correlation.settings import CorrelationSettings
 from ringdic.correlation.spline import REACH, Box, coefficients, gradients
 from ringdic.errors import InputError
@@ -19,15 +21,18 @@ from ringdic.errors import InputError
 Levels = NDArray[np.floating]
 T = TypeVar("T")
 
-_SOME = 500  # points tell how a region is stretched as a whole
+_FIT_POINTS = 500  # points at most, of an affine fit to the motion of a region
 
 
 @dataclass(frozen=True)
 class Reference:
-    """A reference image and the box (x0, y0, x1, y1) of it around its region of interest, filtered when needed.
+    """A reference image and a box of it around the region of interest, with what is computed from it when first needed.
 
-    image : the whole image as it came; mask : (h, w) bool, the region in the box; grey_range : 255 or 65535.
-    precision : float32, or float64 for a tolerance beyond it.
+    image : (height, width) grey levels of the whole image, in its own type.
+    box : x0, y0, x1, y1 px, ends exclusive.
+    mask : (h, w) bool, the region of interest in the box.
+    degree : of the B-spline, 3 or 5. precision : float32, or float64 for tolerances that need it.
+    grey_range : largest grey level, 255 or, of 16 bits, that of the image.
     """
 
     image: NDArray = field(repr=False)
@@ -36,52 +41,62 @@ class Reference:
     degree: int
     precision: type
     grey_range: float
-    _kept: dict[Hashable, Any] = field(default_factory=dict, repr=False, compare=False)
+    _cache: dict[Hashable, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(height, width) of the whole image, px."""
+        """Height and width of the whole image, px."""
         return self.image.shape[0], self.image.shape[1]
 
     @property
-    def origin(self) -> Floats:
-        """(x, y) px of the box in the image."""
+    def origin(self) -> Pixels:
+        """Position (x, y) of the box's first pixel in the image. (2,) float64, px."""
         return np.array(self.box[:2], dtype=np.float64)
 
     @property
     def grey(self) -> Levels:
         """Grey levels of the box. (h, w)."""
-        return self.once("grey", lambda: _crop(self.image, self.box, self.precision))
+        return self.get_or_compute("grey", lambda: _crop(self.image, self.box, self.precision))
 
     @property
-    def slopes(self) -> tuple[Levels, Levels]:
-        """∂/∂x and ∂/∂y of the box, two (h, w)."""
-        return self.once("slopes", lambda: gradients(self.image, self.degree, self.box, self.precision))
+    def gradient(self) -> tuple[Levels, Levels]:
+        """Derivatives of the grey levels of the box, ∂/∂x and ∂/∂y, grey levels per px. Two (h, w)."""
+        return self.get_or_compute("gradient", lambda: gradients(self.image, self.degree, self.box, self.precision))
 
     @cached_property
     def coef(self) -> Levels:
-        """Padded coefficients of the box; only points between the pixels need them."""
+        """B-spline coefficients of the box, padded; needed only for points between pixels. (h + 2 PAD, w + 2 PAD)."""
         return coefficients(self.image, self.degree, self.box, self.precision)
 
     @cached_property
-    def turned(self) -> Reference:
-        """The image turned about its diagonal: x and y exchanged."""
-        along_x, along_y = self.slopes
-        found: dict[Hashable, Any] = {"grey": _turned(self.grey), "slopes": (_turned(along_y), _turned(along_x))}
-        box, mask = _exchanged(self.box), _turned(self.mask)
-        return replace(self, image=_turned(self.image), box=box, mask=mask, _kept=found)
+    def transpose(self) -> Reference:
+        """The reference with x and y exchanged."""
+        along_x, along_y = self.gradient
+        cache: dict[Hashable, Any] = {
+            "grey": _transpose(self.grey),
+            "gradient": (_transpose(along_y), _transpose(along_x)),
+        }
+        box, mask = _transpose_box(self.box), _transpose(self.mask)
+        return replace(self, image=_transpose(self.image), box=box, mask=mask, _cache=cache)
 
-    def once(self, key: Hashable, make: Callable[[], T]) -> T:
-        """What ``make`` finds in this image, made when first asked for: of one reference many images are matched."""
-        if key not in self._kept:
-            self._kept[key] = make()
-        kept: T = self._kept[key]
-        return kept
+    def get_or_compute(self, key: Hashable, compute: Callable[[], T]) -> T:
+        """The value stored under a key, computed by ``compute`` and stored when first asked for.
+
+        What depends on the reference alone is thus computed once, however many images are matched to it.
+        """
+        if key not in self._cache:
+            self._cache[key] = compute()
+        value: T = self._cache[key]
+        return value
 
 
 @dataclass(frozen=True)
 class Current:
-    """A current image as it came, and the box (x0, y0, x1, y1) of it where matches can lie, filtered when needed."""
+    """A current image and a box of it where matches can lie, with what is computed from it when first needed.
+
+    image : (height, width) grey levels of the whole image, in its own type.
+    box : x0, y0, x1, y1 px, ends exclusive. degree : of the B-spline, 3 or 5. precision : float32 or float64.
+    """
 
     image: NDArray = field(repr=False)
     box: Box
@@ -90,26 +105,32 @@ class Current:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(height, width) of the whole image, px."""
+        """Height and width of the whole image, px."""
         return self.image.shape[0], self.image.shape[1]
 
     @property
-    def origin(self) -> Floats:
-        """(x, y) px of the box in the image."""
+    def origin(self) -> Pixels:
+        """Position (x, y) of the box's first pixel in the image. (2,) float64, px."""
         return np.array(self.box[:2], dtype=np.float64)
 
     @cached_property
     def coef(self) -> Levels:
-        """Padded coefficients of the box, those of the whole image: the filter sees the pixels around."""
+        """B-spline coefficients of the box, padded. (h + 2 PAD, w + 2 PAD).
+
+        They are those of the whole image, since the filter also takes the pixels around the box.
+        """
         return coefficients(self.image, self.degree, self.box, self.precision)
 
     @cached_property
-    def turned(self) -> Current:
-        """The image turned about its diagonal: x and y exchanged."""
-        return replace(self, image=_turned(self.image), box=_exchanged(self.box))
+    def transpose(self) -> Current:
+        """The current image with x and y exchanged."""
+        return replace(self, image=_transpose(self.image), box=_transpose_box(self.box))
 
-    def around(self, positions: Floats, margin: float) -> Current:
-        """The same with the box no larger than the positions (k, 2) px and a margin about them."""
+    def crop_around(self, positions: Pixels, margin: float) -> Current:
+        """The current image with its box reduced to given positions and a margin around them.
+
+        positions : (k, 2) float64, px. margin : px. A box that would hardly be smaller is left as it is.
+        """
         x0, y0, x1, y1 = self.box
         (left, right), (top, bottom) = (
             (int(np.floor(at.min() - margin)), int(np.ceil(at.max() + margin)) + 1) for at in positions.T
@@ -122,22 +143,27 @@ class Current:
             return self
         return Current(self.image, box, self.degree, self.precision)
 
-    def about_all(self, at: Floats, to: Floats, xy: Floats, radius: int) -> Current:
-        """The same with a box about where points xy (n, 2) px will lie, judged by some of which it is known.
+    def crop_by_affine_fit(self, at: Pixels, to: Pixels, xy: Pixels, radius: int) -> Current:
+        """The current image with its box reduced to where all points will lie, extrapolated from the matches of some of
+        them.
 
-        at, to : (k, 2) px. An affine fit of them moves and stretches all; the margin is three subset radii and 32 px.
+        at, to : (k, 2) float64, px, reference and current positions of the matched points; an affine map is fitted to
+            them.
+        xy : (n, 2) float64, px, reference positions of all points. radius : px, of the subset; the margin is three of
+            it and 32 px.
         """
-        some = slice(None, None, max(1, len(at) // _SOME))
+        some = slice(None, None, max(1, len(at) // _FIT_POINTS))
         fit = np.linalg.lstsq(np.insert(at[some], 0, 1.0, axis=1), to[some], rcond=None)[0]
-        return self.around(np.concatenate([to, fit[0] + xy @ fit[1:]]), 3.0 * radius + 32.0)
+        return self.crop_around(np.concatenate([to, fit[0] + xy @ fit[1:]]), 3.0 * radius + 32.0)
 
 
 def prepare_reference(
     image: NDArray, mask: Mask | None = None, settings: CorrelationSettings | None = None
 ) -> Reference:
-    """The reference image (h, w), 8 or 16 bits or float, and the box of its mask (h, w) bool.
+    """Prepare a reference image for correlation, in the box around its region of interest.
 
-    Without a mask all pixels take part. InputError for an empty mask or one of another size.
+    image : (h, w) grey levels, 8 or 16 bits or float. mask : (h, w) bool, region of interest; None for the whole image.
+    Raises InputError for an empty mask or one of another size.
     """
     settings = settings or CorrelationSettings()
     _check_image(image, "reference")
@@ -157,9 +183,12 @@ def prepare_reference(
 
 
 def prepare_current(image: NDArray, roi: Box | None = None, settings: CorrelationSettings | None = None) -> Current:
-    """The current image (h, w), or a box (x0, y0, x1, y1; ends exclusive) of it where matches can lie.
+    """Prepare a current image for correlation, whole or in a box where matches can lie.
 
-    A subset that leaves the box is lost as if it left the image.
+    image : (h, w) grey levels, 8 or 16 bits or float.
+    roi : box x0, y0, x1, y1 px, ends exclusive; None for the whole image. A subset that leaves the box is lost as if it
+        left the image.
+    Raises InputError for a box that is empty or outside the image.
     """
     settings = settings or CorrelationSettings()
     _check_image(image, "current")
@@ -170,7 +199,10 @@ def prepare_current(image: NDArray, roi: Box | None = None, settings: Correlatio
 
 
 def as_8_bit(image: NDArray) -> NDArray[np.uint8]:
-    """The image stretched to 8 bits for the search of start values, between its 0.1 and 99.9 percentiles."""
+    """An image in 8 bits for the search of start values, its 0.1 to 99.9 percentiles stretched to the whole range.
+
+    image : (h, w) grey levels of any type. Returns (h, w) uint8 grey levels, the image itself if it has 8 bits.
+    """
     if image.dtype == np.uint8:
         return image
     low, high = np.percentile(image[::4, ::4], [0.1, 99.9])
@@ -178,28 +210,34 @@ def as_8_bit(image: NDArray) -> NDArray[np.uint8]:
 
 
 def _grey_range(image: NDArray) -> float:
+    """Largest grey level that an image of this type can have; images of 10 and 12 bits also come in 16."""
     if image.dtype == np.uint16:
-        return max(float(image.max()), 255.0)  # 10 and 12 bits also come in 16
+        return max(float(image.max()), 255.0)
     return 255.0
 
 
 def _clip(box: Box, shape: tuple[int, ...]) -> Box:
+    """The part of a box that lies inside an image of this shape."""
     return max(int(box[0]), 0), max(int(box[1]), 0), min(int(box[2]), shape[1]), min(int(box[3]), shape[0])
 
 
-def _turned(image: NDArray) -> NDArray:
+def _transpose(image: NDArray) -> NDArray:
+    """Transposed copy of an image or mask."""
     whole = image.view(np.uint8) if image.dtype == np.bool_ else image
     return np.asarray(cv2.transpose(whole)).view(image.dtype)  # by blocks: five times faster than a copy of image.T
 
 
-def _exchanged(box: Box) -> Box:
+def _transpose_box(box: Box) -> Box:
+    """A box with x and y exchanged."""
     return box[1], box[0], box[3], box[2]
 
 
 def _crop(image: NDArray, box: Box, precision: type) -> Levels:
+    """Contiguous copy of a box of an image in the given precision."""
     return np.ascontiguousarray(image[box[1] : box[3], box[0] : box[2]], dtype=precision)
 
 
 def _check_image(image: NDArray, name: str) -> None:
+    """Raise InputError unless an image is grey and at least 8 px wide and high."""
     if image.ndim != 2 or min(image.shape) < 8:
         raise InputError(f"the {name} image must be grey and at least 8 px wide and high, not of shape {image.shape}")

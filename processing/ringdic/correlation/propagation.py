@@ -1,9 +1,9 @@
 """Reliability-guided propagation (Pan 2009) in waves: from the best matched points to their neighbours.
 
-Every wave refines, in parallel, all points that border on a reliable one, each from the best of its neighbours,
-displacement and derivatives carried across. Waves start at the most reliable level and sink to lower ones only when
-nothing else is left, so bad points are never a bridge while a better way exists. The result depends on nothing but
-the input: not on threads, not on timing.
+A wave refines, in parallel, all unmatched points that have a reliable neighbour. Each starts from its neighbour with
+the highest ZNCC, whose displacement and derivatives are extrapolated to it. Neighbours below a level of ZNCC are used
+only when no point is left beside better ones, so that poor matches are no bridge where there is a better way. The
+result depends on the input alone, not on the number of threads or on timing.
 """
 
 from __future__ import annotations
@@ -16,172 +16,214 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Pixels
 from ringdic.correlation import kernels
-from ringdic.correlation.neighbours import COUNT, inconsistent, local_fit, point_neighbours, predicted
+from ringdic.correlation.neighbours import COUNT, extrapolate, inconsistent_points, local_affine_fit, point_neighbours
 from ringdic.correlation.prepared import Current, Reference
-from ringdic.correlation.refinement import Subsets, refine, steep_along_rows, subsets_of
+from ringdic.correlation.refinement import SubsetCache, refine, steep_along_rows, subset_cache
 from ringdic.correlation.settings import CorrelationSettings
 from ringdic.correlation.status import Status
 
 Progress = Callable[[int, int], None]
 
-_LEVELS = (0.9, 0.8, 0.6)  # reliability in steps, ZNCC; the last one is settings.zncc_min
-_RETRIES = 3
-_DRIFTING = 0.9  # ZNCC of a point that twice did not converge from which on it is not started elsewhere
-_PATIENCE = 15  # iterations of a point that failed before
-_FEWEST = 8  # start values that tell where the region of interest goes
+_LEVELS = (0.9, 0.8, 0.6)  # levels of reliability, ZNCC; the last one is settings.zncc_min
+_RETRIES = 3  # neighbours from which a point is started at most
+_DRIFT_ZNCC = 0.9  # a point above it that twice did not converge is not started a third time
+_REPEATED_ITERATIONS = 15  # at most, of points that have failed before
+_FEWEST = 8  # start values from which an affine fit extrapolates where the region of interest lies
 _STRETCH = 4.0  # largest stretch and compression of a subset between two images
 
 
 @dataclass
 class Propagation:
-    """The state of all points while they are being matched; arrays over n points.
+    """State of the points of a correlation while they are matched; arrays over n points.
 
-    parameters (n, 12) as in ``kernels``; tried : (n, 8) bool, neighbours a start value was taken from;
-    fitted : (n,), which neighbours were good when a start value was fitted to the points around, as bits.
-    region : the part of the current image in use, chosen by the first start values, grown when a point lies beyond.
-    filtering : seconds spent on filtering it. bare : (n,) bool, points without texture; None to look for them.
-    alone : points are refined from start values of their own; none has neighbours.
-    drifting : (n,) bool, points that look alike but whose steps do not end, from two start values: at the rim of what
-    both images show they drift to the same place from any.
-    jump, stale : (n,), what the neighbours' judgement keeps, see ``inconsistent``.
+    Parameters
+    ----------
+    reference, current : the images.
+    xy : (n, 2) float64, px, points of the reference image.
+    settings : of the correlation. progress : called with the numbers of matched and of all points after every wave.
+    region : part of the current image in use; by default chosen from the first start values, and the whole image once a
+        point lies outside it.
+    filtering : seconds spent so far on filtering the current image.
+    textureless : (n,) bool, points with too little texture; found from the image by default.
+    independent : each point is refined from its own start value only; no point has neighbours.
+
+    Attributes
+    ----------
+    near : (n, 8) int64, indices of neighbours, -1 for none.
+    parameters : (n, 12) float64, px and derivatives, the warps in the order of ``kernels``.
+    status, zncc, iterations : (n,), results of the last refinement. sigma : (n, 2) float64, px.
+    used_sources : (n, 8) bool, neighbours that have already given a start value.
+    fit_sources : (n,) int64, the good neighbours at the time of the last affine fit, one bit each.
+    non_convergent : (n,) bool, points with a high ZNCC that did not converge from two start values. At the edge of what
+        both images show, they would drift to the same place from any.
+    deviation : (n,) float64, px, and stale : (n,) bool, cache of ``inconsistent_points``.
+    subsets : cache of what depends on the reference alone.
     """
 
     reference: Reference
     current: Current
-    xy: Floats
+    xy: Pixels
     settings: CorrelationSettings
     progress: Progress | None = None
     region: Current | None = None
     filtering: float = 0.0
-    bare: Mask | None = None
-    alone: bool = False
+    textureless: Mask | None = None
+    independent: bool = False
     near: Indices = field(init=False)
     parameters: Floats = field(init=False)
     status: Indices = field(init=False)
     zncc: Floats = field(init=False)
     iterations: Indices = field(init=False)
     sigma: Floats = field(init=False)
-    tried: Mask = field(init=False)
-    fitted: Indices = field(init=False)
-    drifting: Mask = field(init=False)
-    jump: Floats = field(init=False)
+    used_sources: Mask = field(init=False)
+    fit_sources: Indices = field(init=False)
+    non_convergent: Mask = field(init=False)
+    deviation: Floats = field(init=False)
     stale: Mask = field(init=False)
-    subsets: Subsets | None = field(init=False, default=None)
+    subsets: SubsetCache | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         n = len(self.xy)
-        self.near = np.full((n, COUNT), -1) if self.alone else point_neighbours(self.xy, self.settings.step)
+        self.near = np.full((n, COUNT), -1) if self.independent else point_neighbours(self.xy, self.settings.step)
         self.parameters = np.full((n, kernels.N_PARAMETERS), np.nan)
         self.status = np.full(n, Status.NOT_REACHED, np.int64)
         self.zncc = np.full(n, np.nan)
         self.iterations = np.zeros(n, np.int64)
         self.sigma = np.full((n, 2), np.nan)
-        self.tried, self.fitted = np.zeros((n, COUNT), bool), np.zeros(n, np.int64)
-        self.drifting = np.zeros(n, bool)
-        self.jump, self.stale = np.full(n, np.nan), np.ones(n, bool)
-        if self.bare is None:
-            self.bare = bare_points(self.reference, self.xy, self.settings)
-        self.status[self.bare] = Status.NO_TEXTURE
-        if not self.alone:
-            self.subsets = subsets_of(self.reference, self.xy, self.settings)
+        self.used_sources, self.fit_sources = np.zeros((n, COUNT), bool), np.zeros(n, np.int64)
+        self.non_convergent = np.zeros(n, bool)
+        self.deviation, self.stale = np.full(n, np.nan), np.ones(n, bool)
+        if self.textureless is None:
+            self.textureless = textureless_points(self.reference, self.xy, self.settings)
+        self.status[self.textureless] = Status.NO_TEXTURE
+        if not self.independent:
+            self.subsets = subset_cache(self.reference, self.xy, self.settings)
 
     @property
     def good(self) -> Mask:
-        """Points matched so far. (n,) bool."""
+        """Whether a point is matched. (n,) bool."""
         return self.status == Status.GOOD
 
-    def attempt(
+    def refine_from(
         self,
         index: Indices,
         start: Floats,
         zncc_min: float | None = None,
-        follow: bool = False,
-        held: bool = False,
+        prefer_neighbour: bool = False,
+        fixed_curvature: bool = False,
     ) -> Mask:
-        """Refine points (k,) from start values (k, 12) and keep what is good; true where it was. (k,) bool.
+        """Refine points from start values and keep the good matches.
 
-        follow : a point beside one just matched starts from it, if it agrees with the start value. held : the second
-        derivatives stay as they are given.
-        A result must look alike (ZNCC) and lie within a step of its start value.
+        A match is good if it converged, its ZNCC reaches the limit, it lies within a step of its start value and its
+        warp is not degenerate.
+
+        Parameters
+        ----------
+        index : (k,) int64, of the points.
+        start : (k, 12) float64, parameters in px and derivatives.
+        zncc_min : limit of the ZNCC; that of the settings by default.
+        prefer_neighbour : a point beside one just matched starts from that match where it agrees with the given start
+            value.
+        fixed_curvature : keep the second derivatives as given and refine the affine parameters alone.
+
+        Returns
+        -------
+        good : (k,) bool.
         """
-        settings = replace(self._patient(index), order=1) if held else self._patient(index)
-        part = self.region if self.region is not None else self._reached(start, index)
-        self._filter(part, start)
-        status, zncc, iterations, sigma, found = refine(
-            self.reference, part, self.xy[index], start, settings, follow, None if held else self._kept(index)
+        settings = replace(self._settings_for(index), order=1) if fixed_curvature else self._settings_for(index)
+        part = self.region if self.region is not None else self._initial_region(start, index)
+        self._filter_part(part, start)
+        status, zncc, iterations, sigma, parameters = refine(
+            self.reference,
+            part,
+            self.xy[index],
+            start,
+            settings,
+            prefer_neighbour,
+            None if fixed_curvature else self._cache_rows(index),
         )
-        beyond = np.flatnonzero(status == Status.OUTSIDE)
-        if part is not self.current and len(beyond):  # of the region, but perhaps not of the image
+        outside = np.flatnonzero(status == Status.OUTSIDE)
+        if part is not self.current and len(outside):  # outside the region, but perhaps inside the image
             part = self.current
-            self._filter(part, start[beyond])
-            again = refine(self.reference, part, self.xy[index[beyond]], start[beyond], settings)
-            status[beyond], zncc[beyond], iterations[beyond], sigma[beyond], found[beyond] = again
+            self._filter_part(part, start[outside])
+            second = refine(self.reference, part, self.xy[index[outside]], start[outside], settings)
+            status[outside], zncc[outside], iterations[outside], sigma[outside], parameters[outside] = second
         self.region = part
         limit = self.settings.zncc_min if zncc_min is None else zncc_min
-        jump = np.hypot(found[:, 0] - start[:, 0], found[:, 6] - start[:, 6])
-        settled = status == Status.GOOD
-        status = np.where(settled & ~(zncc >= limit), Status.LOW_ZNCC, status)
-        far = (status == Status.GOOD) & (jump > max(self.settings.step, 5))
-        status = np.where(far | ((status == Status.GOOD) & _degenerate(found)), Status.INCONSISTENT, status)
-        keep = status == Status.GOOD
+        distance = np.hypot(parameters[:, 0] - start[:, 0], parameters[:, 6] - start[:, 6])
+        status = np.where((status == Status.GOOD) & ~(zncc >= limit), Status.LOW_ZNCC, status)
+        far = (status == Status.GOOD) & (distance > max(self.settings.step, 5))
+        status = np.where(far | ((status == Status.GOOD) & _degenerate(parameters)), Status.INCONSISTENT, status)
+        good = status == Status.GOOD
         repeated = self.iterations[index] > 0
-        self.drifting[index] = repeated & (status == Status.NO_CONVERGENCE) & (zncc > _DRIFTING)
+        self.non_convergent[index] = repeated & (status == Status.NO_CONVERGENCE) & (zncc > _DRIFT_ZNCC)
         self.status[index], self.iterations[index] = status, iterations
-        self.parameters[index] = np.where(keep[:, None], found, np.nan)
-        self.zncc[index] = np.where(keep, zncc, np.nan)
-        self.sigma[index] = np.where(keep[:, None], sigma, np.nan)
+        self.parameters[index] = np.where(good[:, None], parameters, np.nan)
+        self.zncc[index] = np.where(good, zncc, np.nan)
+        self.sigma[index] = np.where(good[:, None], sigma, np.nan)
         self.stale[index] = True
         if self.progress is not None:
             self.progress(int(self.good.sum()), len(self.xy))
-        return keep
+        return good
 
-    def _kept(self, index: Indices) -> tuple[Subsets, Indices] | None:
+    def _cache_rows(self, index: Indices) -> tuple[SubsetCache, Indices] | None:
+        """The cache of the reference's subsets with the rows of points (k,) in it; None if there is no cache."""
         return None if self.subsets is None else (self.subsets, index)
 
-    def _patient(self, index: Indices) -> CorrelationSettings:
-        """The settings for points (k,): where none has been matched from elsewhere before, fewer iterations will tell.
+    def _settings_for(self, index: Indices) -> CorrelationSettings:
+        """The settings for refining points (k,), with fewer iterations if all of them have failed before.
 
-        Gauss-Newton from another start value converges in a few steps or, at the rim of what both images show, never.
+        From another start value Gauss-Newton converges within a few steps or, at the edge of what both images show,
+        never.
         """
-        if (self.iterations[index] > 0).all() and self.settings.max_iterations > _PATIENCE:
-            return replace(self.settings, max_iterations=_PATIENCE)
+        if (self.iterations[index] > 0).all() and self.settings.max_iterations > _REPEATED_ITERATIONS:
+            return replace(self.settings, max_iterations=_REPEATED_ITERATIONS)
         return self.settings
 
-    def _filter(self, part: Current, start: Floats) -> None:
+    def _filter_part(self, part: Current, start: Floats) -> None:
+        """Compute the coefficients of a part of the current image, and add the time to ``filtering``.
+
+        They are computed when first asked for; start (k, 12) decides whether those of the transposed image are needed.
+        """
         began = time.perf_counter()
-        assert (part.turned if steep_along_rows(start) else part).coef.size  # computed when first asked for
+        assert (part.transpose if steep_along_rows(start) else part).coef.size  # computed when first asked for
         self.filtering += time.perf_counter() - began
 
-    def _reached(self, start: Floats, index: Indices) -> Current:
-        """The part of the current image where the points will lie, judged by the first start values (k, 12)."""
+    def _initial_region(self, start: Floats, index: Indices) -> Current:
+        """The part of the current image where all points will lie, extrapolated from start values (k, 12) of points
+        (k,).
+        """
         known = np.isfinite(start).all(axis=1)
         if known.sum() < _FEWEST:
             return self.current
         at = self.xy[index[known]]
-        return self.current.about_all(at, at + start[known][:, [0, 6]], self.xy, self.settings.radius)
+        return self.current.crop_by_affine_fit(at, at + start[known][:, [0, 6]], self.xy, self.settings.radius)
 
     def adopt(self, index: Indices, other: Propagation) -> None:
-        """Take over the good points of another field, whose points are ``index`` (k,) here, where still open."""
-        take = other.good & ~self.good[index]
-        to = index[take]
+        """Take over the good matches of another propagation for points that are not matched here.
+
+        index : (k,) int64, the points here that are the other's points.
+        """
+        source = other.good & ~self.good[index]
+        to = index[source]
         self.parameters[to], self.status[to], self.zncc[to] = (
-            other.parameters[take],
-            other.status[take],
-            other.zncc[take],
+            other.parameters[source],
+            other.status[source],
+            other.zncc[source],
         )
-        self.iterations[to], self.sigma[to] = other.iterations[take], other.sigma[take]
+        self.iterations[to], self.sigma[to] = other.iterations[source], other.sigma[source]
         self.stale[to] = True
 
     def propagate(self) -> None:
-        """Waves from the good points until no point has an untried good neighbour."""
+        """Refine unmatched points in waves until none has a good neighbour that it has not been started from."""
         levels = [level for level in _LEVELS if level > self.settings.zncc_min] + [-1.0]
         while True:
-            index = np.flatnonzero(self._open())
-            index = index[self.tried[index].sum(axis=1) < _RETRIES]
+            index = np.flatnonzero(self._unmatched())
+            index = index[self.used_sources[index].sum(axis=1) < _RETRIES]
             near = self.near[index]
-            worth = np.where((near >= 0) & self.good[near] & ~self.tried[index], self.zncc[near], -np.inf)
+            worth = np.where((near >= 0) & self.good[near] & ~self.used_sources[index], self.zncc[near], -np.inf)
             best = worth.max(axis=1)
             level = next((level for level in levels if (best >= level).any()), None)
             if level is None:
@@ -190,76 +232,77 @@ class Propagation:
             self._wave(index[ready], np.argmax(worth[ready], axis=1))
 
     def _wave(self, index: Indices, slot: Indices) -> None:
-        """Open points (k,) refined from one of their neighbours each (k,)."""
-        self.tried[index, slot] = True
-        start = predicted(self.xy, self.parameters, self.near[index, slot], index)
+        """Refine unmatched points (k,), each from the match of its neighbour number ``slot`` (k,)."""
+        self.used_sources[index, slot] = True
+        start = extrapolate(self.xy, self.parameters, self.near[index, slot], index)
         failed = self.iterations[index] > 0
         for part in (~failed, failed):
             if part.any():
-                self.attempt(index[part], start[part])
+                self.refine_from(index[part], start[part])
 
     def retry_from_fit(self) -> None:
-        """Lost points once more, from an affine fit of the good points around them; then from their new neighbours.
+        """Refine unmatched points again, from an affine fit of the good matches around them, and propagate from there.
 
-        Not those that failed so before and whose neighbours are good or lost as they were then.
+        Points that failed so before are left out while the same neighbours as then are good.
         """
         for _ in range(2):
-            index = np.flatnonzero(self._open())
+            index = np.flatnonzero(self._unmatched())
             beside = self._good_neighbours(index)
-            new = (beside > 0) & (beside != self.fitted[index])
+            new = (beside > 0) & (beside != self.fit_sources[index])
             index, beside = index[new], beside[new]
             if not len(index):
                 return
-            self.fitted[index] = beside
-            start = local_fit(self.xy, self.parameters, self.good, self.near, index)
+            self.fit_sources[index] = beside
+            start = local_affine_fit(self.xy, self.parameters, self.good, self.near, index)
             usable = np.isfinite(start).all(axis=1)
-            if not usable.any() or not self.attempt(index[usable], start[usable]).any():
+            if not usable.any() or not self.refine_from(index[usable], start[usable]).any():
                 return
             self.propagate()
 
-    def hold_curvature(self) -> None:
-        """Lost points of second order once more as of first, with the second derivatives of their best neighbour.
+    def retry_with_neighbour_curvature(self) -> None:
+        """Refine unmatched points of second order again with the second derivatives of their best neighbour held fixed.
 
-        A subset that the region cuts in half knows its own too poorly.
+        A subset that the mask cuts in half determines its own second derivatives too poorly.
         """
-        index = np.flatnonzero(self._open())
+        index = np.flatnonzero(self._unmatched())
         index = index[self._good_neighbours(index) > 0]
         if self.settings.order == 1 or not len(index):
             return
         near = self.near[index]
         best = np.argmax(np.where((near >= 0) & self.good[near], self.zncc[near], -np.inf), axis=1)
         source = near[np.arange(len(index)), best]
-        if self.attempt(index, predicted(self.xy, self.parameters, source, index), held=True).any():
+        if self.refine_from(index, extrapolate(self.xy, self.parameters, source, index), fixed_curvature=True).any():
             self.reject_outliers()
 
     def reject_outliers(self) -> bool:
-        """Points that contradict their neighbours become lost, until none does. True if any did."""
+        """Drop matches that contradict their neighbours, until none is left that does. True if any was dropped."""
         for k in range(5):
-            bad = inconsistent(self.xy, self.parameters, self.good, self.near, self.jump, self.stale)
+            bad = inconsistent_points(self.xy, self.parameters, self.good, self.near, self.deviation, self.stale)
             if not bad.any():
                 return k > 0
             self.status[bad] = Status.INCONSISTENT
             self.parameters[bad], self.zncc[bad], self.sigma[bad] = np.nan, np.nan, np.nan
-            self.tried[bad] = False  # another neighbour may lead elsewhere
+            self.used_sources[bad] = False  # a neighbour used before may now have another match
             self.stale[bad] = True
         return True
 
-    def _open(self) -> Mask:
-        """Points not matched that another start value may help. (n,)."""
-        return ~self.good & (self.status != Status.NO_TEXTURE) & ~self.drifting
+    def _unmatched(self) -> Mask:
+        """Points not matched that another start value may help. (n,) bool."""
+        return ~self.good & (self.status != Status.NO_TEXTURE) & ~self.non_convergent
 
     def _good_neighbours(self, index: Indices) -> Indices:
-        """Which of the neighbours of points (k,) are good, as bits of a number. (k,)."""
+        """Which of the neighbours of points (k,) are good, one bit each. (k,) int64."""
         near = self.near[index]
         return np.asarray(((near >= 0) & self.good[near]) @ (1 << np.arange(COUNT)))
 
 
-def bare_points(reference: Reference, xy: Floats, settings: CorrelationSettings) -> Mask:
-    """Points (n,) with clearly too little texture about them, seen at once for all: no start value is sought there.
+def textureless_points(reference: Reference, xy: Pixels, settings: CorrelationSettings) -> Mask:
+    """Points whose surroundings clearly have too little texture to be matched.
 
-    The kernel judges the subset itself.
+    A quick test of all points at once, so that no start value is sought for them; the kernel tests the subset itself.
+    xy : (n, 2) float64, px, points of the reference image. Returns (n,) bool.
     """
-    weakest, thin = reference.once(("texture", settings.radius), lambda: _texture(reference, settings.radius))
+    weakest, thin = reference.get_or_compute(("texture", settings.radius), lambda: _texture(reference, settings.radius))
     at = np.rint((xy - reference.origin) / thin).astype(np.int64)
     h, w = weakest.shape
     column, row = np.clip(at[:, 0], 0, w - 1), np.clip(at[:, 1], 0, h - 1)
@@ -268,13 +311,17 @@ def bare_points(reference: Reference, xy: Floats, settings: CorrelationSettings)
 
 
 def _texture(reference: Reference, radius: int) -> tuple[NDArray[np.float32], int]:
-    """The weaker eigenvalue of the structure tensor over the square about every so many pixels of the box, from a
-    sample of its pixels; and how many pixels."""
+    """Smaller eigenvalue of the structure tensor over a square of the subset's size, for the pixels of the reference's
+    box.
+
+    It is computed from every ``thin``-th pixel each way, and for those. Returns the eigenvalues (rows, columns), in
+    squared grey levels per px², and ``thin``.
+    """
     thin = max(radius // 8, 1)
     size = (2 * (radius // thin) + 1,) * 2
     sampled = np.s_[::thin, ::thin]
     inside = reference.mask[sampled].astype(np.float32)
-    gx, gy = (slope[sampled].astype(np.float32) * inside for slope in reference.slopes)
+    gx, gy = (slope[sampled].astype(np.float32) * inside for slope in reference.gradient)
 
     def mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
         return np.asarray(cv2.boxFilter(values, -1, size, borderType=cv2.BORDER_CONSTANT))
@@ -286,7 +333,10 @@ def _texture(reference: Reference, radius: int) -> tuple[NDArray[np.float32], in
 
 
 def _degenerate(parameters: Floats) -> Mask:
-    """Warps (n, 12) that fold, or stretch an axis beyond what a view of a surface does: never a true match. (n,)."""
+    """Warps that fold a subset over, or stretch or compress it more than a view of a surface does.
+
+    parameters : (n, 12). Returns (n,) bool.
+    """
     a, b, c, d = 1.0 + parameters[:, 1], parameters[:, 2], parameters[:, 7], 1.0 + parameters[:, 8]
     half, det = 0.5 * (a * a + b * b + c * c + d * d), a * d - b * c
     largest = np.sqrt(half + np.sqrt(np.maximum(half * half - det * det, 0.0)))

@@ -1,8 +1,8 @@
 """Local least squares: a quadratic of a measured field over the neighbours of every point, on any set of points.
 
 About point i the field is ``f(x_j) = a + b dx + c dy + p dx²/2 + q dx dy + r dy²/2`` with (dx, dy) = x_j - x_i; each
-neighbour weighs as its uncertainty says. The coefficients are the field, its gradient and its second derivatives at
-the point, far less noisy than those of one subset.
+neighbour is weighted by the inverse square of its uncertainty. The coefficients are the field, its gradient and its
+second derivatives at the point, far less noisy than those of one subset.
 """
 
 from __future__ import annotations
@@ -14,21 +14,26 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Pixels
 from ringdic.correlation.warps import cholesky, solve_cholesky
 
-_LEAST = 10  # neighbours, itself included, that six coefficients are taken from
-_LEAST_SHARE = 0.3  # of the median sigma: no point weighs more than this lets it
-_RIDGE = 1e-10  # of the trace: points on one line give a large sigma, not an error
+_MIN_NEIGHBOURS = 10  # for six coefficients, the point itself included
+_MIN_SIGMA = 0.3  # least uncertainty that counts, as a share of the median: bounds the weight of a single point
+_RIDGE = 1e-10  # share of the trace added to the diagonal: points on a line give a large sigma, not a singular matrix
 
 
 @dataclass(frozen=True)
 class QuadraticFit:
-    """Local quadratics of a field of k components at n points; NaN where too few neighbours are known.
+    """Local quadratics of a field of k components at n points; NaN where too few neighbours are measured.
 
-    value : (n, k). gradient : (n, k, 2) by x, y. curvature : (n, k, 3), second derivatives by xx, xy, yy.
-    value_sigma (n,), curvature_sigma (n, 3) : their standard uncertainties, the neighbours' noise independent.
-    leave_out : (n, k), measured value minus the quadratic of the other points; NaN where not measured.
+    The units are those of the field, per px for the gradient and per px² for second derivatives.
+
+    value : (n, k) float64, smoothed field. gradient : (n, k, 2) float64, its derivatives by x, y.
+    curvature : (n, k, 3) float64, its second derivatives by xx, xy, yy.
+    value_sigma : (n,) float64, curvature_sigma : (n, 3) float64, standard uncertainties, the neighbours' noise taken as
+        independent.
+    leave_one_out : (n, k) float64, residual of each point against the quadratic of the other points; NaN where it is
+        not measured.
     """
 
     value: Floats
@@ -36,10 +41,13 @@ class QuadraticFit:
     curvature: Floats
     value_sigma: Floats
     curvature_sigma: Floats
-    leave_out: Floats
+    leave_one_out: Floats
 
-    def carried(self, index: Indices, offset: Floats) -> Floats:
-        """The field (j, k) at offsets (j, 2) px from the points ``index`` (j,), by their quadratics."""
+    def extrapolate(self, index: Indices, offset: Pixels) -> Floats:
+        """The field at given offsets from points, by their quadratics.
+
+        index : (j,) int64, of the points. offset : (j, 2) float64, px, from them. Returns (j, k) in the field's unit.
+        """
         dx, dy = offset[:, 0, None], offset[:, 1, None]
         (gx, gy), (xx, xy, yy) = np.moveaxis(self.gradient[index], -1, 0), np.moveaxis(self.curvature[index], -1, 0)
         curved = 0.5 * xx * dx**2 + xy * dx * dy + 0.5 * yy * dy**2
@@ -47,19 +55,23 @@ class QuadraticFit:
 
 
 class Neighbourhoods:
-    """The neighbours within ``window`` of each of the points xy (n, 2), the point itself included."""
+    """Neighbours of each of a set of points within a radius, each point itself included, for local quadratic fits.
 
-    def __init__(self, xy: Floats, window: float) -> None:
+    xy : (n, 2) float64, px, the points. window : px, the radius. Raises ValueError unless the window is positive.
+    """
+
+    def __init__(self, xy: Pixels, window: float) -> None:
         if not window > 0:
             raise ValueError(f"the window must be positive, not {window}")
         self.xy = np.ascontiguousarray(xy, dtype=np.float64)
         self.window = float(window)
-        self._first, self._members = members_within(self.xy, self.xy, self.window)
+        self._first, self._members = neighbours_within(self.xy, self.xy, self.window)
 
     def fit(self, values: Floats, sigma: Floats | None = None) -> QuadraticFit:
-        """Quadratics of a field.
+        """Fit a quadratic of a field around every point.
 
-        values : (n, k), a row with NaN is not measured. sigma : (n,) standard uncertainty, 1 if not given.
+        values : (n, k) float64, the field in any unit; a row with NaN counts as not measured.
+        sigma : (n,) float64, standard uncertainty in the field's unit; 1 for all by default.
         """
         n, k = values.shape
         known: Mask = np.asarray(np.isfinite(values).all(axis=1))
@@ -69,14 +81,15 @@ class Neighbourhoods:
         _fit(self.xy, self._first, self._members, self.window, weight, measured, c, scatter)
         with np.errstate(invalid="ignore", divide="ignore"):
             own = weight * scatter[:, 0] ** 2
-            leave_out = np.where(known[:, None], (values - c[..., 0]) / (1.0 - own)[:, None], np.nan)
+            leave_one_out = np.where(known[:, None], (values - c[..., 0]) / (1.0 - own)[:, None], np.nan)
         w = self.window
         return QuadraticFit(
-            c[..., 0], c[..., 1:3] / w, c[..., 3:] / w**2, scatter[:, 0], scatter[:, 3:] / w**2, leave_out
+            c[..., 0], c[..., 1:3] / w, c[..., 3:] / w**2, scatter[:, 0], scatter[:, 3:] / w**2, leave_one_out
         )
 
 
 def _weights(known: Mask, sigma: Floats | None) -> Floats:
+    """Weights (n,) of the points, 0 where not measured; no point has much less than the median uncertainty."""
     if sigma is None:
         return known.astype(np.float64)
     with np.errstate(invalid="ignore"):
@@ -84,14 +97,16 @@ def _weights(known: Mask, sigma: Floats | None) -> Floats:
     if not ready.any():
         return known.astype(np.float64)
     median = float(np.median(sigma[ready]))
-    limited = np.where(ready, np.maximum(np.nan_to_num(sigma, nan=median), _LEAST_SHARE * median), median)
+    limited = np.where(ready, np.maximum(np.nan_to_num(sigma, nan=median), _MIN_SIGMA * median), median)
     return np.where(known, 1.0 / limited**2, 0.0)
 
 
-def members_within(centres: Floats, xy: Floats, window: float) -> tuple[Indices, NDArray[np.int32]]:
-    """Which of the points xy (m, 2) lie within ``window`` of each centre (n, 2).
+def neighbours_within(centres: Pixels, xy: Pixels, window: float) -> tuple[Indices, NDArray[np.int32]]:
+    """Points within a radius of each of a set of centres.
 
-    Their indices, one centre after the other (k,), and where those of each centre begin, (n + 1,).
+    centres : (n, 2) float64, px. xy : (m, 2) float64, px, the points. window : px, the radius.
+    Returns where the points of each centre begin, (n + 1,) int64, and the indices of the points, one centre after the
+    other, (k,) int32.
     """
     low = np.minimum(xy.min(axis=0), centres.min(axis=0)) if len(xy) and len(centres) else np.zeros(2)
     last = int(max(np.max((xy - low)[:, 0] // window, initial=0), np.max((centres - low)[:, 0] // window, initial=0)))
@@ -103,20 +118,23 @@ def members_within(centres: Floats, xy: Floats, window: float) -> tuple[Indices,
     return _within(centres, xy, window, of_centre, columns, by_cell, starts)  # type: ignore[no-any-return]
 
 
-def _cells(xy: Floats, side: float, columns: int) -> Indices:
-    """The number (n,) of the square that holds each point, row by row."""
+def _cells(xy: Pixels, side: float, columns: int) -> Indices:
+    """Number (n,) of the square of a grid that holds each point, row by row."""
     column, row = np.floor(xy / side).astype(np.int64).T + 1
     return np.asarray(row * columns + column)
 
 
 class LowerQuartiles:
-    """Lower quartiles, about each centre (n, 2), of what is known of the points xy (m, 2) within ``window``."""
+    """Lower quartiles of values at points (m, 2) px within a radius ``window`` px of each centre (n, 2) px."""
 
-    def __init__(self, centres: Floats, xy: Floats, window: float) -> None:
-        self._first, self._members = members_within(np.asarray(centres, float), np.asarray(xy, float), float(window))
+    def __init__(self, centres: Pixels, xy: Pixels, window: float) -> None:
+        self._first, self._members = neighbours_within(np.asarray(centres, float), np.asarray(xy, float), float(window))
 
     def __call__(self, values: Floats) -> Floats:
-        """Of values (m,). (n,), NaN where none is known."""
+        """Lower quartile around each centre, of values (m,) of which those with NaN are left out.
+
+        values : (m,) float64, in any unit. Returns (n,) in that unit, NaN where no value is known.
+        """
         out = np.full(len(self._first) - 1, np.nan)
         _quartiles(self._first, self._members, np.ascontiguousarray(values, dtype=np.float64), out)
         return out
@@ -124,10 +142,11 @@ class LowerQuartiles:
 
 @nb.njit(cache=True, nogil=True)
 def _within(centres, xy, window, cell, columns, by_cell, starts):  # type: ignore[no-untyped-def]
-    """The members (k,) of all neighbourhoods one after the other, and where each begins (n + 1,).
+    """Neighbourhoods of ``neighbours_within``: where each begins (n + 1,), and the members (k,) of all.
 
-    cell : (n,) the square of side ``window`` that holds each centre, row by row; by_cell : the points in the order of
-    their cells, starts : where each cell begins among them.
+    cell : (n,), square of side ``window`` that holds each centre, row by row; by_cell : the points in the order of
+        their
+    cells; starts : where each cell begins among them.
     """
     n = len(centres)
     first = np.zeros(n + 1, np.int64)
@@ -152,7 +171,10 @@ def _within(centres, xy, window, cell, columns, by_cell, starts):  # type: ignor
 
 @nb.njit(cache=True, nogil=True)
 def _normal_matrix(xy, i, members, window, weight, M):  # type: ignore[no-untyped-def]
-    """M (6, 6), lower half, of the neighbours of point i in units of the window; how many have a weight."""
+    """Fill the lower half of the normal matrix M (6, 6) of the neighbours of point i, lengths in units of the window.
+
+    Returns the number of neighbours with a weight.
+    """
     count = 0
     m00 = m10 = m01 = m20 = m11 = m02 = m30 = m21 = m12 = m03 = m40 = m31 = m22 = m13 = m04 = 0.0
     for j in members:
@@ -187,7 +209,7 @@ def _normal_matrix(xy, i, members, window, weight, M):  # type: ignore[no-untype
 
 @nb.njit(cache=True, nogil=True)
 def _right_side(xy, i, members, window, weight, values, b):  # type: ignore[no-untyped-def]
-    """b (6,) of the neighbours of point i: the values (n,) with the weights."""
+    """Fill the right side b (6,) of the normal equations of point i from the weighted values (n,)."""
     b0 = b1 = b2 = b3 = b4 = b5 = 0.0
     for j in members:
         if weight[j] > 0.0:
@@ -204,15 +226,16 @@ def _right_side(xy, i, members, window, weight, values, b):  # type: ignore[no-u
 
 @nb.njit(cache=True, nogil=True, parallel=True)
 def _fit(xy, first, members, window, weight, values, c, scatter):  # type: ignore[no-untyped-def]
-    """c (n, k, 6), in units of the window, and scatter (n, 6), √ of the diagonal of the inverse normal matrix.
+    """Fit the quadratics at all points: c (n, k, 6), lengths in units of the window, and scatter (n, 6).
 
-    values : (k, n). weight : (n,), 0 where not measured.
+    scatter : square roots of the diagonal of the inverse normal matrix. values : (k, n). weight : (n,), 0 where not
+        measured.
     """
     k, n = values.shape
     for i in nb.prange(n):
         about = members[first[i] : first[i + 1]]
         M, e = np.empty((6, 6)), np.empty(6)
-        if _normal_matrix(xy, i, about, window, weight, M) < _LEAST:
+        if _normal_matrix(xy, i, about, window, weight, M) < _MIN_NEIGHBOURS:
             continue
         trace = M[0, 0] + M[1, 1] + M[2, 2] + M[3, 3] + M[4, 4] + M[5, 5]
         for p in range(6):
@@ -231,6 +254,7 @@ def _fit(xy, first, members, window, weight, values, c, scatter):  # type: ignor
 
 @nb.njit(cache=True, nogil=True, parallel=True)
 def _quartiles(first, members, values, out):  # type: ignore[no-untyped-def]
+    """Fill out (n,) with the lower quartile of the finite values in each neighbourhood."""
     for i in nb.prange(len(out)):
         about = values[members[first[i] : first[i + 1]]]
         about = about[np.isfinite(about)]

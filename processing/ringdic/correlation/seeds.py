@@ -1,7 +1,7 @@
-"""Where to look for first matches, and what optical flow and a template search say there.
+"""Seed points, and their start values in another image of the same camera by optical flow and by template matching.
 
-Both work on reduced images whose local mean and contrast are levelled, so a change of light between the images does
-not matter; they serve images of one camera. Between cameras see ``features``.
+Both methods work on reduced images whose local mean and contrast are equalised, so that a change of light between the
+images does not matter. Between cameras, ``features`` gives start values.
 """
 
 from __future__ import annotations
@@ -10,18 +10,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Indices
+from ringdic.arrays import Floats, Indices, Pixels
 from ringdic.correlation.prepared import Current, Reference, as_8_bit
 
 _SEEDS = 150
 _FLOW_SIDE = 700  # px of the longer side of the reduced region
 _FLOW_MARGIN = 96  # px around the region
-_LEVELLED = 35  # px of the reduced image over which mean and contrast are levelled
+_LEVELLED = 35  # px of the reduced image over which mean and contrast are equalised
 _SEARCH = 160  # px, largest displacement of the template search
 
 
-def spread(xy: Floats, count: int = _SEEDS) -> Indices:
-    """Indices of about ``count`` points spread evenly over xy (n, 2): in each cell the one nearest its middle."""
+def even_sample(xy: Pixels, count: int = _SEEDS) -> Indices:
+    """Sample about ``count`` points spread evenly over the area of all: in each cell of a grid the point nearest to its
+    middle.
+
+    xy : (n, 2) float64, px. Returns indices (k,), ascending.
+    """
     if len(xy) <= count:
         return np.arange(len(xy))
     low, size = xy.min(axis=0), np.ptp(xy, axis=0) + 1.0
@@ -39,13 +43,18 @@ def spread(xy: Floats, count: int = _SEEDS) -> Indices:
     return np.sort(order[first])
 
 
-def flow_starts(reference: Reference, current: Current, xy: Floats, radius: int) -> Floats:
-    """Start values (n, 12) from dense inverse search flow (Kroeger et al. 2016) on a reduced region."""
+def flow_start_values(reference: Reference, current: Current, xy: Pixels, radius: int) -> Floats:
+    """Start values from dense inverse search optical flow (Kroeger et al. 2016) on a reduced region of the images.
+
+    xy : (n, 2) float64, px, points of the reference image. radius : px, of the subset.
+    Returns (n, 12), displacement in px and its gradients in the order of the kernels' parameters; NaN if the region is
+    too small.
+    """
     h, w = reference.mask.shape
     scale = _flow_scale(max(h, w))
     x0, y0 = (np.maximum(reference.origin - _FLOW_MARGIN, 0)).astype(int)
     x1, y1 = (reference.origin + np.array([w, h]) + _FLOW_MARGIN).astype(int)
-    ref = reference.once(("levelled", scale), lambda: _reduced(reference.image[y0:y1, x0:x1], scale))
+    ref = reference.get_or_compute(("levelled", scale), lambda: _reduced(reference.image[y0:y1, x0:x1], scale))
     cur = _reduced(current.image[y0:y1, x0:x1], scale)
     height, width = min(ref.shape[0], cur.shape[0]), min(ref.shape[1], cur.shape[1])
     if min(height, width) < 16:
@@ -67,13 +76,21 @@ def flow_starts(reference: Reference, current: Current, xy: Floats, radius: int)
 
 
 def _flow_scale(side: int) -> float:
-    """By what a region with such a longer side, px, is reduced; where to about half or less, by a whole number."""
+    """Scale, at most 1, to which a region is reduced for the optical flow; side : px, the longer side of the region.
+
+    From about a half down it is one over a whole number: averages over whole pixels cost a tenth.
+    """
     times = min(max(side / _FLOW_SIDE, 1.0), 4.0)
-    return 1.0 / (round(times) if times > 1.5 else times)  # averages over whole pixels cost a tenth
+    return 1.0 / (round(times) if times > 1.5 else times)
 
 
-def search_starts(reference: Reference, current: Current, xy: Floats, radius: int) -> Floats:
-    """Start values (n, 12) by normalised correlation of a template within ± 160 px; NaN where nothing resembles."""
+def template_start_values(reference: Reference, current: Current, xy: Pixels, radius: int) -> Floats:
+    """Start values from normalised cross-correlation of a template within ± 160 px, on reduced images.
+
+    xy : (n, 2) float64, px, points of the reference image. radius : px, of the subset.
+    Returns (n, 12), displacement in px and zeros, in the order of the kernels' parameters; NaN where no peak is high
+    enough.
+    """
     scale = 1.0 / max(1, min(4, radius // 8))
     ref, cur = _reduced(reference.image, scale), _reduced(current.image, scale)
     half, reach = round(max(1.2 * radius, 12) * scale), round(_SEARCH * scale)
@@ -93,22 +110,25 @@ def search_starts(reference: Reference, current: Current, xy: Floats, radius: in
 
 
 def _reduced(image: NDArray, scale: float) -> NDArray[np.uint8]:
-    """8-bit image reduced by area and levelled: local mean 128, local standard deviation 40."""
+    """An image in 8 bits, reduced by area averaging, with a local mean of 128 and a local standard deviation of 40."""
     grey: NDArray = as_8_bit(image)
     if scale < 1.0:
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     level = grey.astype(np.float32)
     level -= cv2.blur(level, (_LEVELLED, _LEVELLED))
-    spread_of = np.sqrt(np.maximum(cv2.blur(level * level, (_LEVELLED, _LEVELLED)), 4.0))
-    return np.clip(128.0 + 40.0 * level / spread_of, 0, 255).astype(np.uint8)
+    deviation = np.sqrt(np.maximum(cv2.blur(level * level, (_LEVELLED, _LEVELLED)), 4.0))
+    return np.clip(128.0 + 40.0 * level / deviation, 0, 255).astype(np.uint8)
 
 
-def _reduced_position(xy: Floats, scale: float) -> Floats:
-    """Positions in the reduced image: area averaging keeps the corner of the corner pixel in place."""
+def _reduced_position(xy: Pixels, scale: float) -> Pixels:
+    """Positions (n, 2) in the reduced image of positions in the full one, px.
+
+    Area averaging keeps the outer corner of the corner pixel, at (-0.5, -0.5), in place.
+    """
     return (xy + 0.5) * scale - 0.5
 
 
-def _sample(flow: NDArray[np.float32], at: Floats) -> Floats:
+def _sample(flow: NDArray[np.float32], at: Pixels) -> Pixels:
     """Bilinear samples (n, 2) of a flow field at positions (n, 2), px of the field."""
     points = at.astype(np.float32)
     sampled = cv2.remap(flow, points[:, None, 0], points[:, None, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -1,9 +1,9 @@
 """B-spline coefficients and gradients of an image by finite filters.
 
-A spline through the samples f is Σ c_k β(x − k) with c = b⁻¹ * f, b the sampled B-spline (Unser, Aldroubi & Eden
-1993). The inverse filter decays as its largest pole to the power of the distance (quintic 0.431, cubic 0.268), so a
-finite filter reaches any accuracy; mirrored borders are exact for it. What goes in decides the precision: a float32
-image is filtered in single precision, with as many taps as that resolves.
+A spline through the samples f is Σ c_k β(x − k) with c = b⁻¹ * f, b the sampled B-spline (Unser, Aldroubi & Eden 1993).
+The inverse filter decays as its largest pole to the power of the distance (quintic 0.431, cubic 0.268), so a finite
+filter reaches any accuracy; mirrored borders are exact for it. In single precision the filter has only as many taps as
+that resolves.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats
-from ringdic.correlation.filters import separable
+from ringdic.correlation.filters import separable_filter
 
 Levels = NDArray[np.floating]
 Box = tuple[int, int, int, int]
@@ -22,12 +22,15 @@ _SAMPLES = {3: np.array([1.0, 4.0, 1.0]) / 6.0, 5: np.array([1.0, 26.0, 66.0, 26
 _SLOPES = {3: np.array([0.5, 0.0, -0.5]), 5: np.array([1.0, 10.0, 0.0, -10.0, -1.0]) / 24.0}
 # Taps on either side: pole ** reach < 3e-7 in single precision, 1e-10 in double.
 _REACH = {("f", 3): 12, ("f", 5): 18, ("d", 3): 18, ("d", 5): 28}
-REACH = max(_REACH.values()) + 2  # of any filter here
-PAD = 32  # coefficients outside the image: a position inside has its taps, a vector its lanes
+REACH = max(_REACH.values()) + 2  # the longest of all filters, and the derivative's taps
+PAD = 32  # coefficients outside the image: taps of positions near its edge, and lanes of vectors that reach over it
 
 
 def prefilter_taps(degree: int, precision: str = "d") -> Floats:
-    """The inverse of the sampled B-spline, centred. (2 reach + 1,). precision : a float's character code, f or d."""
+    """Taps of the inverse filter that turns samples into B-spline coefficients, centred.
+
+    degree : 3 or 5. precision : character code of the float type, f or d. Returns (2 reach + 1,) float64, no unit.
+    """
     reach = _REACH[precision, degree]
     samples = _SAMPLES[degree]
     period = 8 * reach
@@ -39,32 +42,41 @@ def prefilter_taps(degree: int, precision: str = "d") -> Floats:
 
 
 def gradient_taps(degree: int, precision: str = "d") -> Floats:
-    """Derivative at the samples of the interpolating spline, as a correlation kernel. (odd,)."""
+    """Taps of a correlation kernel that gives the derivative of the interpolating spline at the samples.
+
+    degree : 3 or 5. precision : character code of the float type, f or d. Returns (k,) float64, k odd, 1/px.
+    """
     return np.convolve(prefilter_taps(degree, precision), _SLOPES[degree])[::-1].copy()
 
 
 def coefficients(image: NDArray, degree: int, box: Box | None = None, precision: type | None = None) -> Levels:
-    """Spline coefficients of a box (x0, y0, x1, y1; the whole if None) of an image (h, w), with PAD more on every side.
+    """B-spline coefficients of an image, or of a box of it, with PAD more on every side.
 
-    precision : float32 or float64; the image's own if None. (y1 - y0 + 2 PAD, x1 - x0 + 2 PAD).
+    image : (h, w) grey levels. degree : 3 or 5. box : x0, y0, x1, y1 in px, ends exclusive; None for the whole image.
+    precision : float32 or float64; None for the image's own type.
+    Returns (y1 - y0 + 2 PAD, x1 - x0 + 2 PAD), in grey levels.
     """
     x0, y0, x1, y1 = box or (0, 0, image.shape[1], image.shape[0])
     kind = np.dtype(precision or image.dtype)
     taps = prefilter_taps(degree, kind.char).astype(kind)
     out = np.empty((y1 - y0 + 2 * PAD, x1 - x0 + 2 * PAD), kind)
-    separable(image, taps, taps, x0 - PAD, y0 - PAD, out)
+    separable_filter(image, taps, taps, x0 - PAD, y0 - PAD, out)
     return out
 
 
 def gradients(
     image: NDArray, degree: int, box: Box | None = None, precision: type | None = None
 ) -> tuple[Levels, Levels]:
-    """∂/∂x and ∂/∂y of the spline at the samples of a box (the whole if None) of an image. Two (y1 - y0, x1 - x0),
-    grey levels a pixel. precision : as for :func:`coefficients`."""
+    """Derivatives ∂/∂x and ∂/∂y of the interpolating spline at the pixels of an image, or of a box of it.
+
+    image : (h, w) grey levels. degree : 3 or 5. box : x0, y0, x1, y1 in px, ends exclusive; None for the whole image.
+    precision : float32 or float64; None for the image's own type.
+    Returns two arrays (y1 - y0, x1 - x0), in grey levels per px.
+    """
     x0, y0, x1, y1 = box or (0, 0, image.shape[1], image.shape[0])
     kind = np.dtype(precision or image.dtype)
     slope, one = gradient_taps(degree, kind.char).astype(kind), np.ones(1, kind)
     along_x, along_y = np.empty((y1 - y0, x1 - x0), kind), np.empty((y1 - y0, x1 - x0), kind)
-    separable(image, slope, one, x0, y0, along_x)
-    separable(image, one, slope, x0, y0, along_y)
+    separable_filter(image, slope, one, x0, y0, along_x)
+    separable_filter(image, one, slope, x0, y0, along_y)
     return along_x, along_y

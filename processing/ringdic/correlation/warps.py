@@ -1,7 +1,7 @@
-"""Normal equations and warps: a Cholesky factor, and the inverse composition of two warps. Double precision.
+"""Kernels for the normal equations and for composing warps: Cholesky factor, solution, inverse composition.
 
-The 12 parameters of a warp are those of ``kernels``. The inverse-compositional scheme is Baker & Matthews (2004), its
-second-order composition Gao et al. (2015).
+All in double precision. The 12 parameters of a warp are those of ``kernels``. The inverse-compositional scheme is Baker
+& Matthews (2004), its second-order composition Gao et al. (2015).
 """
 
 from __future__ import annotations
@@ -16,7 +16,10 @@ _U = np.uint64
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def cholesky(H, n):  # type: ignore[no-untyped-def]
-    """H (n, n) to its lower factor in place, its diagonal inverted; False where it is not positive definite."""
+    """Cholesky factor of the symmetric matrix H (n, n), in place.
+
+    The lower triangle becomes the factor L with its diagonal inverted. False where H is not positive definite.
+    """
     for j in range(_U(n)):
         least, total = 1e-14 * abs(H[j, j]), H[j, j]
         for k in range(j):
@@ -35,7 +38,7 @@ def cholesky(H, n):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def solve_cholesky(L, b, n):  # type: ignore[no-untyped-def]
-    """x of L Lᵀ x = b, in place of b; L from ``cholesky``."""
+    """Solve L Lᵀ x = b for x (n,), in place of b; L (n, n) as ``cholesky`` leaves it."""
     for i in range(_U(n)):
         total = b[i]
         for k in range(i):
@@ -50,7 +53,10 @@ def solve_cholesky(L, b, n):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def variance(L, y, n, which):  # type: ignore[no-untyped-def]
-    """Element (which, which) of (L Lᵀ)⁻¹; y : (n,) scratch."""
+    """Diagonal element (which, which) of the inverse matrix (L Lᵀ)⁻¹, L (n, n) as ``cholesky`` leaves it.
+
+    y : (n,) scratch.
+    """
     total = 0.0
     for i in range(_U(which), _U(n)):
         value = 1.0 if i == _U(which) else 0.0
@@ -63,7 +69,9 @@ def variance(L, y, n, which):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _warp_matrix(p, M):  # type: ignore[no-untyped-def]
-    """The warp as a matrix (6, 6) acting on (x², xy, y², x, y, 1), third powers dropped (Gao et al. 2015)."""
+    """Fill M (6, 6), the matrix of a warp p (12,) acting on (x², xy, y², x, y, 1), third powers dropped (Gao et al.
+    2015).
+    """
     u, ux, uy, uxx, uxy, uyy = p[0], 1.0 + p[1], p[2], p[3], p[4], p[5]
     v, vx, vy, vxx, vxy, vyy = p[6], p[7], 1.0 + p[8], p[9], p[10], p[11]
     M[0, 0], M[0, 1], M[0, 2] = ux * ux + u * uxx, 2 * (ux * uy + u * uxy), uy * uy + u * uyy
@@ -80,9 +88,9 @@ def _warp_matrix(p, M):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def compose_inverse(p, d, A, B):  # type: ignore[no-untyped-def]
-    """p ← p ∘ d⁻¹ for small d; False where d cannot be inverted. A, B : (6, 6) scratch.
+    """Compose the warp p (12,) with the inverse of a small increment d (12,), in place: p ← p ∘ d⁻¹, second order.
 
-    The two rows x', y' of W(p) W(d)⁻¹ solve W(d)ᵀ m = rowᵀ.
+    The two rows x', y' of W(p) W(d)⁻¹ solve W(d)ᵀ m = rowᵀ. A, B : (6, 6) scratch. False where d cannot be inverted.
     """
     _warp_matrix(d, A)
     _warp_matrix(p, B)
@@ -109,7 +117,11 @@ def compose_inverse(p, d, A, B):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def compose_inverse_affine(p, d):  # type: ignore[no-untyped-def]
-    """p ← p ∘ d⁻¹ of first order, exactly; second derivatives of p stay. False where d cannot be inverted."""
+    """Compose the affine part of the warp p (12,) with the inverse of that of d (12,), in place and exactly: p ← p ∘
+    d⁻¹.
+
+    The second derivatives of p stay as they are. False where d cannot be inverted.
+    """
     a, b, c, e = 1.0 + d[1], d[2], d[7], 1.0 + d[8]
     det = a * e - b * c
     if not abs(det) > 1e-6:

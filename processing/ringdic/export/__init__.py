@@ -1,4 +1,4 @@
-"""Results in the forms that other programs read.
+"""Export of results to the file formats of other programs.
 
 =======  ===========================================  ==================================================
 format   what is written                              for
@@ -14,9 +14,9 @@ ply      a folder, one surface a step, with fields    MeshLab, CloudCompare
 glb      a folder, one coloured surface a step        viewers, Blender (metres, y upwards)
 =======  ===========================================  ==================================================
 
-Lengths are mm in the target's frame except in glb, whose standard is metres. All of them are made of the stored
-positions, so a step may be compared with the one before it, moved back, or given strains over another window than the
-run's.
+Lengths are mm in the world frame of the target, except in glb, whose standard is metres. Every format is evaluated
+from the stored positions, so that a step can be compared with the one before it, freed of its rigid motion, or given
+strains over another window than that of the run.
 """
 
 from __future__ import annotations
@@ -57,11 +57,32 @@ def export(
     colour: str | None = None,
     run: int | None = None,
 ) -> Path:
-    """Write the results of a session in another form; the file or folder written. ``run`` : the newest unless given.
+    """Write the results of a session in the format of another program.
 
-    ``out`` : where to; without it, beside the results. Formats of one file a step write a folder. ``evaluation`` : how
-    fields are made of positions. ``colour`` : the field that ply and glb are coloured by, displacement unless given.
-    Raises InputError : unknown format or field, no results, or no folder to write into.
+    Parameters
+    ----------
+    session_path : Path
+        The session's folder.
+    format : str
+        One of `FORMATS`.
+    out : Path, optional
+        File to write, or folder for formats with one file a step; beside the results unless given.
+    evaluation : Evaluation
+        How fields are computed from positions: reference, rigid motion, strain window, strain family.
+    colour : str, optional
+        Name of the field that colours ply and glb; displacement unless given.
+    run : int, optional
+        Number of the processing run; the newest unless given.
+
+    Returns
+    -------
+    Path
+        The file or folder written.
+
+    Raises
+    ------
+    InputError
+        Unknown format or field, no results, or no folder to write into.
     """
     if format not in _WRITERS:
         raise InputError(f"no export format '{format}'; there are {', '.join(FORMATS)}")

@@ -1,4 +1,4 @@
-"""All steps as arrays for Python: NumPy's npz."""
+"""Export of all steps as arrays for Python: NumPy's npz."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ _SCALARS = ("lambda1", "lambda2", "J")
 
 
 def export_npz(seen: EvaluatedResults, out: Path) -> None:
-    """Write ``vertices_ref`` (N, 3), ``vertices`` (F, N, 3), ``faces`` (M, 3), ``lambda1``, ``lambda2``, ``J`` (F, M),
-    ``E`` (F, M, 3, 3), ``correlation`` (F, N), ``sigma_xyz`` (F, N, 3) and ``pair`` (M,).
-
-    ``sigma_xyz`` is the standard deviation of a position over repeated noise of the images. What the calibration adds,
-    common to all points and steps, stands apart: ``sigma_calibration`` (F, N, 3), where it is known.
-
-    mm, world frame; step 0 is the reference, with identity deformation; NaN where not measured. With a strain window,
-    the four of deformation also as ``window_…``.
-    """  # fmt: skip
+    """Write the arrays of `arrays` into one npz file."""
     with Path(out).open("wb") as file:  # given a name, savez would append a suffix to it
         np.savez(file, **arrays(seen))
 
 
 def arrays(seen: EvaluatedResults) -> dict[str, Any]:
-    """The arrays of the npz, in full precision."""
+    """The arrays of the npz by name, in full precision, for F steps of N points and M triangles.
+
+    ``vertices_ref`` (N, 3) and ``vertices`` (F, N, 3) mm, world frame; ``faces`` (M, 3); ``lambda1``, ``lambda2`` and
+    ``J`` (F, M); ``E`` (F, M, 3, 3), Cartesian Green-Lagrange; ``correlation`` (F, N), C_LS; ``sigma_xyz`` (F, N, 3)
+    mm, the standard deviation of a position over repeated noise of the images; ``sigma_calibration`` (F, N, 3) mm,
+    where it is known, the part of the calibration, which all points and steps share; ``pair`` (M,), −1 where a
+    triangle joins two camera pairs. Step 0 is the reference, with identity deformation. NaN where not measured. With a
+    strain window, the arrays of deformation also as ``window_…``.
+    """
     results = seen.results
     F, M = len(results.steps), len(results.faces)
     prefixes = ("", "window_") if seen.window is not None else ("",)
@@ -53,5 +53,5 @@ def arrays(seen: EvaluatedResults) -> dict[str, Any]:
 
 
 def square(six: np.ndarray) -> np.ndarray:
-    """Symmetric tensors (..., 3, 3) of their components (..., 6), xx yy zz xy yz xz."""
+    """Symmetric tensors (..., 3, 3) from their components ``six`` (..., 6) in the order xx yy zz xy yz xz."""
     return six[..., [[0, 3, 5], [3, 1, 4], [5, 4, 2]]]

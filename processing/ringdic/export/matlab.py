@@ -1,4 +1,4 @@
-"""All steps for MATLAB and Octave, with the field names of MultiDIC (Solav et al. 2018)."""
+"""Export of all steps for MATLAB and Octave, with the field names of MultiDIC (Solav et al. 2018)."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _LARGEST = 2**31 - 2**20  # bytes of one variable of a level 5 file
 
 
 def export_mat(seen: EvaluatedResults, out: Path) -> None:
-    """Write a level 5 MAT file, indices from 1.
+    """Write a level 5 MAT file; indices in it count from 1.
 
-    ``DIC3DPPresults`` : the structure that MultiDIC's post-processing makes and its plots read: Points3D, Faces, Disp,
-    RBM, Deform and their like as cells with one entry a step, the same with ``_ARBM`` after the rigid motion has been
-    taken out, and Deform_window over the strain window if there is one; deformation in single precision. Beside it the
-    arrays of the npz: ``faces`` and ``pair`` count from 1 (0: a face joins two pairs); ``steps`` and ``settings`` are
-    text.
+    ``DIC3DPPresults`` is the structure that MultiDIC's post-processing makes and its plots read: Points3D, Faces, Disp,
+    RBM, Deform and others as cells with one entry a step; fields with the ending ``_ARBM`` have the rigid motion
+    removed; Deform_window holds the strain over the window if there is one. Deformation is in single precision. Beside
+    it stand the arrays of the npz (`ringdic.export.arrays`), where ``faces`` and ``pair`` count from 1 (0: a triangle
+    joins two pairs), and ``steps`` and ``settings`` as text.
 
     Raises InputError where a level 5 file cannot hold it.
     """
@@ -46,7 +46,7 @@ def export_mat(seen: EvaluatedResults, out: Path) -> None:
 
 
 def post_processing(seen: EvaluatedResults) -> dict[str, Any]:
-    """The structure DIC3DPPresults. Cells are object arrays (1, F)."""
+    """The structure DIC3DPPresults by field; cells are object arrays (1, F)."""
     results = seen.results
     F = len(results.steps)
     structure = _surface(seen)
@@ -111,7 +111,7 @@ def _deform(seen: EvaluatedResults, rigid_motion_removed: bool, window: StrainWi
 
 
 def _named(found: Deformation) -> dict[str, NDArray[np.float32]]:
-    """The fields of one step under MultiDIC's names: tensors (3, 3, M), vectors (M, 3), scalars (M, 1)."""
+    """Deformation of one step by MultiDIC's field names: tensors (3, 3, M), vectors (M, 3), scalars (M, 1)."""
     C = np.einsum("mki,mkj->mij", found.F, found.F)
     tensors = {"Fmat": found.F, "Cmat": C, "Emat": found.E, "emat": found.e}
     vectors = {
@@ -147,19 +147,19 @@ def _before(seen: EvaluatedResults, step: int) -> Floats:
 
 
 def _motion(seen: EvaluatedResults, step: int) -> RigidMotion:
-    """The motion that takes the exported positions back; none is left where it has been removed already."""
+    """Rigid motion that takes exported positions back onto the reference; the identity if it is removed already."""
     if seen.evaluation.rigid_motion_removed:
         return RigidMotion(np.eye(3), np.zeros(3))
     return seen.results.motion(step, seen.evaluation.previous)
 
 
 def _camera_number(name: str, order: dict[str, int]) -> int:
-    """MultiDIC's cameras have numbers for names; a camera with another name takes its place in the ring."""
+    """Number of a camera as MultiDIC names cameras; for a name that is no number, its place in the ring, from 1."""
     return int(name) if name.isascii() and name.isdigit() else order.get(name, 0)
 
 
 def column(values: Floats) -> Floats:
-    """Scalars as MATLAB has them, (n, 1)."""
+    """Scalars ``values`` (n,) of any unit as a column (n, 1), as MATLAB keeps vectors."""
     return np.asarray(values, dtype=float).reshape(-1, 1)
 
 

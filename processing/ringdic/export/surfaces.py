@@ -1,4 +1,7 @@
-"""Every step as a surface: PLY with fields and colours, GLB with colours. Triangles that lost a corner are left out."""
+"""Export of every step as a surface: PLY with fields and colours, GLB with colours.
+
+Triangles with a corner that was not measured are left out.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +21,11 @@ DEFAULT_COLOUR = "displacement"
 
 
 def export_ply(seen: EvaluatedResults, out: Path, colour: str = DEFAULT_COLOUR) -> None:
-    """Write ``STEP.ply`` (binary, mm) for every step: every field as a property of its vertices or faces, and colours
-    of one of them, one scale for all steps."""
+    """Write ``STEP.ply`` (binary, mm) for every step, with all fields and with colours.
+
+    Fields are properties of the vertices or faces. colour : name of the field that is coloured, with one scale for all
+    steps.
+    """
     paint = _Paint(seen, colour)
     for step, name in enumerate(seen.steps):
         fields = seen.step(step)
@@ -35,9 +41,9 @@ def export_ply(seen: EvaluatedResults, out: Path, colour: str = DEFAULT_COLOUR) 
 
 
 def export_glb(seen: EvaluatedResults, out: Path, colour: str = DEFAULT_COLOUR) -> None:
-    """Write ``STEP.glb`` for every step, coloured by a field, one scale for all steps.
+    """Write ``STEP.glb`` for every step, coloured by a field with one scale for all steps.
 
-    glTF's conventions: metres, y upwards (the target's z).
+    By the conventions of glTF lengths are metres and y points upwards (z of the target).
     """
     paint = _Paint(seen, colour)
     for step, name in enumerate(seen.steps):
@@ -47,7 +53,7 @@ def export_glb(seen: EvaluatedResults, out: Path, colour: str = DEFAULT_COLOUR) 
 
 
 def _solid(vertices: Floats, faces: Indices, rgba: NDArray[np.uint8]) -> trimesh.Trimesh:
-    """A surface with colours; one without points has none."""
+    """A trimesh surface with vertex colours (N, 4); a surface without points has no colours."""
     return trimesh.Trimesh(vertices, faces, vertex_colors=rgba if len(rgba) else None, process=False)
 
 
@@ -61,7 +67,7 @@ class _Paint:
         self._count = len(seen.results.vertices_ref)
 
     def vertices(self, fields: StepFields) -> NDArray[np.uint8]:
-        """RGBA (N, 4)."""
+        """Colours of the vertices, RGBA (N, 4) uint8."""
         values = fields.scalar(self._entry)
         if self._entry.location == "face":
             values = self._at_vertices(values)

@@ -1,4 +1,4 @@
-"""Points and faces of every step as tables of comma-separated values."""
+"""Export of the points and triangles of every step as tables of comma-separated values."""
 
 from __future__ import annotations
 

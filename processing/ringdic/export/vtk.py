@@ -1,4 +1,4 @@
-"""Forms of the Visualization Toolkit: the VTKHDF file of all steps, and one XML PolyData file a step."""
+"""Export for the Visualization Toolkit: one VTKHDF file of all steps, or one XML PolyData file a step."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Arrays = dict[str, NDArray[np.generic]]
 
 
 def export_vtkhdf(seen: EvaluatedResults, out: Path) -> None:
-    """Write the moving surface with every field, and the vectors and tensors they come from."""
+    """Write the moving surface with all fields, vectors and tensors into one VTKHDF file."""
     with h5py.File(out, "w") as file:
         group = vtkhdf.create_group(file, seen.results.faces, len(seen.results.vertices_ref), len(seen.steps))
         for step in range(len(seen.steps)):
@@ -41,7 +41,10 @@ def export_vtp(seen: EvaluatedResults, out: Path) -> None:
 
 
 def _step(seen: EvaluatedResults, step: int) -> tuple[Floats, Arrays, Arrays]:
-    """Positions, all finite (a lost point stays at its reference), and the arrays of points and of faces."""
+    """Positions of a step (N, 3) mm, and its arrays of the points and of the triangles.
+
+    VTK cannot draw NaN: a lost point stays at its reference position and is marked by the array ``measured``.
+    """
     current = seen.positions(step)
     measured: Mask = np.asarray(np.isfinite(current).all(axis=1))
     flags: Arrays = {
@@ -54,7 +57,7 @@ def _step(seen: EvaluatedResults, step: int) -> tuple[Floats, Arrays, Arrays]:
 
 
 def _arrays(seen: EvaluatedResults, fields: StepFields, location: str) -> Arrays:
-    """Vectors and tensors as they are; of the scalars, every field that is not a component or length of one."""
+    """Vectors and tensors, and the scalar fields that are neither a component nor the length of one of these."""
     arrays = fields.point if location == "point" else fields.face
     wide = {name: values for name, values in arrays.items() if values.ndim > 1}
     scalars = {
@@ -82,7 +85,7 @@ def _poly_data(positions: Floats, faces: Indices, point: Arrays, cell: Arrays) -
 
 
 def _array(parent: ET.Element, name: str, values: NDArray[np.generic]) -> None:
-    """Inline binary: base64 of the number of bytes and the bytes, both little-endian."""
+    """Add an array as inline binary: base64 of the number of bytes followed by the bytes, both little-endian."""
     values = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
     components = values.shape[1] if values.ndim == 2 else 1
     element = ET.SubElement(

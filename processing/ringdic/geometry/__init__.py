@@ -1,1 +1,1 @@
-"""Cameras and points in space: projection, lens distortion, triangulation, outliers."""
+"""Camera model, lens distortion, triangulation of points from matched pixels, and tests for outliers."""

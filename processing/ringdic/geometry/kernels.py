@@ -1,7 +1,7 @@
-"""The loops over points, compiled: triangulation, how points move with their pixels, and neighbours on a grid.
+"""Compiled loops over points: triangulation, propagation of pixel errors to points, residuals against neighbours.
 
-:mod:`ringdic.geometry.triangulation`, :mod:`ringdic.uncertainty.position` and :mod:`ringdic.geometry.outliers` say
-what is computed.
+The equations are explained where the kernels are called: :mod:`ringdic.geometry.triangulation`,
+:mod:`ringdic.uncertainty.position` and :mod:`ringdic.geometry.outliers`.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ import math
 import numba as nb
 import numpy as np
 
-# A positive semi-definite N with det N above this share of (tr N)³ has no eigenvalue below that share of the largest.
+# A positive semi-definite N with det N > s (tr N)³ has no eigenvalue below s times the largest one.
 _SURE = 1e-9
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _inverse(N, out):  # type: ignore[no-untyped-def]
-    """Inverse of a symmetric N (3, 3) by its cofactors; its determinant."""
+    """Write the inverse of a symmetric matrix N (3, 3) into ``out`` by its cofactors; return the determinant of N."""
     out[0, 0] = N[1, 1] * N[2, 2] - N[1, 2] * N[1, 2]
     out[0, 1] = N[0, 2] * N[1, 2] - N[0, 1] * N[2, 2]
     out[0, 2] = N[0, 1] * N[1, 2] - N[0, 2] * N[1, 1]
@@ -34,10 +34,11 @@ def _inverse(N, out):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def normal_equations(P, px, normal, right, seen):  # type: ignore[no-untyped-def]
-    """Eq. 7-9 of points: ``AᵀA`` (n, 3, 3), ``Aᵀb`` (n, 3) and the number of cameras (n,) are filled.
+    """Normal equations of the linear triangulation of n points (Solav et al. 2018, eq. 7-9).
 
-    P (C, 3, 4), px (C, n, 2) undistorted, not finite where a camera takes no part. Returns (n,) bool, whether each is
-    well conditioned for sure.
+    P (C, 3, 4) projection matrices; px (C, n, 2) undistorted pixels, not finite where a camera does not see the point.
+    Filled: normal (n, 3, 3) ``AᵀA``, right (n, 3) ``Aᵀb``, seen (n,) number of cameras. Returns (n,) bool: True where
+    the determinant alone proves ``AᵀA`` well conditioned, False where the eigenvalues must decide.
     """
     sure = np.zeros(px.shape[1], np.bool_)
     row = np.empty(4)
@@ -69,7 +70,10 @@ def normal_equations(P, px, normal, right, seen):  # type: ignore[no-untyped-def
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def solve_normal_equations(normal, right, which, xyz):  # type: ignore[no-untyped-def]
-    """xyz (n, 3) with ``normal xyz = right`` by the factors L D Lᵀ of (n, 3, 3); NaN but for ``which`` (n,)."""
+    """Solve ``normal xyz = right`` for each point by the factorisation L D Lᵀ.
+
+    normal (n, 3, 3), right (n, 3), which (n,) bool: points to be solved. xyz (n, 3) is filled, NaN for the others.
+    """
     for n in range(len(normal)):
         if not which[n]:
             xyz[n] = np.nan
@@ -88,10 +92,12 @@ def solve_normal_equations(normal, right, which, xyz):  # type: ignore[no-untype
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def linear_variance(P, px, slopes, normal, which, xyz, sigma):  # type: ignore[no-untyped-def]
-    """Variances (n, 3) mm² of linearly triangulated points; NaN but for ``which`` (n,).
+    """Variances (n, 3) mm² of linearly triangulated points, by first-order propagation of independent pixel errors.
 
-    P (C, 3, 4). px (C, n, 2) undistorted. slopes (C, n, 2, 2): image pixel by undistorted pixel, NaN for the identity.
-    normal (n, 3, 3), xyz (n, 3): of the solution. sigma (C, n, 2) px, NaN for none.
+    P (C, 3, 4) projection matrices. px (C, n, 2) undistorted pixels. slopes (C, n, 2, 2) Jacobians of the image pixel
+    by the undistorted pixel, NaN for the identity. normal (n, 3, 3) and xyz (n, 3) mm: normal matrices and solutions of
+    the triangulation. which (n,) bool: points to be computed, the others are NaN. sigma (C, n, 2) px standard
+    deviations in the image, NaN for an exact pixel.
     """
     out = np.zeros((len(xyz), 3))
     inverse, A, moved = np.empty((3, 3)), np.empty((2, 3)), np.empty((3, 2))
@@ -127,9 +133,10 @@ def linear_variance(P, px, slopes, normal, which, xyz, sigma):  # type: ignore[n
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def gain(slopes, sigma, out):  # type: ignore[no-untyped-def]
-    """``(Σ Jᵀ W J)⁻¹ J_cᵀ W_c`` of each camera and point fills out (C, n, 3, 2); zero where a camera takes no part.
+    """Sensitivities d(point)/d(pixel) of the weighted triangulation, ``(Σ Jᵀ W J)⁻¹ J_cᵀ W_c`` for camera c.
 
-    slopes (C, n, 2, 3) px a mm. sigma (C, n, 2) px; a camera where either is not finite takes no part.
+    slopes (C, n, 2, 3) px/mm, Jacobians J of the projections. sigma (C, n, 2) px, W = diag(σ⁻²). out (C, n, 3, 2) mm/px
+    is filled: zero for a camera in which either is not finite.
     """
     normal, inverse, weighted = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 2))
     for n in range(slopes.shape[1]):
@@ -162,7 +169,11 @@ def gain(slopes, sigma, out):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def fill_covariance(gain, sigma):  # type: ignore[no-untyped-def]
-    """``Σ A_c diag(σ_c²) A_cᵀ`` (n, 3, 3) of gains (C, n, 3, 2), errors (C, n, 2); NaN for fewer than two cameras."""
+    """Covariances ``Σ A_c diag(σ_c²) A_cᵀ`` (n, 3, 3) mm² of triangulated points.
+
+    gain (C, n, 3, 2) mm/px, the sensitivities A_c, zero for a camera that does not see the point. sigma (C, n, 2) px.
+    NaN for a point with fewer than two cameras.
+    """
     total = np.zeros((gain.shape[1], 3, 3))
     for n in range(gain.shape[1]):
         count = 0
@@ -184,10 +195,12 @@ def fill_covariance(gain, sigma):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def fill_midpoint_residuals(pairs, values, doubt, rows):  # type: ignore[no-untyped-def]
-    """How far values (n, k) of some rows (r,) lie from the median of the middles of their pairs of neighbours, (r,).
+    """Distance (r,) of the values of some grid points from a prediction by their neighbours.
 
-    pairs (n, 4, 2): rows of opposite neighbours, -1 where there is none. doubt (n,): nobody is judged by a more
-    doubtful one. NaN where no pair is complete.
+    The prediction is, for each component, the median over the pairs of opposite neighbours of the mean of the pair.
+    values (n, k) of all points; rows (r,) the points that are tested; pairs (n, 4, 2) rows of their opposite
+    neighbours, -1 where there is none. doubt (n,): a neighbour with a larger doubt than the point itself is not used.
+    NaN where no pair is complete.
     """
     out = np.empty(len(rows))
     middle = np.empty(4)

@@ -1,8 +1,8 @@
-"""From matched pixels and their uncertainty to points in space, with covariance: every camera by its weight.
+"""Triangulation of points in space from pixels with known standard deviations, with the covariance of each point.
 
-A point minimises ``χ² = Σ ((u_c - û_c(X))/σ_c)²`` over the cameras that see it, ``û_c`` its true projection through the
-lens. The start is the weighted linear solution (eq. 7-9 of Solav et al. 2018), the rest is Gauss-Newton. With m cameras
-χ² has 2 m - 3 degrees of freedom, and the covariance of the point is ``(Σ Jᵀ W J)⁻¹``.
+A point minimises ``χ² = Σ ((u_c - û_c(X))/σ_c)²`` over the cameras that see it, with ``û_c`` its projection through the
+lens. Gauss-Newton starts at the weighted linear solution (Solav et al. 2018, eq. 7-9). With m cameras χ² has 2 m - 3
+degrees of freedom, and the covariance of the point is ``(Σ Jᵀ W J)⁻¹``.
 """
 
 from __future__ import annotations
@@ -12,24 +12,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Pixels, Points
 from ringdic.geometry.camera import Camera
+from ringdic.geometry.triangulation import pixels_of_cameras
 
-_STEPS = 8  # Gauss-Newton; two or three are enough unless a match is wrong
-_SETTLED = 1e-7  # mm
+_STEPS = 8  # most Gauss-Newton steps; two or three are enough unless a match is wrong
+_SETTLED = 1e-7  # mm, step at which the iteration has converged
 _CROSSING = 1e-10  # least 27 det N / (tr N)³ of a normal matrix N; 1 where all directions are known equally well
 
 
 @dataclass(frozen=True)
 class WeightedPoints:
-    """Points triangulated from all their views; NaN where fewer than two cameras saw one or their rays are parallel.
+    """Triangulated points with their covariances and fit; NaN where a point is not determined by its views.
 
-    xyz : (n, 3) mm, world frame. covariance : (n, 3, 3) mm², of independent pixel errors with the standard deviations
-    that were given. chi2 : (n,) weighted squared residuals. degrees : (n,) their degrees of freedom, 2 m - 3 for m
-    views, 0 where lost.
+    xyz : (n, 3) mm, world frame.
+    covariance : (n, 3, 3) mm², for independent pixel errors with the standard deviations that were given.
+    chi2 : (n,) sum of squared residuals in units of their standard deviations.
+    degrees : (n,) degrees of freedom of chi2, 2 m - 3 for m cameras, 0 where the point is not determined.
     """
 
-    xyz: Floats
+    xyz: Points
     covariance: Floats
     chi2: Floats
     degrees: Indices
@@ -47,16 +49,16 @@ class WeightedPoints:
 
 @dataclass(frozen=True)
 class _View:
-    """What one camera saw: which points (k,), their pixels (k, 2) and one over their standard deviations (k, 2)."""
+    """The points seen by one camera: their numbers (k,), pixels (k, 2) px and weights 1/σ (k, 2) px⁻¹."""
 
     camera: Camera
     index: Indices
-    px: Floats
+    px: Pixels
     weight: Floats
 
 
-def triangulate_weighted(cameras: Sequence[Camera], px: Floats, sigma: Floats) -> WeightedPoints:
-    """Points in space from their pixels in two or more images, each by its weight.
+def triangulate_weighted(cameras: Sequence[Camera], px: Pixels, sigma: Pixels) -> WeightedPoints:
+    """Points in space from their pixels in two or more images, weighted by the pixels' standard deviations.
 
     Parameters
     ----------
@@ -64,11 +66,11 @@ def triangulate_weighted(cameras: Sequence[Camera], px: Floats, sigma: Floats) -
     px, sigma : (C, n, 2) image pixels as they are in the images (distorted) and their standard deviations, px. A
         camera in which either is not finite takes no part in the point.
 
-    Raises ValueError for arrays of other shapes and for a standard deviation that is not positive.
+    Raises
+    ------
+    ValueError : arrays of other shapes, or a standard deviation that is not positive.
     """
-    px, sigma = np.asarray(px, dtype=float), np.asarray(sigma, dtype=float)
-    if len(cameras) < 2 or px.shape[:1] != (len(cameras),) or px.ndim != 3 or px.shape[2] != 2:
-        raise ValueError(f"{len(cameras)} cameras do not go with pixels of shape {px.shape}; wanted (C, n, 2), C >= 2")
+    px, sigma = pixels_of_cameras(cameras, px), np.asarray(sigma, dtype=float)
     if sigma.shape != px.shape:
         raise ValueError(f"standard deviations of shape {sigma.shape} do not go with pixels of shape {px.shape}")
     if (sigma <= 0).any():
@@ -87,20 +89,20 @@ def triangulate_weighted(cameras: Sequence[Camera], px: Floats, sigma: Floats) -
     return WeightedPoints(xyz, covariance, chi2, np.where(lost, 0, 2 * count - 3))
 
 
-def _view(camera: Camera, px: Floats, sigma: Floats) -> _View:
-    undistorted = np.isfinite(px).all(axis=1) & np.isfinite(sigma).all(axis=1)
-    index = np.flatnonzero(undistorted)
+def _view(camera: Camera, px: Pixels, sigma: Pixels) -> _View:
+    """The points whose pixels (n, 2) and standard deviations (n, 2) px are finite in one camera."""
+    index = np.flatnonzero(np.isfinite(px).all(axis=1) & np.isfinite(sigma).all(axis=1))
     return _View(camera, index, px[index], 1.0 / sigma[index])
 
 
-def _linear(views: list[_View], n: int) -> tuple[Floats, Floats]:
-    """Solutions of the weighted equations of eq. 7-9 (n, 3) and their normal matrices (n, 3, 3)."""
+def _linear(views: list[_View], n: int) -> tuple[Points, Floats]:
+    """Weighted linear solutions of n points (n, 3) mm (eq. 7-9) and their normal matrices (n, 3, 3)."""
     normal, right = np.zeros((n, 3, 3)), np.zeros((n, 3))
     for view in views:
         P = view.camera.P
         px = view.camera.undistort(view.px)
         known = np.isfinite(px).all(axis=1)
-        # A row's residual is the pixel's times its depth, which is 1 at the world's origin and near it all over a rig.
+        # A row's residual is the pixel's times the depth, which is 1 at the world's origin and about 1 on a specimen.
         rows = (P[:2] - px[known][..., None] * P[2]) * view.weight[known][..., None]
         A, b = rows[..., :3], -rows[..., 3]
         normal[view.index[known]] += A.transpose(0, 2, 1) @ A
@@ -108,8 +110,8 @@ def _linear(views: list[_View], n: int) -> tuple[Floats, Floats]:
     return (_inverse(normal) @ right[..., None])[..., 0], normal
 
 
-def _gauss_newton(views: list[_View], xyz: Floats) -> tuple[Floats, Floats, Floats]:
-    """Points (n, 3) moved to the least χ²; then their normal matrices (n, 3, 3) and χ² (n,)."""
+def _gauss_newton(views: list[_View], xyz: Points) -> tuple[Points, Floats, Floats]:
+    """Points of least χ² (n, 3) mm, from starts (n, 3) mm; their normal matrices (n, 3, 3) mm⁻² and χ² (n,)."""
     for _ in range(_STEPS):
         normal, right, chi2 = _normal_equations(views, xyz)
         step = (_inverse(normal) @ right[..., None])[..., 0]
@@ -123,14 +125,14 @@ def _gauss_newton(views: list[_View], xyz: Floats) -> tuple[Floats, Floats, Floa
     return xyz, normal, np.maximum(chi2, 0.0)
 
 
-def _normal_equations(views: list[_View], xyz: Floats) -> tuple[Floats, Floats, Floats]:
-    """JᵀWJ (n, 3, 3), JᵀW times the residuals (n, 3) and χ² (n,)."""
+def _normal_equations(views: list[_View], xyz: Points) -> tuple[Floats, Floats, Floats]:
+    """Normal matrices JᵀWJ (n, 3, 3), right sides JᵀWr (n, 3) with the residuals r, and χ² (n,) at points (n, 3)."""
     n = len(xyz)
     normal, right, chi2 = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n)
     for view in views:
-        projected, slope = view.camera.project_with_slope(xyz[view.index])
+        projected, jacobian = view.camera.project_with_jacobian(xyz[view.index])
         residual = (view.px - projected) * view.weight
-        J = slope * view.weight[..., None]
+        J = jacobian * view.weight[..., None]
         normal[view.index] += J.transpose(0, 2, 1) @ J
         right[view.index] += (J.transpose(0, 2, 1) @ residual[..., None])[..., 0]
         chi2[view.index] += (residual**2).sum(axis=1)
@@ -138,13 +140,13 @@ def _normal_equations(views: list[_View], xyz: Floats) -> tuple[Floats, Floats, 
 
 
 def _determined(normal: Floats) -> Mask:
-    """Which points (n,) have lines of sight that cross."""
+    """Which points (n,) have lines of sight that cross, by their normal matrices (n, 3, 3)."""
     trace = np.einsum("nii->n", normal)
     return np.asarray(27.0 * _determinant(normal) > _CROSSING * trace**3)
 
 
 def _determinant(N: Floats) -> Floats:
-    """Of symmetric matrices (n, 3, 3)."""
+    """Determinants (n,) of symmetric matrices (n, 3, 3)."""
     a, b, c, d, e, f = (N[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
     return np.asarray(a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d))
 

@@ -32,11 +32,11 @@ from ringdic.results.uncertainty import StepUncertainty, camera_covariance
 from ringdic.results.writer import ResultsWriter, StepRecord, map_in_order
 from ringdic.session.folder import Capture, Session, new_run, open_session
 from ringdic.settings import CalibrationGroup, Settings
-from ringdic.sweep.sweep import Search
+from ringdic.sweep.sweep import DepthSearch
 from ringdic.tasks import Executor, LocalExecutor, Task, TaskReport, tidy, work_folder
 
 if TYPE_CHECKING:
-    from ringdic.multiview.surface import RingSurface
+    from ringdic.multiview.surface import MultiviewSurface
 
 Calibrate = Callable[[Session, CalibrationGroup, Callable[[float, str], None]], CalibratedRig]
 
@@ -245,10 +245,10 @@ class _Matching:
         return [step.id for step in self.steps]
 
     @property
-    def search(self) -> Search:
+    def search(self) -> DepthSearch:
         """Where and how the surface is searched for, from the settings and the target."""
         surface = self.settings.surface
-        return Search(
+        return DepthSearch(
             radius=surface.radius_mm or self.session.rig.target.radius_mm,
             reach=surface.reach_mm,
             incidence=surface.incidence_deg,
@@ -301,15 +301,15 @@ def _pair_surfaces(matching: _Matching) -> tuple[list[PairSurface], list[str]]:
     return surfaces, warnings
 
 
-def _global_surface(matching: _Matching) -> RingSurface:
+def _global_surface(matching: _Matching) -> MultiviewSurface:
     """Match all cameras that have a reference image together, as tasks, and triangulate one surface."""
     from ringdic.multiview.surface import surface_of_tracks  # imported here, since matching by pairs needs none of it
-    from ringdic.multiview.tasks import ring_job
+    from ringdic.multiview.tasks import multiview_job
 
     session, settings, pairs, steps = matching.session, matching.settings, matching.pairs, matching.steps
     cameras = [camera for camera in matching.cameras if camera.id in steps[0].images]
-    job = ring_job(session, cameras, pairs, steps, matching.search, settings)
+    job = multiview_job(session, cameras, pairs, steps, matching.search, settings)
     matching.run(job.tasks)
-    shape, tracks = job.found()
+    shape, tracks = job.outputs()
     matching.stages.at("triangulate", 0.0)
     return surface_of_tracks(session.rig.name, cameras, pairs, matching.names, shape, tracks, settings)

@@ -1,16 +1,16 @@
-"""What is asked of results beyond maps: places followed through time, lengths between them, sections, regions.
+"""Measuring on results: time series of places, extensometers, sections, regions, a study of the strain window.
 
 =================  ==========================================================================================
 ``place``          a material place on the reference surface: a triangle and where in it
-``path``           the shortest way along the surface between two places, of the same material at every step
+``path``           the shortest path along the surface between two places, a material line at every step
 ``series``         fields of places through time
 ``extensometer``   the length between two places, along the surface and straight
 ``section``        fields along a cut of the surface with a plane or a half-plane through the axis
 ``region``         statistics over a part of the surface
-``window_study``   how strain and its scatter change with the window it is fitted over
-``table``          what all of them return: columns with units, as CSV or JSON
+``window_study``   how strain and its scatter depend on the width of the strain window
+``table``          the result of all of them: columns with units, as CSV or JSON
 =================  ==========================================================================================
 
-Everything is material: chosen on the reference configuration, then followed. What was not measured at a step is NaN
-there, an empty cell in CSV, null in JSON.
+Places, paths and regions are chosen on the reference configuration and then follow the material. What was not measured
+at a step is NaN, an empty cell in CSV, null in JSON.
 """

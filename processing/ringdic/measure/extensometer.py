@@ -15,11 +15,11 @@ _UNITS = dict.fromkeys(("along_surface", "straight"), "mm")
 
 
 def extensometer(seen: EvaluatedResults, start: Place, end: Place) -> Table:
-    """One row a step: lengths in mm and engineering strains ``L / L0 - 1``.
+    """Length between two places at every step, in mm, and engineering strain ``L / L0 - 1``; one row a step.
 
-    ``along_surface`` follows the material that was the shortest way in the reference; ``straight`` is the chord. L0 is
-    the length at the step that each is compared with. Raises ComputationError if no way along the surface joins the
-    places.
+    ``along_surface`` is the length of the material line that was the shortest path in the reference; ``straight`` is
+    the chord. L0 is the length at the step with which each step is compared. Raises ComputationError if the places lie
+    on parts of the surface that do not touch.
     """
     results = seen.results
     mesh = results.mesh

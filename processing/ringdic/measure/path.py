@@ -1,9 +1,9 @@
-"""The shortest way along the surface between two places, of the same material at every step.
+"""The shortest path along the surface between two places, followed as a material line.
 
-The way crosses edges. A first guess comes from Dijkstra's algorithm over points set on the edges (Lanthier et al.
+The path crosses edges. A first guess comes from Dijkstra's algorithm over points set on the edges (Lanthier et al.
 2001), a few on every edge of a wide corridor, then more in a narrower one. The triangles it passes, unfolded into a
-plane, hold an exact shortest way (the funnel algorithm of Lee and Preparata 1984). Where that is held up at a vertex,
-the other side of the vertex is tried, until nothing becomes shorter.
+plane, contain an exact shortest path (the funnel algorithm of Lee and Preparata 1984). Where that path bends at a
+vertex, the other side of the vertex is tried, until no change shortens it.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _MOST_TURNS = 2000
 
 @dataclass(frozen=True)
 class SurfacePath:
-    """A line on the surface: from ``start`` over crossings of edges to ``end``.
+    """A material line on the surface: from ``start`` over K crossings of edges to ``end``.
 
-    edges : (K, 2) vertices. shares : (K,) where each edge is crossed, 0 at its first vertex, 1 at its second.
+    edges : (K, 2) vertex indices. shares : (K,) where each edge is crossed, 0 at its first vertex, 1 at its second.
     """
 
     start: Place
@@ -39,19 +39,25 @@ class SurfacePath:
     shares: Floats
 
     def line(self, vertices: Floats, faces: Indices) -> Floats:
-        """Its points (K + 2, 3) mm in the configuration ``vertices`` (N, 3); NaN where the material is lost."""
+        """Points of the line in a configuration, (K + 2, 3) mm; NaN where the material is lost.
+
+        vertices : (N, 3) mm. faces : (M, 3).
+        """
         a, b = vertices[self.edges[:, 0]], vertices[self.edges[:, 1]]
         shares = self.shares[:, None]
         crossings = np.where(shares == 0, a, np.where(shares == 1, b, a + shares * (b - a)))
         return np.vstack([self.start.at(vertices, faces), crossings, self.end.at(vertices, faces)])
 
     def length(self, vertices: Floats, faces: Indices) -> float:
-        """Its length in a configuration, mm; NaN if any of its material is lost."""
+        """Length of the line in a configuration, mm; NaN if any of its material is lost.
+
+        vertices : (N, 3) mm. faces : (M, 3).
+        """
         return float(np.linalg.norm(np.diff(self.line(vertices, faces), axis=0), axis=1).sum())
 
 
 def shortest_path(mesh: Mesh, start: Place, end: Place) -> SurfacePath:
-    """The shortest way along the reference surface.
+    """The shortest path along the reference surface between two places.
 
     Raises ComputationError if the places lie on parts of the surface that do not touch.
     """
@@ -74,9 +80,9 @@ def shortest_path(mesh: Mesh, start: Place, end: Place) -> SurfacePath:
 
 
 def _search(mesh: Mesh, which: Indices, points: int, start: Place, end: Place) -> tuple[list[tuple[int, int]], Floats]:
-    """Edges of the shortest way over ``points`` points set inside every edge of some triangles.
+    """Edges crossed by the shortest path over ``points`` points placed on every edge of the triangles ``which`` (m,).
 
-    Also how long the shortest such way over each vertex is, about, (N,) mm: over the nearest points beside it.
+    Also the approximate length (N,) mm of the shortest such path through each vertex.
     """
     faces = mesh.faces[which]
     sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
@@ -113,7 +119,7 @@ def _search(mesh: Mesh, which: Indices, points: int, start: Place, end: Place) -
 
 
 class _Strip:
-    """Triangles one after the other from the start to the end, and the shortest way inside them."""
+    """A strip of adjacent triangles from the start to the end, and the shortest path inside it."""
 
     def __init__(self, mesh: Mesh, start: Place, end: Place, portals: Sequence[tuple[int, int]]) -> None:
         self._mesh, self._start, self._end = mesh, start, end
@@ -125,7 +131,7 @@ class _Strip:
         self._pull()
 
     def tightened(self) -> SurfacePath:
-        """The shortest way, after every vertex that holds it up has been passed on its better side."""
+        """The shortest path after each vertex at which it bends has been passed on its better side."""
         for _ in range(_MOST_TURNS):
             if not any(self._turned_round(vertex) for vertex in list(self._held_at)):
                 break
@@ -133,7 +139,7 @@ class _Strip:
         return SurfacePath(self._start, self._end, edges, np.array(self._shares))
 
     def _turned_round(self, vertex: int) -> bool:
-        """Whether the way became shorter on the other side of a vertex."""
+        """Move the strip to the other side of a vertex if the path becomes shorter; whether it did."""
         at = [k for k, portal in enumerate(self._portals) if vertex in portal]
         if not at or at != list(range(at[0], at[-1] + 1)):
             return False
@@ -149,7 +155,7 @@ class _Strip:
         return False
 
     def _other_side(self, vertex: int, first: int, last: int) -> list[tuple[int, int]] | None:
-        """The edges at a vertex that are crossed on the side that portals ``first`` … ``last`` do not pass."""
+        """Edges at a vertex crossed on the side opposite to the portals ``first`` … ``last``; None at a border."""
         faces = self._mesh.faces
         before, after = self._face_before(first), self._face_before(last + 1)
         at = before
@@ -186,7 +192,7 @@ class _Strip:
         return self._faces_at[vertex]
 
     def _pull(self) -> None:
-        """The shortest way inside the strip: where it crosses each portal, its length, and what holds it up."""
+        """Compute the shortest path inside the strip: its crossings, its length, the vertices at which it bends."""
         left, right, names, first, last = self._unfolded()
         corners = _funnel(left, right, first, last)
         line = np.array([first, *(point for point, _, _ in corners), last])
@@ -203,7 +209,7 @@ class _Strip:
             self._shares.append(share if names[k][0] == a else 1.0 - share)
 
     def _unfolded(self) -> tuple[Floats, Floats, list[tuple[int, int]], Floats, Floats]:
-        """Left and right ends of the portals (K, 2) in a plane, their vertices, and the first and the last place."""
+        """The strip unfolded into a plane: left and right ends of the portals (K, 2), their vertices, start and end."""
         V = self._mesh.vertices
         a, b = self._portals[0]
         plane = {a: np.zeros(2), b: np.array([float(np.linalg.norm(V[b] - V[a])), 0.0])}
@@ -226,7 +232,10 @@ class _Strip:
 
 
 def _beside(a: Floats, b: Floats, c: Floats, at_a: Floats, at_b: Floats, side: float) -> Floats:
-    """Where c, in space, lies in the plane in which a and b have been placed, on one side of the line from a to b."""
+    """Position in the plane of the point c of space, by its distances from a and b, on one side of the line a to b.
+
+    a, b, c : (3,). at_a, at_b : (2,), positions of a and b in the plane.
+    """
     along = (b - a) / np.linalg.norm(b - a)
     x = (c - a) @ along
     y = np.linalg.norm(c - a - x * along)
@@ -284,7 +293,7 @@ def _crossing(left: Floats, right: Floats, a: Floats, b: Floats) -> float:
 
 
 def _without_returns(portals: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """The same without going through a portal and straight back."""
+    """Portals without pairs that are crossed and immediately crossed back."""
     kept: list[tuple[int, int]] = []
     for portal in portals:
         if kept and kept[-1] == portal:

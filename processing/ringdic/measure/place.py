@@ -1,4 +1,4 @@
-"""A material place on the reference surface: a triangle and where in it."""
+"""Material places on the reference surface: a triangle and barycentric weights in it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ringdic.mesh.mesh import Mesh
 
 @dataclass(frozen=True)
 class Place:
-    """A place in triangle ``face`` with barycentric ``weights`` (3,), which sum to 1. label : what to call it."""
+    """A material place in triangle ``face`` with barycentric ``weights`` (3,), which sum to 1. label : its name."""
 
     face: int
     weights: tuple[float, float, float]
@@ -27,7 +27,10 @@ class Place:
             raise ValueError(f"weights {self.weights} are not those of a place in a triangle")
 
     def at(self, values: Floats, faces: Indices) -> Floats:
-        """Values of points (..., N, k) or (N,) interpolated here; NaN where a corner that has weight is NaN."""
+        """Values interpolated at the place, in their unit; NaN where a corner with weight is NaN.
+
+        values : (N,) or (N, k) of the vertices. faces : (M, 3).
+        """
         corners = faces[self.face]
         weights = np.array(self.weights)
         held = weights > 0
@@ -35,9 +38,9 @@ class Place:
 
 
 def nearest_place(mesh: Mesh, position: Sequence[float], within: float = 5.0) -> Place:
-    """The place of the surface that is nearest to a position (3,) mm in space.
+    """The place of the surface nearest to a position (3,) mm in space.
 
-    Raises InputError if it is farther than ``within`` mm, with where the surface is.
+    Raises InputError if the surface is farther than ``within`` mm; the sentence names its nearest point.
     """
     xyz = np.asarray(position, dtype=float)
     whole = np.flatnonzero(mesh.whole_faces())
@@ -65,7 +68,7 @@ def nearest_place(mesh: Mesh, position: Sequence[float], within: float = 5.0) ->
 
 
 def place_of_vertex(mesh: Mesh, vertex: int) -> Place:
-    """A vertex by its index from 0. Raises InputError if there is none, or it belongs to no triangle."""
+    """The place of a vertex, by its index from 0. Raises InputError if there is none, or it belongs to no triangle."""
     if not 0 <= vertex < len(mesh.vertices):
         raise InputError(f"no point {vertex}; there are {len(mesh.vertices)}, from 0")
     face, corner = np.nonzero(mesh.faces == vertex)
@@ -77,7 +80,7 @@ def place_of_vertex(mesh: Mesh, vertex: int) -> Place:
 
 
 def place_of_face(mesh: Mesh, face: int) -> Place:
-    """The centroid of a triangle by its index from 0. Raises InputError if there is none."""
+    """The place of a triangle's centroid, by the triangle's index from 0. Raises InputError if there is none."""
     if not 0 <= face < len(mesh.faces):
         raise InputError(f"no face {face}; there are {len(mesh.faces)}, from 0")
     third = 1.0 / 3.0

@@ -16,10 +16,10 @@ from ringdic.results.evaluation import EvaluatedResults
 
 
 class Region(Protocol):
-    """A part of space, or of a surface."""
+    """A part of the reference surface over which statistics are taken."""
 
     def faces(self, mesh: Mesh) -> Mask:
-        """Which triangles (M,) of the reference surface belong to it, by their centroids."""
+        """Which triangles of the reference surface have their centroid in the region, (M,) bool."""
         ...
 
 
@@ -28,13 +28,13 @@ class Everything:
     """The whole surface."""
 
     def faces(self, mesh: Mesh) -> Mask:
-        """All triangles, (M,)."""
+        """Every triangle, (M,) bool."""
         return np.ones(len(mesh.faces), dtype=bool)
 
 
 @dataclass(frozen=True)
 class Box:
-    """What lies between two corners, mm."""
+    """A box with edges along the axes, between two corners in mm."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
@@ -44,14 +44,14 @@ class Box:
             raise InputError(f"the first corner of a box is the lower one in x, y and z, not {self.low} to {self.high}")
 
     def faces(self, mesh: Mesh) -> Mask:
-        """Triangles inside, (M,)."""
+        """Which triangles have their centroid inside, (M,) bool."""
         centroids = mesh.centroids
         return np.asarray(((centroids >= self.low) & (centroids <= self.high)).all(axis=1))
 
 
 @dataclass(frozen=True)
 class Ball:
-    """What lies within ``radius`` mm of a centre."""
+    """A sphere: what lies within ``radius`` mm of a centre in mm."""
 
     centre: tuple[float, float, float]
     radius: float
@@ -61,7 +61,7 @@ class Ball:
             raise InputError(f"the radius of a sphere is above 0 mm, not {self.radius:g}")
 
     def faces(self, mesh: Mesh) -> Mask:
-        """Triangles inside, (M,)."""
+        """Which triangles have their centroid inside, (M,) bool."""
         return np.asarray(np.linalg.norm(mesh.centroids - self.centre, axis=1) <= self.radius)
 
 
@@ -77,7 +77,7 @@ class AngularPatch:
             raise InputError(f"the first height of a patch is the lower one, not {self.height[0]:g}")
 
     def faces(self, mesh: Mesh) -> Mask:
-        """Triangles inside, (M,)."""
+        """Which triangles have their centroid inside, (M,) bool."""
         x, y, z = mesh.centroids.T
         begin, end = self.azimuth
         span = 2 * np.pi if end - begin >= 2 * np.pi else np.mod(end - begin, 2 * np.pi)
@@ -92,7 +92,7 @@ class Listed:
     indices: tuple[int, ...]
 
     def faces(self, mesh: Mesh) -> Mask:
-        """Those triangles, (M,). Raises InputError for one that there is not."""
+        """The listed triangles, (M,) bool. Raises InputError for an index beyond the mesh."""
         chosen = np.zeros(len(mesh.faces), dtype=bool)
         for index in self.indices:
             if not 0 <= index < len(mesh.faces):
@@ -102,7 +102,9 @@ class Listed:
 
 
 def region_statistics(seen: EvaluatedResults, region: Region, fields: Sequence[str] = ()) -> Table:
-    """One row a field and step over the triangles of a region, or over the points that are their corners.
+    """Statistics of fields over a region, one row a field and step.
+
+    Fields of triangles are taken over the triangles of the region, fields of points over the corners of these.
 
     ``mean``, ``std`` and ``rms`` are weighted by the area in the reference (a point has a third of its triangles in the
     region); ``min``, ``p5``, ``median``, ``p95``, ``max`` count triangles or points alike; ``measured`` and ``lost``
@@ -127,7 +129,10 @@ def region_statistics(seen: EvaluatedResults, region: Region, fields: Sequence[s
 
 
 def statistics(values: Floats, weights: Floats) -> dict[str, float | int]:
-    """Weighted mean, standard deviation and RMS, plain percentiles, and how many are measured and lost."""
+    """Weighted mean, standard deviation and RMS, unweighted percentiles, numbers of measured and lost values.
+
+    values : (n,) in any unit, NaN where lost. weights : (n,), such as areas.
+    """
     known = np.isfinite(values)
     lost = int((~known).sum())
     names = ("mean", "std", "rms", "min", "p5", "median", "p95", "max")

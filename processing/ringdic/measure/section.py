@@ -1,4 +1,4 @@
-"""Fields along a cut of the reference surface, of the same material at every step."""
+"""Sections: fields along a cut of the reference surface, followed as a material line."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from ringdic.results.fields import Field
 
 @dataclass(frozen=True)
 class Cut:
-    """A plane through ``origin`` mm with ``normal`` of any length.
+    """A plane, or a half-plane, that cuts the reference surface.
 
-    towards : if given, only the side of the plane where ``(x - origin) · towards > 0``.
+    origin : (3,) mm, a point of the plane. normal : (3,), of any length. towards : (3,); if given, only the half where
+    ``(x - origin) · towards > 0`` counts.
     """
 
     origin: tuple[float, float, float]
@@ -45,7 +46,7 @@ class Cut:
 
 @dataclass(frozen=True)
 class Crossings:
-    """The triangles that a cut crosses, in order along its lines. K triangles.
+    """The K triangles that a cut crosses, in order along its lines.
 
     faces : (K,). edges : (K, 2, 2) the two edges crossed, shares : (K, 2) where. line : (K,) number of the line.
     along : (K,) mm, arc length from the line's begin to the middle of the crossing, in the reference.
@@ -58,17 +59,17 @@ class Crossings:
     along: Floats
 
     def at(self, values: Floats) -> Floats:
-        """Values of points (N, ...) at the middle of each crossing, (K, ...)."""
+        """Values, in their unit, at the middle of each crossing, (K, ...). values : (N, ...) of the vertices."""
         shares = self.shares.reshape(*self.shares.shape, *[1] * (values.ndim - 1))
         first, second = values[self.edges[..., 0]], values[self.edges[..., 1]]
         return np.asarray((first + shares * (second - first)).mean(axis=1))
 
 
 def section(seen: EvaluatedResults, cut: Cut, fields: Sequence[str] = ()) -> Table:
-    """One row a crossed triangle and step: line, arc length in the reference, position and fields.
+    """Fields along a section: one row a crossed triangle and step.
 
-    fields : names; every field there is unless given. Raises InputError for a field there is not, or a cut that misses
-    the surface.
+    A row holds the number of the line, the arc length in the reference, the position and the fields. fields : names;
+    all fields unless given. Raises InputError for an unknown field or a cut that misses the surface.
     """
     entries: list[Field] = [seen.field(name) for name in fields] if fields else list(seen.fields)
     found = crossings(seen.results.mesh, cut)
@@ -93,7 +94,7 @@ def section(seen: EvaluatedResults, cut: Cut, fields: Sequence[str] = ()) -> Tab
 
 
 def crossings(mesh: Mesh, cut: Cut) -> Crossings:
-    """Where a cut crosses the triangles of a surface. Raises InputError if it does not."""
+    """The triangles of a surface that a cut crosses. Raises InputError if the cut misses the surface."""
     normal = np.array(cut.normal) / np.linalg.norm(cut.normal)
     height = (mesh.vertices - np.array(cut.origin)) @ normal
     above = height >= 0  # a vertex on the plane counts as above: every triangle is crossed twice or not at all
@@ -121,13 +122,13 @@ def crossings(mesh: Mesh, cut: Cut) -> Crossings:
 
 
 def _points(mesh: Mesh, edges: Indices, shares: Floats) -> Floats:
-    """Where edges (K, 2, 2) are crossed: (K, 2, 3) mm."""
+    """Positions at which edges (K, 2, 2) are crossed, (K, 2, 3) mm. shares : (K, 2) of the way along each edge."""
     a, b = mesh.vertices[edges[..., 0]], mesh.vertices[edges[..., 1]]
     return np.asarray(a + shares[..., None] * (b - a))
 
 
 def _chained(edges: Indices, vertices: int) -> tuple[Indices, Mask, Indices]:
-    """Segments between edges (K, 2, 2) in order along their lines.
+    """The order of segments between edges (K, 2, 2) along the lines that they form.
 
     Returns the order (K,), which of the ordered segments run backwards (K,), and the number of the line of each (K,),
     rising. Open lines begin at an end; closed ones at the segment that comes first.

@@ -1,4 +1,4 @@
-"""Fields of places through time."""
+"""Time series of fields at material places."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from ringdic.results.evaluation import EvaluatedResults
 
 
 def time_series(seen: EvaluatedResults, places: Sequence[Place], fields: Sequence[str] = ()) -> Table:
-    """One row a place and step: position and fields, those of points interpolated, those of faces of its triangle.
+    """Position and fields of places at every step; one row a place and step.
 
-    fields : names; every field there is unless given. Raises InputError for a field there is not.
+    Fields of points are interpolated at the place, fields of triangles are those of its triangle. fields : names; all
+    fields unless given. Raises InputError for an unknown field.
     """
     entries = [seen.field(name) for name in fields] if fields else list(seen.fields)
     faces = seen.results.faces

@@ -1,4 +1,4 @@
-"""A table of measurements: columns of one length, each with a unit."""
+"""Tables of measurements: named columns of equal length, each with its unit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Column:
-    """One column. unit : "" for a number without one and for text."""
+    """A column of a table. unit : "" for text and for numbers without a unit."""
 
     name: str
     unit: str
@@ -24,7 +24,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of one length, and sentences about them."""
+    """Columns of equal length, and notes about them."""
 
     columns: tuple[Column, ...]
     notes: tuple[str, ...] = ()
@@ -35,7 +35,7 @@ class Table:
 
     @classmethod
     def of_rows(cls, rows: Sequence[dict[str, Any]], units: dict[str, str], notes: Sequence[str] = ()) -> Table:
-        """The table of rows that all have the same keys; ``units`` of those that have one."""
+        """A table from rows that all have the same keys. units : of the columns that have one."""
         names = list(rows[0]) if rows else []
         columns = (Column(name, units.get(name, ""), tuple(row[name] for row in rows)) for name in names)
         return cls(tuple(columns), tuple(notes))
@@ -48,7 +48,7 @@ class Table:
         raise KeyError(name)
 
     def rows(self) -> list[dict[str, Any]]:
-        """One dictionary a row, keys without units; what is not finite is None."""
+        """The rows as dictionaries by column name; numbers that are not finite are None."""
         names = [column.name for column in self.columns]
         return [
             dict(zip(names, map(_plain, values), strict=True))
@@ -56,12 +56,12 @@ class Table:
         ]
 
     def to_json(self) -> dict[str, Any]:
-        """``rows``, the ``units`` of the columns that have one, and ``notes``, as JSON values."""
+        """The table as JSON values: ``rows``, the ``units`` of the columns that have one, and ``notes``."""
         units = {column.name: column.unit for column in self.columns if column.unit}
         return {"rows": self.rows(), "units": units, "notes": list(self.notes)}
 
     def to_csv(self) -> str:
-        """Comma-separated values, first the headings with units; what is not finite is empty."""
+        """The table as comma-separated values: a line of headings with units; numbers that are not finite are empty."""
         lines = [",".join(_quoted(column.heading) for column in self.columns)]
         for values in zip(*(column.values for column in self.columns), strict=True):
             lines.append(",".join(_cell(value) for value in values))

@@ -1,4 +1,4 @@
-"""How strain and its scatter change with the window it is fitted over, without correlating again."""
+"""Study of the strain window: strain and its scatter by window width, without correlating again."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _RADIUS_PX = 20  # of a subset, where the results do not tell
 
 
 def window_study(results: Results, widths: Sequence[float], previous: bool = False) -> Table:
-    """One row a width and step. Width 0 is the triangle alone.
+    """Strain figures for several widths of the strain window; one row a width and step. Width 0 is the triangle alone.
 
-    ``gauge`` is what a strain averages over; ``points`` the median number in a window. ``E1_p5`` and ``E2_p95`` tell
-    how much of a peak is left; ``E_magnitude_median`` and ``E_magnitude_p95`` the scatter where there is no strain. The
-    standard deviations of λ1 and λ2 hold both, signal and scatter. A width that pays for its loss of detail lowers the
-    scatter and leaves the peaks.
+    ``gauge`` is the length of the virtual strain gauge, mm; ``points`` the median number of points in a window.
+    ``E1_p5`` and ``E2_p95`` show how much of a strain peak is left; ``E_magnitude_median`` and ``E_magnitude_p95`` the
+    scatter where there is no strain; the standard deviations of λ1 and λ2 contain signal and scatter. A good width
+    lowers the scatter and leaves the peaks.
 
     Raises InputError for a width below 0.
     """
@@ -41,10 +41,11 @@ def window_study(results: Results, widths: Sequence[float], previous: bool = Fal
 
 
 def gauge(results: Results, width: float) -> Gauge:
-    """What a strain over a window of ``width`` mm averages over: the usual spacing of points and width of a subset.
+    """The virtual strain gauge of a strain window of ``width`` mm: window, spacing of points and size of a subset.
 
-    The spacing is the median edge of the mesh. The subset is measured across the line of sight of the first camera of
-    each point's pair, in the median; seen obliquely, it is wider on the surface. NaN where no camera is known.
+    The spacing is the median edge of the mesh. The size of a subset is the median over the points, measured across the
+    line of sight of the first camera of each point's pair; on a surface seen obliquely it is larger. NaN where no
+    camera is known.
     """
     mesh = results.mesh
     edges, _ = mesh.edges()

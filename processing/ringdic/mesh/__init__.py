@@ -1,1 +1,1 @@
-"""Triangle meshes: neighbours, topology, distances along the surface, projection onto it."""
+"""Triangle meshes: adjacency, topology, geodesic distances, spatial search and projection onto a surface."""

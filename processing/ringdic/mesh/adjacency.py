@@ -1,6 +1,6 @@
-"""Which triangles share an edge, and what hangs together: loops over half-edges sorted by their vertices, compiled.
+"""Compiled adjacency of a triangle mesh: half-edges along one edge, connected pieces, fans of triangles at a vertex.
 
-``half`` is everywhere what ``ringdic.mesh.mesh.half_edges`` gives of the triangles (M, 3): directed edges (3M, 2).
+``half`` (3M, 2) is everywhere the vertices of the half-edges of M triangles, by ``ringdic.mesh.mesh.half_edges``.
 """
 
 from __future__ import annotations
@@ -11,7 +11,10 @@ import numpy as np
 
 @nb.njit(cache=True, nogil=True)
 def _starts(key, size):  # type: ignore[no-untyped-def]
-    """Where the numbers with each key begin (size + 1,) in a row sorted by key, and that row."""
+    """Counting sort of items by their keys, 0 ≤ key < size.
+
+    Returns start (size + 1,) and order (n,): the items with key c are ``order[start[c] : start[c + 1]]``.
+    """
     start = np.zeros(size + 1, np.int64)
     for k in key:
         start[k + 1] += 1
@@ -27,7 +30,7 @@ def _starts(key, size):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def twins(half):  # type: ignore[no-untyped-def]
-    """The half-edge that runs along the same edge the other way, (3M,), the first if several do; -1 at a border."""
+    """Opposite half-edge of each, (3M,): the first in ``half`` that runs along its edge the other way, or -1."""
     twin = np.full(len(half), -1)
     if not len(half):
         return twin
@@ -42,8 +45,12 @@ def twins(half):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def alike(half):  # type: ignore[no-untyped-def]
-    """The half-edge before each along the same edge, either way, (3M,), or -1; and which have the edge alone (3M,)."""
+def shared_edges(half):  # type: ignore[no-untyped-def]
+    """Half-edges of ``half`` along one edge, in either direction, linked to one another.
+
+    Returns for each half-edge the next earlier one along its edge (3M,), or -1, and whether it has the edge alone
+    (3M,) bool.
+    """
     before, alone = np.full(len(half), -1), np.ones(len(half), np.bool_)
     if not len(half):
         return before, alone
@@ -64,6 +71,7 @@ def alike(half):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _root(parent, i):  # type: ignore[no-untyped-def]
+    """Representative of the set of ``i`` in a union-find forest, with path halving."""
     while parent[i] != i:
         parent[i] = parent[parent[i]]
         i = parent[i]
@@ -72,13 +80,14 @@ def _root(parent, i):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _join(parent, i, j):  # type: ignore[no-untyped-def]
+    """Unite the sets of ``i`` and ``j``; the smaller representative stays."""
     a, b = _root(parent, i), _root(parent, j)
     parent[max(a, b)] = min(a, b)
 
 
 @nb.njit(cache=True, nogil=True)
 def _numbered(parent):  # type: ignore[no-untyped-def]
-    """Numbers of the sets, in the order of their first members."""
+    """Number of the set of each member (n,), counted from 0 in the order of the sets' first members."""
     number, count = np.empty(len(parent), np.int64), 0
     for i in range(len(parent)):
         root = _root(parent, i)
@@ -92,8 +101,8 @@ def _numbered(parent):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def piece_numbers(half):  # type: ignore[no-untyped-def]
-    """Number of the piece of each triangle, (M,): those that share an edge hang together."""
-    before, _ = alike(half)
+    """Number of the connected piece of each triangle, (M,); triangles are connected by the edges shared in ``half``."""
+    before, _ = shared_edges(half)
     parent = np.arange(len(half) // 3)
     for h in range(len(half)):
         if before[h] >= 0:
@@ -103,8 +112,11 @@ def piece_numbers(half):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def fan_numbers(half):  # type: ignore[no-untyped-def]
-    """Number of the fan of each corner, (3M,): corners at one vertex whose triangles share an edge there."""
-    before, _ = alike(half)
+    """Number of the fan of each triangle corner, (3M,), from ``half``.
+
+    A fan is a set of triangles at one vertex that are connected by edges which end in that vertex.
+    """
+    before, _ = shared_edges(half)
     parent = np.arange(len(half))
     for h in range(len(half)):
         g = before[h]
@@ -119,7 +131,10 @@ def fan_numbers(half):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def vertices_of_several_fans(corners, fan):  # type: ignore[no-untyped-def]
-    """Which corners (3M,), given by their vertices, are at a vertex with more than one fan. Bool (3M,)."""
+    """Which corners are at a vertex with more than one fan, (3M,) bool.
+
+    corners (3M,) vertex of each corner. fan (3M,) number of its fan.
+    """
     several = np.zeros(len(corners), np.bool_)
     if not len(corners):
         return several

@@ -1,4 +1,4 @@
-"""The loops over the triangles of a mesh, compiled: area vectors, and their sums at the vertices."""
+"""Compiled loops over the triangles of a mesh: area vectors, and sums of vectors at the vertices."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ import numba as nb
 
 @nb.njit(cache=True, nogil=True)
 def area_vectors(vertices, faces, out):  # type: ignore[no-untyped-def]
-    """Normals (M, 3) with the length of the areas, of triangles faces (M, 3) over vertices (N, 3)."""
+    """Area vectors of triangles: normal to them, with the length of their areas; out (M, 3) mm² is filled.
+
+    vertices (N, 3) mm. faces (M, 3) vertex indices.
+    """
     for m in range(len(faces)):
         a, b, c = vertices[faces[m, 0]], vertices[faces[m, 1]], vertices[faces[m, 2]]
         for k in range(3):
@@ -19,7 +22,10 @@ def area_vectors(vertices, faces, out):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def corner_sums(vectors, faces, total):  # type: ignore[no-untyped-def]
-    """Add to each vertex (N, 3) the finite vectors (M, 3) of the triangles (M, 3) round it."""
+    """Add the vectors (M, 3) of the triangles to the sums at their corners; total (N, 3) is changed in place.
+
+    faces (M, 3) vertex indices. A vector that is not finite is left out.
+    """
     for corner in range(3):
         for m in range(len(faces)):
             if math.isfinite(vectors[m, 0] + vectors[m, 1] + vectors[m, 2]):

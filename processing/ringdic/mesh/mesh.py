@@ -1,4 +1,4 @@
-"""A triangle mesh of two arrays, and what can be asked of it."""
+"""A triangle mesh of vertices and faces, with areas, normals, edges and orientation."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Points, Vectors
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles over points.
+    """A triangle mesh of N vertices and M triangles.
 
-    vertices : (N, 3) mm, NaN where a point is lost. faces : (M, 3) vertex indices.
+    vertices : (N, 3) mm, world frame, NaN where a point is lost.
+    faces : (M, 3) vertex indices, counter-clockwise seen from outside.
     """
 
-    vertices: Floats
+    vertices: Points
     faces: Indices
 
     def __post_init__(self) -> None:
@@ -26,9 +27,9 @@ class Mesh:
             raise ValueError(f"faces name vertices beyond the {len(self.vertices)} of the mesh")
 
     @property
-    def area_vectors(self) -> Floats:
-        """Normals with the length of the areas, (M, 3) mm²."""
-        from ringdic.mesh.kernels import area_vectors  # compiled, and loaded only where it is asked for
+    def area_vectors(self) -> Vectors:
+        """Area vectors of the triangles: normal to them, with the length of their areas, (M, 3) mm²."""
+        from ringdic.mesh.kernels import area_vectors  # compiled: loaded only where needed
 
         vectors = np.empty((len(self.faces), 3))
         area_vectors(np.ascontiguousarray(self.vertices), np.ascontiguousarray(self.faces), vectors)
@@ -40,20 +41,23 @@ class Mesh:
         return np.linalg.norm(self.area_vectors, axis=1)
 
     @property
-    def normals(self) -> Floats:
-        """Unit normals of the triangles, (M, 3); NaN for a triangle without area."""
+    def normals(self) -> Vectors:
+        """Normals of the triangles as unit vectors, (M, 3); NaN for a triangle without area."""
         vectors = self.area_vectors
         length = np.linalg.norm(vectors, axis=1, keepdims=True)
         return vectors / np.where(length > 0, length, np.nan)
 
     @property
-    def centroids(self) -> Floats:
+    def centroids(self) -> Points:
         """Centroids of the triangles, (M, 3) mm."""
         return self.vertices[self.faces].mean(axis=1)
 
     @property
-    def vertex_normals(self) -> Floats:
-        """Unit normals of the vertices, weighted by area, (N, 3); NaN for a vertex without a whole triangle."""
+    def vertex_normals(self) -> Vectors:
+        """Normals of the vertices as unit vectors, (N, 3); NaN for a vertex without a whole triangle.
+
+        The sum of the area vectors of the triangles round the vertex, so that large triangles count more.
+        """
         from ringdic.mesh.kernels import corner_sums
 
         total = np.zeros(self.vertices.shape)
@@ -62,46 +66,46 @@ class Mesh:
         return total / np.where(length > 0, length, np.nan)
 
     def edges(self) -> tuple[Indices, Indices]:
-        """Unique edges (K, 2), smaller vertex first, and the number of triangles at each (K,)."""
+        """All edges, each once, as vertex indices (K, 2), the smaller first; and numbers of triangles at each (K,)."""
         unique, count = np.unique(self._edge_numbers(), return_counts=True)
         return np.stack(np.divmod(unique, len(self.vertices)), axis=1), count
 
     def boundary_edges(self) -> Indices:
-        """Edges with one triangle, (K, 2), in the direction in which that triangle runs along them."""
-        from ringdic.mesh.adjacency import alike  # compiled, and loaded only where it is asked for
+        """Edges with one triangle only: vertex indices (K, 2), in the direction in which that triangle runs."""
+        from ringdic.mesh.adjacency import shared_edges  # compiled: loaded only where needed
 
         half = half_edges(self.faces)
-        _, alone = alike(half)
+        _, alone = shared_edges(half)
         return half[alone]
 
     def _edge_numbers(self) -> Indices:
-        """One number for each edge of each triangle, (3M,), the same in both directions; ordered as the edges are."""
+        """One number for the edge of each half-edge, (3M,), equal in both directions, ordered as the vertex pairs."""
         half = half_edges(self.faces)
         return half.min(axis=1) * len(self.vertices) + half.max(axis=1)
 
     def whole_faces(self) -> Mask:
-        """Which triangles have three measured corners and an area. (M,)."""
+        """Which triangles have three measured corners and an area, (M,) bool."""
         return np.isfinite(self.vertices[self.faces]).all(axis=(1, 2)) & (np.nan_to_num(self.areas) > 0)
 
     def without_lost(self) -> Mesh:
-        """The same vertices, without triangles that have lost a corner."""
+        """The mesh with all its vertices but without the triangles that have lost a corner or have no area."""
         return Mesh(self.vertices, self.faces[self.whole_faces()])
 
     def compact(self) -> tuple[Mesh, Indices]:
-        """The mesh without unused vertices, and the old index (K,) of each vertex that is kept."""
+        """The mesh without unused vertices, and the index (K,) that each of its K vertices had before."""
         used = np.unique(self.faces)
         renumber = np.full(len(self.vertices), -1, dtype=np.int64)
         renumber[used] = np.arange(len(used))
         return Mesh(self.vertices[used], renumber[self.faces]), used
 
     def flipped(self, which: Mask) -> Mesh:
-        """The mesh with the orientation of some triangles (M,) turned over."""
+        """The mesh with the orientation of some triangles reversed. which : (M,) bool."""
         faces = self.faces.copy()
         faces[which] = faces[which][:, ::-1]
         return Mesh(self.vertices, faces)
 
-    def facing(self, viewpoints: Floats) -> Mesh:
-        """The mesh with every triangle turned towards the cameras that saw it.
+    def facing(self, viewpoints: Points) -> Mesh:
+        """The mesh with every triangle oriented so that its normal points to the side of its viewpoint.
 
         viewpoints : (3,) or (M, 3) mm, a point in front of each triangle, such as the mean of its cameras' centres.
         """
@@ -111,5 +115,8 @@ class Mesh:
 
 
 def half_edges(faces: Indices) -> Indices:
-    """Directed edges (3M, 2) of triangles (M, 3): number 3f + k runs from corner k of triangle f to the next."""
+    """Half-edges of triangles: the directed edge 3f + k runs from corner k of triangle f to its next corner.
+
+    faces : (M, 3) vertex indices. Returns vertex indices (3M, 2), start and end.
+    """
     return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Points sorted into cubes, so that compiled loops find what lies near without a tree."""
+"""Compiled search for neighbouring points: points sorted into a regular grid of cubes."""
 
 from __future__ import annotations
 
@@ -7,17 +7,20 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from ringdic.arrays import Floats, Indices
+from ringdic.arrays import Floats, Indices, Points
 
-_MOST = 4  # cubes a point: a few far points do not make many empty cubes
+_MOST = 4  # cubes for each point: a few far points must not make very many empty cubes
 
 
 class Cubes(NamedTuple):
-    """Points in the order of the cubes in which they lie.
+    """Points sorted by the cubes of a regular grid in which they lie.
 
-    low : (3,) mm, corner of the first cube. size : mm, edge of a cube. shape : (3,) number of cubes along x, y and z.
-    start : (C + 1,) where each cube begins in ``order``; cubes beside one another in z follow one another.
-    order : (n,) numbers of the points. at : (n, 3) mm, the points in that order.
+    low : (3,) mm, lower corner of the grid.
+    size : mm, edge of a cube.
+    shape : (3,) number of cubes along x, y and z.
+    start : (C + 1,) where the points of each cube begin in ``order``; z is the fastest index of the cubes.
+    order : (n,) indices of the points, sorted by cube.
+    at : (n, 3) mm, the points in that order.
     """
 
     low: Floats
@@ -25,11 +28,15 @@ class Cubes(NamedTuple):
     shape: Indices
     start: Indices
     order: Indices
-    at: Floats
+    at: Points
 
 
-def cubes(points: Floats, size: float) -> Cubes:
-    """Points (n, 3) mm, finite, in cubes with edges of ``size`` mm, or larger ones where these would be too many."""
+def cubes(points: Points, size: float) -> Cubes:
+    """Sort points into a regular grid of cubes.
+
+    points : (n, 3) mm, finite. size : mm, edge of the cubes; it is enlarged where the grid would have far more cubes
+    than points.
+    """
     low = points.min(axis=0, initial=np.inf) if len(points) else np.zeros(3)
     extent = (points.max(axis=0, initial=-np.inf) if len(points) else low) - low
     size = size if size > 0 else 1.0
@@ -42,7 +49,7 @@ def cubes(points: Floats, size: float) -> Cubes:
 
 @nb.njit(cache=True, nogil=True)
 def _sorted(points, low, size, shape):  # type: ignore[no-untyped-def]
-    """Where each cube begins (C + 1,), and the points (n,) in the order of their cubes."""
+    """Counting sort of points by their cubes: where each cube begins (C + 1,), and the order of the points (n,)."""
     n = len(points)
     cube = np.empty(n, np.int64)
     start = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int64)
@@ -63,13 +70,14 @@ def _sorted(points, low, size, shape):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def among_alike(sorted_points, label, reach):  # type: ignore[no-untyped-def]
-    """Which points (n,) have none of another label nearer than ``reach`` mm for certain: by whole cubes.
+def away_from_other_labels(sorted_points, label, reach):  # type: ignore[no-untyped-def]
+    """Which points certainly have no point of another label within a distance, (n,) bool.
 
-    label : (n,), not negative, of each point.
+    Whole cubes are compared, so a point near the distance may be False though it is far enough.
+    sorted_points : Cubes of n points. label : (n,) number ≥ 0 of each point. reach : mm.
     """
     shape, start, order = sorted_points.shape, sorted_points.start, sorted_points.order
-    sole = np.full(len(start) - 1, -1)  # of a cube: no point, -2 several labels
+    sole = np.full(len(start) - 1, -1)  # label of each cube's points; -1 for no point, -2 for several labels
     for c in range(len(sole)):
         for k in range(start[c], start[c + 1]):
             mine = label[order[k]]
@@ -88,7 +96,7 @@ def among_alike(sorted_points, label, reach):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _all_alike(sole, shape, x, y, z, steps):  # type: ignore[no-untyped-def]
-    """Whether all points in the cubes up to some steps beside one have its label."""
+    """Whether the points of all cubes within some steps of cube (x, y, z) have the label of that cube."""
     mine = sole[(x * shape[1] + y) * shape[2] + z]
     for i in range(max(x - steps, 0), min(x + steps + 1, shape[0])):
         for j in range(max(y - steps, 0), min(y + steps + 1, shape[1])):
@@ -100,10 +108,11 @@ def _all_alike(sole, shape, x, y, z, steps):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def near(sorted_points, x, y, z, radius, found, apart):  # type: ignore[no-untyped-def]
-    """Number of points no farther than ``radius`` mm from a place.
+def near(sorted_points, x, y, z, radius, neighbours, distances):  # type: ignore[no-untyped-def]
+    """Points within a radius of the position x, y, z (mm); returns their number.
 
-    found : (n,), changed in place: their places in the order of the cubes. apart : (n,), their squared distances mm².
+    sorted_points : Cubes of n points. radius : mm. The first elements of neighbours (n,) and distances (n,) are filled:
+    places of the points in the order of the cubes, and squared distances in mm².
     """
     low, size, shape, start, at = (
         sorted_points.low, sorted_points.size, sorted_points.shape, sorted_points.start, sorted_points.at,
@@ -119,15 +128,15 @@ def near(sorted_points, x, y, z, radius, found, apart):  # type: ignore[no-untyp
                 dx, dy, dz = at[k, 0] - x, at[k, 1] - y, at[k, 2] - z
                 distance = dx * dx + dy * dy + dz * dz
                 if distance <= square:
-                    found[count] = k
-                    apart[count] = distance
+                    neighbours[count] = k
+                    distances[count] = distance
                     count += 1
     return count
 
 
 @nb.njit(cache=True, nogil=True)
 def _range(middle, radius, size, count):  # type: ignore[no-untyped-def]
-    """First and last cube along an axis that come within ``radius`` of a place; the last before the first if none."""
+    """First and last cube along an axis that lie within ``radius`` mm of a coordinate; (1, 0) where none does."""
     first, last = np.floor((middle - radius) / size), np.floor((middle + radius) / size)
     if last < 0 or first > count - 1:
         return 1, 0

@@ -1,7 +1,7 @@
-"""How the triangles of a surface hang together: borders, holes, pieces, and places covered twice.
+"""Topology of a triangulated surface: borders, holes, connected pieces, and area covered by two layers.
 
 A surface is *sound* when every edge has one or two triangles that run along it in opposite directions, every vertex
-one fan of triangles, and no place is covered twice.
+one fan of triangles, and no part of it lies in a second layer above another.
 """
 
 from __future__ import annotations
@@ -12,31 +12,32 @@ from enum import Enum
 import numpy as np
 import scipy
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Points
 from ringdic.mesh.adjacency import fan_numbers, piece_numbers, twins, vertices_of_several_fans
 from ringdic.mesh.mesh import Mesh, half_edges
 from ringdic.mesh.projection import line_hits
 
-#: Where a triangle is looked at for a second layer: its middle and the middles of its corner parts.
+#: Barycentric coordinates at which a triangle is tested for a second layer: its centroid and one place to each corner.
 _SAMPLES = np.array([[1 / 3, 1 / 3, 1 / 3], [2 / 3, 1 / 6, 1 / 6], [1 / 6, 2 / 3, 1 / 6], [1 / 6, 1 / 6, 2 / 3]])
 
 
 class Kind(Enum):
-    """What a border goes round."""
+    """Kind of a border of a surface: round a hole, round a sheet, or round the end of a tube."""
 
-    HOLE = "hole"  # the surface lies all round it
-    RIM = "rim"  # the outer border of a sheet
-    END = "end"  # of a tube
+    HOLE = "hole"  # the surface surrounds it
+    RIM = "rim"  # it surrounds a sheet
+    END = "end"  # it closes a tube
 
 
 @dataclass(frozen=True)
 class Border:
-    """One closed line of edges with a triangle on one side only.
+    """A closed line of edges that have a triangle on one side only.
 
-    loop : (n,) vertices in the direction in which the triangles run along it; where two borders touch in a vertex,
-    that vertex is passed twice. area : mm², of the vector area that the line encloses (the cross-section of a
-    tube for its end). turning : geodesic curvature along the line in full turns: +1 for a flat sheet's rim, -1 for a
-    flat hole, 0 for a cylinder's end, however ragged (theorem of Gauss and Bonnet).
+    loop : (n,) vertex indices in the direction in which the triangles run along the line; where two borders touch in a
+        vertex, it occurs in both.
+    area : mm², size of the vector area that the line encloses (for the end of a tube, its cross-section).
+    turning : integral of the geodesic curvature along the line, in full turns: +1 for the rim of a flat sheet, -1 for a
+        flat hole, 0 for the end of a cylinder, however ragged (theorem of Gauss and Bonnet).
     """
 
     loop: Indices
@@ -45,64 +46,75 @@ class Border:
 
     @property
     def kind(self) -> Kind:
-        """Hole, rim or end: the nearest whole number of turns."""
+        """Hole, rim or end, by the whole number nearest to ``turning``."""
         return Kind.HOLE if self.turning < -0.5 else Kind.RIM if self.turning > 0.5 else Kind.END
 
 
 def non_manifold_edges(mesh: Mesh) -> Indices:
-    """Edges (K, 2) with more than two triangles."""
+    """Edges with more than two triangles. Returns vertex indices (K, 2), the smaller first."""
     edges, count = mesh.edges()
     return edges[count > 2]
 
 
 def inconsistent_edges(mesh: Mesh) -> Indices:
-    """Edges (K, 2) along which two triangles run in the same direction: one of them is turned over."""
+    """Edges along which two triangles run in the same direction, so that their orientations differ.
+
+    Returns vertex indices (K, 2), in that direction.
+    """
     half = half_edges(mesh.faces)
     unique, count = np.unique(half[:, 0] * len(mesh.vertices) + half[:, 1], return_counts=True)
     return np.stack(np.divmod(unique[count > 1], len(mesh.vertices)), axis=1)
 
 
 def non_manifold_vertices(mesh: Mesh) -> Indices:
-    """Vertices (K,) where triangles meet in more than one fan: two pieces or two borders touch in a point."""
+    """Vertices with more than one fan of triangles, where two pieces or two borders touch. Returns indices (K,)."""
     corners = mesh.faces.ravel()
     return np.unique(corners[vertices_of_several_fans(corners, fans(mesh))])
 
 
 def fans(mesh: Mesh) -> Indices:
-    """Number of the fan of each corner, (3M,): the corners at a vertex whose triangles hang together round it."""
+    """The number of the fan of each triangle corner, (3M,), the three corners of a triangle in succession.
+
+    A fan is a set of triangles at one vertex that are connected by edges which end in that vertex.
+    """
     return np.asarray(fan_numbers(half_edges(mesh.faces)))
 
 
-def without_pinches(mesh: Mesh) -> Mask:
-    """Triangles (M,) left when at every vertex only the fan of the largest area stays."""
-    kept = np.ones(len(mesh.faces), bool)
+def without_pinches(mesh: Mesh, weights: Floats | None = None) -> Mask:
+    """Which triangles remain when every vertex keeps only its fan of the largest weight, (M,) bool.
+
+    weights : (M,) mm², of the triangles; their areas unless given. Of fans of equal weight the first stays.
+    """
+    weights = np.nan_to_num(mesh.areas) if weights is None else weights
+    remaining = np.ones(len(mesh.faces), bool)
     while True:
-        left = np.flatnonzero(kept)
+        left = np.flatnonzero(remaining)
         part = Mesh(mesh.vertices, mesh.faces[left])
         fan = fans(part)
         pinched = vertices_of_several_fans(part.faces.ravel(), fan)
         if not pinched.any():
-            return kept
-        area = np.bincount(fan, np.repeat(np.nan_to_num(part.areas), 3))
+            return remaining
+        weight = np.bincount(fan, np.repeat(weights[left], 3))
         corners = np.flatnonzero(pinched)
-        # The largest fan of each vertex: the last of its corners in order of the fan's area.
-        order = np.lexsort((fan[corners], area[fan[corners]], part.faces.ravel()[corners]))
+        # Sorted by the weight of their fans, the last corner at each vertex belongs to its largest fan.
+        order = np.lexsort((-fan[corners], weight[fan[corners]], part.faces.ravel()[corners]))
         corners = corners[order]
         vertex = part.faces.ravel()[corners]
         last = np.flatnonzero(np.append(vertex[1:] != vertex[:-1], True))
         largest = np.repeat(fan[corners[last]], np.diff(np.append(-1, last)))
-        kept[left[np.unique(corners[fan[corners] != largest] // 3)]] = False
+        remaining[left[np.unique(corners[fan[corners] != largest] // 3)]] = False
 
 
 def pieces(mesh: Mesh) -> Indices:
-    """Number of the connected piece of each triangle, (M,): triangles hang together by shared edges."""
+    """Number of the connected piece of each triangle, (M,); triangles are connected by shared edges."""
     return np.asarray(piece_numbers(half_edges(mesh.faces)))
 
 
 def borders(mesh: Mesh) -> tuple[Border, ...]:
-    """All borders of a surface, the longest first.
+    """All borders of a surface, the one with the most edges first.
 
-    Raises ValueError for a surface with non-manifold edges or triangles turned over: its borders have no direction.
+    Raises ValueError for a surface with non-manifold edges or triangles of opposite orientation, whose borders have no
+    direction.
     """
     if len(non_manifold_edges(mesh)) or len(inconsistent_edges(mesh)):
         raise ValueError("a surface with non-manifold edges or triangles turned over has no borders in order")
@@ -111,7 +123,7 @@ def borders(mesh: Mesh) -> tuple[Border, ...]:
     following = np.arange(len(half)) // 3 * 3 + (np.arange(len(half)) + 1) % 3
     angle = _corner_angles(mesh).ravel()
     border = np.flatnonzero(twin < 0)
-    # From the end of a border edge, round its triangles to the next border edge of the same fan.
+    # From the end of a border edge, across the triangles of its fan, to the next border edge.
     ahead = following[border]
     inner_angle = angle[ahead]
     while (inner := twin[ahead] >= 0).any():
@@ -119,7 +131,7 @@ def borders(mesh: Mesh) -> tuple[Border, ...]:
         inner_angle[inner] += angle[ahead[inner]]
     succeeding = dict(zip(border.tolist(), ahead.tolist(), strict=True))
     turning = dict(zip(border.tolist(), (np.pi - inner_angle).tolist(), strict=True))
-    found = []
+    loops = []
     while succeeding:
         first, onward = succeeding.popitem()
         loop = [first]
@@ -127,53 +139,52 @@ def borders(mesh: Mesh) -> tuple[Border, ...]:
             loop.append(onward)
             onward = succeeding.pop(onward)
         at = half[loop, 0]
-        found.append(Border(at, _enclosed(mesh.vertices[at]), sum(turning[h] for h in loop) / (2 * np.pi)))
-    return tuple(sorted(found, key=lambda border: -len(border.loop)))
+        loops.append(Border(at, _enclosed(mesh.vertices[at]), sum(turning[h] for h in loop) / (2 * np.pi)))
+    return tuple(sorted(loops, key=lambda border: -len(border.loop)))
 
 
 def holes(mesh: Mesh, above: float = 0.0) -> tuple[Border, ...]:
-    """Holes with an area above a limit in mm²."""
+    """The holes of a surface with an area above a limit in mm², the one with the most edges first."""
     return tuple(border for border in borders(mesh) if border.kind is Kind.HOLE and border.area > above)
 
 
 def is_closed_tube(mesh: Mesh, largest_hole: float = 0.0) -> bool:
-    """Whether the surface is one sound piece closed round an axis: two ends, no rim, no hole above a limit in mm²."""
+    """Whether the surface is one manifold piece with two ends, no rim and no hole of an area above a limit in mm²."""
     if not len(mesh.faces) or pieces(mesh).max() > 0 or len(non_manifold_edges(mesh)) or len(inconsistent_edges(mesh)):
         return False
-    found = borders(mesh)
-    kinds = [border.kind for border in found if border.kind is not Kind.HOLE or border.area > largest_hole]
+    kinds = [border.kind for border in borders(mesh) if border.kind is not Kind.HOLE or border.area > largest_hole]
     return sorted(kind.value for kind in kinds) == ["end", "end"]
 
 
 def doubly_covered(mesh: Mesh, reach: float) -> Floats:
-    """Share of each triangle that has another layer of the surface above or below it, (M,), in quarters.
+    """Share of each triangle that has another layer of the surface above or below it, (M,), tested at four places.
 
-    reach : mm, how far off along the normal a layer may lie to count; one of opposite orientation is another side of
-    the body and does not.
+    reach : mm, largest distance of another layer along the normal. A layer of opposite orientation is the other side
+    of the body and does not count.
     """
     covered = np.zeros((len(mesh.faces), len(_SAMPLES)), bool)
     if not len(mesh.faces):
         return np.zeros(0)
     normals, corners = mesh.normals, mesh.vertices[mesh.faces]
     own, other = _neighbourhood(mesh, reach)
-    kept = np.einsum("ni,ni->n", normals[own], normals[other]) > 0.2
-    own, other = own[kept], other[kept]
+    alike = np.einsum("ni,ni->n", normals[own], normals[other]) > 0.2
+    own, other = own[alike], other[alike]
     for part in np.array_split(np.arange(len(own)), max(1, len(own) // 500_000)):
         first, second = own[part], other[part]
         for k, weights in enumerate(_SAMPLES):
-            there, along = line_hits(weights @ corners[first], normals[first], corners[second])
-            covered[first[(there > 1e-6).all(axis=1) & (np.abs(along) < reach)], k] = True
+            inside, along = line_hits(weights @ corners[first], normals[first], corners[second])
+            covered[first[(inside > 1e-6).all(axis=1) & (np.abs(along) < reach)], k] = True
     return covered.mean(axis=1)
 
 
 def _neighbourhood(mesh: Mesh, reach: float) -> tuple[Indices, Indices]:
-    """Ordered pairs (P,), (P,) of triangles close enough for one to lie above the other."""
+    """Ordered pairs (P,), (P,) of triangles close enough for the one to lie within ``reach`` mm above the other."""
     centroids = mesh.centroids
     size = np.linalg.norm(mesh.vertices[mesh.faces] - centroids[:, None], axis=2).max(axis=1)
-    usual = 1.4 * float(np.median(size))
+    ordinary = 1.4 * float(np.median(size))
     tree = scipy.spatial.cKDTree(centroids)
-    pairs = tree.query_pairs(float(np.hypot(2 * usual, reach)), output_type="ndarray").astype(np.int64)
-    large = np.flatnonzero(size > usual)
+    pairs = tree.query_pairs(float(np.hypot(2 * ordinary, reach)), output_type="ndarray").astype(np.int64)
+    large = np.flatnonzero(size > ordinary)
     around = tree.query_ball_point(centroids[large], np.hypot(size[large] + size.max(), reach))
     more = np.array([(a, b) for a, row in zip(large, around, strict=True) for b in row if a != b], np.int64)
     pairs = np.concatenate([pairs, more.reshape(-1, 2)])
@@ -181,12 +192,15 @@ def _neighbourhood(mesh: Mesh, reach: float) -> tuple[Indices, Indices]:
 
 
 def overlap_area(mesh: Mesh, reach: float) -> float:
-    """Area covered twice, mm²: half of what lies in two layers. ``reach`` as in :func:`doubly_covered`."""
+    """Area in mm² over which the surface lies in two layers, counted once.
+
+    reach : mm, largest distance between two layers along the normal.
+    """
     return float(0.5 * (doubly_covered(mesh, reach) * mesh.areas).sum())
 
 
-def _enclosed(points: Floats) -> float:
-    """Length of the vector area that a closed line of points (n, 3) encloses."""
+def _enclosed(points: Points) -> float:
+    """Size of the vector area (mm²) that a closed line of points (n, 3) mm encloses."""
     about = points - points.mean(axis=0)
     return float(np.linalg.norm(0.5 * np.cross(about, np.roll(about, -1, axis=0)).sum(axis=0)))
 
@@ -199,9 +213,10 @@ def _corner_angles(mesh: Mesh) -> Floats:
 
 
 def face_neighbours(faces: Indices) -> Indices:
-    """Triangles beside each triangle, (M, 3): across the edge from corner k to the next; -1 at a border.
+    """Neighbouring triangles of each triangle, across the edges from corner k to the next.
 
-    Where more than two triangles share an edge, one of the others.
+    faces : (M, 3) vertex indices. Returns triangle indices (M, 3), -1 at a border; one of the others where more than
+    two triangles share an edge.
     """
     twin = twins(half_edges(faces))
     return np.where(twin >= 0, twin // 3, -1).reshape(-1, 3)

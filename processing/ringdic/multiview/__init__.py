@@ -1,8 +1,16 @@
-"""One surface seen by all cameras: every material point has one identity in all of them.
+"""One surface measured by all cameras together: every material point has one identity in all of them.
 
-The surface is a radius over a lattice of angle and height about the target's axis. ``lattice`` lays the lattice and
-fits smooth pieces to it, ``depth`` finds it roughly, ``views`` says which camera sees a node, ``warps`` what the shape
-does to a subset between two cameras, ``shape`` joins these to the reference shape, ``tube`` lays the triangles.
-In time, ``following`` finds points of one image again in another of the same camera, ``tracking`` does so through all
-of a camera's images, and ``motion`` places the points from all cameras at every step.
+The surface is described by its radius over a lattice of angle and height about the target's axis.
+
+At the reference:
+``lattice`` is the lattice and the smooth pieces that are fitted to it, ``depth`` a first rough surface from sweeps of
+the camera pairs, ``views`` the visibility of the lattice's nodes in the cameras, ``warps`` the deformation of a subset
+between two cameras by the shape, ``matching`` the matches of the nodes, ``agreement`` their triangulation without
+views that contradict the others, ``weights`` the weights of the views, ``tube`` the triangles between the nodes, and
+``shape`` all of these together.
+
+In time:
+``tracked_points`` and ``step_matching`` match points of one image in a later one of the same camera, ``tracking``
+follows them through all images of a camera, ``motion`` triangulates the positions of every step from all cameras,
+``uncertainty`` gives their standard deviations, and ``surface`` collects the results. ``tasks`` divides the work.
 """

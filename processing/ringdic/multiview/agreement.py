@@ -1,4 +1,4 @@
-"""Points from all their views but those that contradict the others."""
+"""Triangulation of points from all their views, except those that contradict the others."""
 
 from __future__ import annotations
 
@@ -6,21 +6,30 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Pixels, Points
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.weighted_triangulation import WeightedPoints, triangulate_weighted
 
-_LIMIT = 25.0  # χ² a degree of freedom, in units of the usual one
+_LIMIT = 25.0  # χ² for each degree of freedom, in units of the usual one
 _ROUNDS = 2
 
 
 def triangulate_agreeing(
-    cameras: Sequence[Camera], px: Floats, sigma: Floats, given: Indices | None = None
+    cameras: Sequence[Camera], px: Pixels, sigma: Floats, fixed: Indices | None = None
 ) -> tuple[WeightedPoints, Mask]:
-    """Points (n) from px, sigma (C, n, 2), up to two views dropped where a point's χ² is far beyond the usual.
+    """Triangulate points from all cameras and drop up to two views of a point whose χ² is far beyond the usual.
 
-    given : (n,) a camera a point whose pixel defines the point and is not dropped. A point of two views that
-    contradict one another is lost. Returns the points and which views (C, n) they rest on.
+    A point of two views that contradict one another is lost.
+
+    Parameters
+    ----------
+    cameras : the C cameras.
+    px, sigma : (C, n, 2) float64, px, pixels of the points and their standard deviations, NaN where a camera has none.
+    fixed : (n,) int, index of a camera whose pixel defines the point and is never dropped; None: any view may go.
+
+    Returns
+    -------
+    The points, NaN where lost, and the views (C, n) bool that they rest on.
     """
     px = px.copy()
     points = triangulate_weighted(cameras, px, sigma)
@@ -29,7 +38,7 @@ def triangulate_agreeing(
         bad = np.flatnonzero(_contradicted(points, usual))
         if not len(bad):
             break
-        px[_worst(cameras, points.xyz[bad], px[:, bad], sigma[:, bad], None if given is None else given[bad]), bad] = (
+        px[_worst(cameras, points.xyz[bad], px[:, bad], sigma[:, bad], None if fixed is None else fixed[bad]), bad] = (
             np.nan
         )
         again = triangulate_weighted(cameras, px[:, bad], sigma[:, bad])
@@ -41,19 +50,20 @@ def triangulate_agreeing(
 
 
 def _usual(points: WeightedPoints) -> float:
-    """χ² a degree of freedom of the middling point, and not below one."""
+    """Median over the points of χ² for each degree of freedom, at least one."""
     known = points.degrees > 0
     return max(1.0, float(np.median(points.chi2[known] / points.degrees[known]))) if known.any() else 1.0
 
 
 def _contradicted(points: WeightedPoints, usual: float) -> Mask:
+    """Points (n,) whose χ² is far beyond the usual: some view contradicts the others."""
     return np.asarray((points.degrees > 0) & (np.nan_to_num(points.chi2) > _LIMIT * usual * points.degrees))
 
 
-def _worst(cameras: Sequence[Camera], xyz: Floats, px: Floats, sigma: Floats, given: Indices | None) -> Indices:
-    """Index (n,) of the view that fits worst."""
+def _worst(cameras: Sequence[Camera], xyz: Points, px: Pixels, sigma: Floats, fixed: Indices | None) -> Indices:
+    """Index (n,) of the camera whose pixel is farthest from each point's projection, in standard deviations."""
     residual = np.stack([camera.project(xyz) for camera in cameras]) - px
     each = np.nansum((residual / sigma) ** 2, axis=2)
-    if given is not None:
-        each[given, np.arange(len(given))] = -1.0
+    if fixed is not None:
+        each[fixed, np.arange(len(fixed))] = -1.0
     return np.asarray(np.argmax(each, axis=0))

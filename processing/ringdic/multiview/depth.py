@@ -1,4 +1,4 @@
-"""A first, rough radius of the surface over the lattice, from sweeps of the camera pairs."""
+"""A first rough radius of the surface over the lattice, from depth sweeps of the camera pairs."""
 
 from __future__ import annotations
 
@@ -6,28 +6,31 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Points
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.multiview.lattice import TURN, Pieces, SurfaceLattice, robust_pieces
 
-_SMOOTHING = 12.0  # mm, reach of the pieces that join the samples of the sweeps
+_SMOOTHING = 12.0  # mm, reach of the pieces through the samples of the sweeps
 _MARGIN = 3  # rows beyond the samples
 
 
 def px_per_mm(cameras: Sequence[Camera], radius: float) -> float:
-    """Scale of the images where the cameras face a cylinder about the axis. Median, px/mm."""
+    """Median image scale, px/mm, where each camera faces a cylinder of a radius, mm, about the z axis."""
     scales = []
     for camera in cameras:
         towards = camera.centre[:2] / np.linalg.norm(camera.centre[:2])
-        place = np.array([*(radius * towards), camera.centre[2]])
-        ends = np.stack([place, place + np.array([0.0, 0.0, 1.0])])
+        position = np.array([*(radius * towards), camera.centre[2]])
+        ends = np.stack([position, position + np.array([0.0, 0.0, 1.0])])
         scales.append(float(np.linalg.norm(np.diff(camera.project(ends), axis=0))))
     return float(np.median(scales))
 
 
-def lay_lattice(samples: Floats, spacing: float) -> SurfaceLattice:
-    """A lattice over points of the surface (n, 3) mm, its nodes ``spacing`` mm apart on the middling radius."""
+def lay_lattice(samples: Points, spacing: float) -> SurfaceLattice:
+    """Lay a lattice over samples of the surface, with equal spacing along the arc of their median radius and along z.
+
+    samples : (n, 3) float64, mm, world frame. spacing : mm, between nodes.
+    """
     radius = float(np.median(np.hypot(samples[:, 0], samples[:, 1])))
     columns = max(8, round(TURN * radius / spacing))
     low, high = (float(value) for value in (samples[:, 2].min(), samples[:, 2].max()))
@@ -36,10 +39,10 @@ def lay_lattice(samples: Floats, spacing: float) -> SurfaceLattice:
     return SurfaceLattice(radius, columns, (first + np.arange(count)) * spacing)
 
 
-def rough_surface(lattice: SurfaceLattice, samples: Floats) -> Pieces:
-    """Smooth pieces through samples (n, 3) mm of the surface that are scattered over the lattice and may be wrong.
+def rough_surface(lattice: SurfaceLattice, samples: Points) -> Pieces:
+    """Fit smooth pieces through samples of the surface that are scattered over the lattice and partly wrong.
 
-    Raises ComputationError where they do not make a surface.
+    samples : (n, 3) float64, mm, world frame. Raises ComputationError where the samples do not form a surface.
     """
     theta = np.arctan2(samples[:, 1], samples[:, 0]) % TURN
     column, row, inside = lattice.nearest(theta, samples[:, 2])
@@ -53,7 +56,7 @@ def rough_surface(lattice: SurfaceLattice, samples: Floats) -> Pieces:
 
 
 def _density(known: Mask) -> float:
-    """Share of known nodes where there are any about."""
+    """Median share of known nodes in the blocks of 8 x 8 nodes that hold any. known : (columns, rows)."""
     blocks = [
         known[i : i + 8, j : j + 8].mean() for i in range(0, known.shape[0], 8) for j in range(0, known.shape[1], 8)
     ]
@@ -62,7 +65,10 @@ def _density(known: Mask) -> float:
 
 
 def _medians(shape: tuple[int, int], column: Indices, row: Indices, values: Floats) -> Floats:
-    """Median of the values (n,) that fall on each node, NaN where none does."""
+    """Median of the values that fall on each node of a lattice, (columns, rows), NaN where none does.
+
+    column, row : (n,) int, the node of each value. values : (n,).
+    """
     out = np.full(shape, np.nan)
     node = column * shape[1] + row
     order = np.lexsort((values, node))

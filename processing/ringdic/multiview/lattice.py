@@ -1,4 +1,4 @@
-"""A lattice of angle and height about the z axis, and smooth pieces fitted to a radius known on some of its nodes.
+"""A lattice of angle and height about the z axis, and smooth pieces of surface fitted to the radius at its nodes.
 
 The pieces are polynomials of the second or third degree in the arc a = R (θ - θ₀) and the height b = z - z₀ about each
 node, fitted by weighted least squares to the nodes within reach. On a lattice the sums of the normal equations are
@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Points, Vectors
 
 TURN = 2.0 * math.pi
-#: Powers of a and b of the coefficients, the second degree first.
+#: Powers of a and b that the coefficients belong to, those up to the second degree first.
 POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 _QUADRATIC = 6
 _RIDGE = 1e-9
@@ -24,9 +24,9 @@ _RIDGE = 1e-9
 
 @dataclass(frozen=True)
 class SurfaceLattice:
-    """Nodes (columns, rows): columns close round the axis at equal angles, rows at equal heights.
+    """Lattice of angle and height about the z axis: columns at equal angles all round, rows at equal heights.
 
-    radius : mm, of the cylinder whose arcs measure the columns. columns : their number. z : (rows,) mm, rising.
+    radius : mm, of the cylinder on which arcs are measured. columns : their number. z : (rows,) float64, mm, rising.
     """
 
     radius: float
@@ -39,43 +39,48 @@ class SurfaceLattice:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(columns, rows)."""
+        """Number of columns and of rows."""
         return self.columns, len(self.z)
 
     @property
     def theta(self) -> Floats:
-        """Angles of the columns. (columns,) rad, from 0."""
+        """Angles of the columns, (columns,) rad, from 0."""
         return np.asarray(np.arange(self.columns) * (TURN / self.columns))
 
     @property
     def spacing(self) -> tuple[float, float]:
-        """Distance of columns along the arc, and of rows, mm."""
+        """Distance of neighbouring columns along the arc and of neighbouring rows, mm."""
         return TURN * self.radius / self.columns, float(self.z[1] - self.z[0])
 
     @property
-    def places(self) -> tuple[Floats, Floats]:
-        """θ rad and z mm of all nodes, (columns, rows) each."""
+    def coordinates(self) -> tuple[Floats, Floats]:
+        """Angle θ, rad, and height z, mm, of all nodes, (columns, rows) each."""
         theta, z = np.meshgrid(self.theta, self.z, indexing="ij")
         return theta, z
 
     def nearest(self, theta: Floats, z: Floats) -> tuple[Indices, Indices, Mask]:
-        """Column and row of the node nearest to θ, z (n,), and whether the lattice reaches there."""
+        """Node nearest to points on the cylinder.
+
+        theta : (n,) rad. z : (n,) mm. Returns column (n,) and row (n,) indices, the rows clipped to the lattice, and
+        a mask (n,) of the points that the lattice reaches.
+        """
         column = np.rint(np.nan_to_num(theta) / (TURN / self.columns)).astype(np.int64) % self.columns
         row = np.rint((np.nan_to_num(z, nan=-1e9) - self.z[0]) / self.spacing[1]).astype(np.int64)
         inside = (row >= 0) & (row < len(self.z)) & np.isfinite(theta)
         return column, np.clip(row, 0, len(self.z) - 1), inside
 
     def arc(self, theta: Floats, theta_0: Floats) -> Floats:
-        """R (θ - θ₀) the short way round, mm."""
+        """Arc R (θ - θ₀) the short way round, mm. theta, theta_0 : (...) rad, of shapes that broadcast."""
         return self.radius * ((theta - theta_0 + math.pi) % TURN - math.pi)
 
 
 @dataclass(frozen=True)
 class Pieces:
-    """A smooth piece of surface about each node.
+    """A smooth piece of surface about each node of a lattice.
 
-    coefficients : (columns, rows, 10) of ``POWERS``, mm; NaN where too little is known around. The first is the radius.
-    support : (columns, rows), nodes known within reach, by weight, as a share of all.
+    lattice : its nodes. coefficients : (columns, rows, 10) float64, mm, of the powers ``POWERS``, the first one the
+    radius; NaN where too little is known around. support : (columns, rows), share of the nodes within reach that are
+    known, by weight.
     """
 
     lattice: SurfaceLattice
@@ -84,13 +89,13 @@ class Pieces:
 
     @property
     def radius(self) -> Floats:
-        """Fitted radius of the nodes. (columns, rows) mm."""
+        """Fitted radius of the nodes, (columns, rows) mm."""
         return self.coefficients[..., 0]
 
     @property
-    def normals(self) -> Floats:
-        """Outward unit normals (columns, rows, 3)."""
-        theta, _ = self.lattice.places
+    def normals(self) -> Vectors:
+        """Outward unit normals of the surface at the nodes, (columns, rows, 3), world frame."""
+        theta, _ = self.lattice.coordinates
         radius, along, up = np.moveaxis(self.coefficients[..., :3], -1, 0)
         along = along * self.lattice.radius  # d radius / dθ
         cos, sin = np.cos(theta), np.sin(theta)
@@ -98,21 +103,24 @@ class Pieces:
         return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
 
     @property
-    def xyz(self) -> Floats:
-        """Fitted positions of the nodes. (columns, rows, 3) mm."""
-        theta, z = self.lattice.places
+    def xyz(self) -> Points:
+        """Fitted positions of the nodes, (columns, rows, 3) mm, world frame."""
+        theta, z = self.lattice.coordinates
         return np.stack([self.radius * np.cos(theta), self.radius * np.sin(theta), z + 0 * self.radius], axis=-1)
 
 
 def fit_pieces(
     lattice: SurfaceLattice, radius: Floats, reach: float, degree: int = 3, *, least: float = 0.2, density: float = 1.0
 ) -> Pieces:
-    """Fit a piece about every node that has enough known nodes within reach.
+    """Fit a smooth piece of surface about every node of a lattice that has enough known nodes within reach.
 
-    radius : (columns, rows) mm, NaN where unknown. reach : mm; weights fall from the node to zero there.
-    degree : 2 or 3; where the known nodes lie to one side, at a rim, always 2. least : share of known nodes, by
-    weight, below which a node is left without a piece. density : the share of the nodes that were to be measured; of
-    these are the other shares.
+    Parameters
+    ----------
+    radius : (columns, rows) float64, mm, NaN where unknown.
+    reach : mm, at which the weights have fallen from one at the node to zero.
+    degree : 2 or 3. Where the known nodes lie to one side, as at a rim, the piece is always of degree 2.
+    least : share of known nodes, by weight, below which a node is left without a piece.
+    density : share of the nodes that were to be measured at all; ``least`` and the support refer to these.
     """
     known = np.isfinite(radius)
     level = float(np.mean(radius[known])) if known.any() else 0.0
@@ -134,9 +142,9 @@ def fit_pieces(
         powers = POWERS[:count]
         normal = np.stack([np.stack([sums[p + r, q + s][chosen] for r, s in powers], -1) for p, q in powers], -1)
         normal += _RIDGE * normal[:, :1, :1] * np.eye(count)
-        found = np.linalg.solve(normal, right[chosen][:, :count, None])[..., 0]
+        solution = np.linalg.solve(normal, right[chosen][:, :count, None])[..., 0]
         coefficients[chosen] = 0.0
-        coefficients[chosen, :count] = found
+        coefficients[chosen, :count] = solution
     scale = np.array([reach ** -(p + q) for p, q in POWERS])
     coefficients *= scale
     coefficients[..., 0] += level
@@ -153,32 +161,46 @@ def robust_pieces(
     floor: float = 0.1,
     density: float = 1.0,
 ) -> tuple[Pieces, Mask]:
-    """The same without the nodes that lie off; returns the pieces and which known nodes (columns, rows) were kept.
+    """Fit smooth pieces of surface without the nodes that lie off them.
 
-    A node lies off by more than ``floor`` mm and 6 standard deviations of the usual residual. The most distant ones
-    go first, so that they do not drag good ones along.
+    A node lies off if its distance is more than ``floor`` and more than 6 standard deviations of the usual residual.
+    The most distant nodes are left out first, so that they do not draw the pieces away from good ones.
+
+    Parameters
+    ----------
+    radius : (columns, rows) float64, mm, NaN where unknown.
+    reach, degree, least, density : as in :func:`fit_pieces`.
+    floor : mm.
+
+    Returns
+    -------
+    The pieces, and the mask (columns, rows) of the known nodes that they were fitted to.
     """
     known = np.isfinite(radius)
-    kept = known
+    agreeing = known
 
-    def fitted() -> Pieces:
-        return fit_pieces(lattice, np.where(kept, radius, np.nan), reach, degree, least=least, density=density)
+    def fit() -> Pieces:
+        return fit_pieces(lattice, np.where(agreeing, radius, np.nan), reach, degree, least=least, density=density)
 
-    pieces = fitted()
+    pieces = fit()
     for factor in (20.0, 10.0, 6.0, 6.0):
         residual = np.abs(radius - pieces.radius)
-        usual = 1.4826 * float(np.nanmedian(residual[kept])) if np.isfinite(residual[kept]).any() else 0.0
+        usual = 1.4826 * float(np.nanmedian(residual[agreeing])) if np.isfinite(residual[agreeing]).any() else 0.0
         with np.errstate(invalid="ignore"):
             now = known & (residual <= max(factor * usual, floor))
-        if (now == kept).all():
+        if (now == agreeing).all():
             continue
-        kept = now
-        pieces = fitted()
-    return pieces, kept
+        agreeing = now
+        pieces = fit()
+    return pieces, agreeing
 
 
 def evaluate(coefficients: Floats, a: Floats, b: Floats) -> tuple[Floats, Floats, Floats]:
-    """Radius (...) of pieces (..., 10) at a, b (...) mm from their nodes, and its derivatives by a and b."""
+    """Evaluate the polynomials of pieces of surface.
+
+    coefficients : (..., 10) mm. a, b : (...) mm, arc and height from the pieces' nodes. Returns the radius, mm, and its
+    derivatives by a and by b, (...) each.
+    """
     c = np.moveaxis(coefficients, -1, 0)
     value = (
         c[0]
@@ -191,7 +213,7 @@ def evaluate(coefficients: Floats, a: Floats, b: Floats) -> tuple[Floats, Floats
 
 
 def _window(lattice: SurfaceLattice, reach: float) -> tuple[Floats, Floats, Floats]:
-    """a, b and weights of the nodes within reach; a and b in units of the reach."""
+    """Arc a, height b and weight of the nodes of a window about a node; a and b in units of the reach."""
     along, up = lattice.spacing
     half = (max(2, math.ceil(reach / along)), max(2, math.ceil(reach / up)))
     half = (min(half[0], lattice.columns // 2 - 1), half[1])
@@ -204,8 +226,8 @@ def _window(lattice: SurfaceLattice, reach: float) -> tuple[Floats, Floats, Floa
 
 
 def _correlate(values: Floats, kernel: Floats) -> Floats:
-    """Σ kernel · values about each node (columns, rows): round the ring, and nothing beyond the rows."""
+    """Σ kernel · values about each node (columns, rows), periodic over the columns and zero beyond the rows."""
     over, up = kernel.shape[0] // 2, kernel.shape[1] // 2
     padded = np.pad(np.pad(values, ((over, over), (0, 0)), mode="wrap"), ((0, 0), (up, up)))
-    found = cv2.filter2D(padded, cv2.CV_64F, kernel, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(found[over : over + values.shape[0], up : up + values.shape[1]])
+    filtered = cv2.filter2D(padded, cv2.CV_64F, kernel, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(filtered[over : over + values.shape[0], up : up + values.shape[1]])

@@ -1,4 +1,4 @@
-"""Nodes of the surface matched from the camera that faces them to the others, with start values from the shape."""
+"""Matches of the surface's nodes from the camera that faces them to the others, with start values from the shape."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Image, Indices, Mask
+from ringdic.arrays import Floats, Image, Indices, Mask, Pixels
 from ringdic.correlation import (
     Correlation,
     CorrelationSettings,
     Current,
     Reference,
     Status,
+    correlate_independently,
     prepare_current,
     prepare_reference,
-    refine_alone,
 )
 from ringdic.correlation.prepared import Box
 from ringdic.errors import ComputationError
@@ -29,18 +29,20 @@ from ringdic.uncertainty.matches import match_uncertainty
 from ringdic.uncertainty.noise import flat_noise
 from ringdic.uncertainty.texture import Texture, TextureMap, texture_map
 
-_KEPT = 16  # filtered images held at a time, the surface's part of each
-_MARGIN = 48.0  # px that are filtered about the subsets
-_FELT = 0.6  # share of the subset's radius over which the warp's differences are taken
-_LOOSE = 5e-3  # px, tolerance of the second order
-_PATIENCE = 25  # iterations; steep and small subsets take some ten
+_CACHED = 16  # filtered images in memory at a time, of each the part with the surface
+_MARGIN = 48.0  # px about the subsets in which an image is filtered
+_DIFFERENCE = 0.6  # subset radii over which the warp's central differences are taken
+_LOOSE = 5e-3  # px, tolerance of subsets of second order
+_PATIENCE = 25  # iterations at most; steep and small subsets take some ten
 
 
 @dataclass
 class ReferenceImages:
-    """The cameras and their reference images.
+    """The reference images of all cameras, filtered where the surface is searched.
 
-    image : gives the grey image of a camera's id, or None where it has none. masks : regions drawn by the user.
+    cameras : C calibrated cameras. image : gives the grey image of a camera id, (height, width) grey levels, or None
+    where there is none. masks : (height, width) bool, regions drawn by the user, by camera id. settings : of the
+    correlation.
     """
 
     cameras: Sequence[Camera]
@@ -53,23 +55,25 @@ class ReferenceImages:
     _noise: dict[int, float] = field(default_factory=dict)
 
     def grey(self, k: int) -> Image:
-        """The image of camera k. ComputationError where it has none."""
-        found = self.image(self.cameras[k].id)
-        if found is None:
+        """Image of camera number k, (height, width) grey levels. Raises ComputationError where it has none."""
+        matches = self.image(self.cameras[k].id)
+        if matches is None:
             raise ComputationError(f"camera {self.cameras[k].id}: the reference capture lacks an image")
-        return found
+        return matches
 
     def current(self, k: int) -> Current:
-        """The image of camera k, filtered where the surface is looked for; the latest are kept."""
+        """Image of camera number k, filtered as a current image about the pixels of ``look_at``; the latest ones are
+        cached.
+        """
         if k not in self._filtered:
-            while len(self._filtered) >= _KEPT:
+            while len(self._filtered) >= _CACHED:
                 self._filtered.popitem(last=False)
             self._filtered[k] = prepare_current(self.grey(k), self._boxes.get(k), self.settings)
         self._filtered.move_to_end(k)
         return self._filtered[k]
 
-    def look_at(self, k: int, px: Floats) -> None:
-        """Camera k is searched about px (n, 2) from now on."""
+    def look_at(self, k: int, px: Pixels) -> None:
+        """Restrict later searches in the image of camera number k to the surroundings of px (n, 2) px."""
         box = self._boxes.get(k)
         edge = np.array(self.cameras[k].size)
         low, high = (np.clip(values, 0, edge) for values in (px.min(axis=0), px.max(axis=0)))
@@ -80,22 +84,22 @@ class ReferenceImages:
         self._boxes[k] = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
         self._filtered.pop(k, None)
 
-    def texture(self, k: int, px: Floats) -> Texture:
-        """What the image of camera k shows about px (n, 2)."""
+    def texture(self, k: int, px: Pixels) -> Texture:
+        """Texture of the image of camera number k about px (n, 2) px."""
         if k not in self._textures:
             self._textures[k] = texture_map(self.grey(k), self.settings.radius)
         return self._textures[k].at(px)
 
     def noise(self, k: int) -> float:
-        """Variance of the grey levels of camera k by noise, from the middle of its image where the body stands."""
+        """Variance of camera number k's noise, grey levels², from the middle of its image, where the body stands."""
         if k not in self._noise:
             grey = self.grey(k)
             height, width = grey.shape
             self._noise[k] = flat_noise(grey[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4])
         return self._noise[k]
 
-    def reference(self, k: int, px: Floats) -> Reference:
-        """The image of camera k about px (n, 2), filtered to be searched for."""
+    def reference(self, k: int, px: Pixels) -> Reference:
+        """Image of camera number k, filtered as a reference image about px (n, 2) px."""
         grey = self.grey(k)
         mask = np.zeros(grey.shape, bool)
         margin = self.settings.radius + 2
@@ -108,25 +112,25 @@ class ReferenceImages:
 
 @dataclass(frozen=True)
 class NodeMatches:
-    """Matches of n nodes in C cameras. px, sigma : (C, n, 2), NaN where a camera has none; c_ls : (C, n).
+    """Matches of n nodes in C cameras.
 
-    The reference camera's pixel is whole and given, its sigma zero. noise, systematic : (C, n, 2) px, what the noise of
-    each image alone and what is no noise leave uncertain, of the reference camera too. status : (n,), why a node has
-    fewer than two views, 0 where it has.
+    px, sigma : (C, n, 2) px, NaN where a camera has none; in the reference camera of a node a whole pixel, with
+    sigma zero. noise, systematic : (C, n, 2) px, standard deviations by the noise of each image alone and by what is
+    not noise, also of the reference camera. c_ls : (C, n). status : (n,), 0 for a node with two views or more, else
+    the reason. count : number of matches that were computed.
     """
 
-    px: Floats
-    sigma: Floats
-    noise: Floats
-    systematic: Floats
+    px: Pixels
+    sigma: Pixels
+    noise: Pixels
+    systematic: Pixels
     c_ls: Floats
     status: NDArray[np.int8]
-    made: int = 0
-    seconds: float = 0.0
+    count: int = 0
 
 
 def match_nodes(
-    ring: ReferenceImages,
+    images: ReferenceImages,
     pieces: Pieces,
     nodes: tuple[Indices, Indices],
     reference: Indices,
@@ -134,69 +138,79 @@ def match_nodes(
     *,
     order: int,
     curved: bool = True,
-    progress: Callable[[float], None] = lambda _: None,
 ) -> NodeMatches:
-    """Match the nodes (columns (n,), rows (n,)) from their reference camera (n,) to their partners (C, n).
+    """Match nodes of the surface from the image of their reference camera to those of their partners.
 
-    order : of the subsets. curved : second derivatives from the shape, as start of the second order and held by the
-    first; otherwise zero.
+    Parameters
+    ----------
+    images : of all C cameras.
+    pieces : the surface, which gives the start values.
+    nodes : columns (n,) int and rows (n,) int.
+    reference : (n,) int, index of the camera that each node is matched from.
+    partners : (C, n) bool, cameras that each node is matched to.
+    order : of the subsets, 1 or 2.
+    curved : whether second derivatives are taken from the shape, as start values of the second order and as fixed
+    values of the first; otherwise they are zero.
     """
-    settings = _of_order(ring.settings, order)
-    count, n = len(ring.cameras), len(reference)
+    settings = _of_order(images.settings, order)
+    count, n = len(images.cameras), len(reference)
     px, sigma = np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan)
     parts = _Parts(np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan), np.zeros(n))
     c_ls, status = np.full((count, n), np.nan), np.full(n, Status.NOT_REACHED, np.int8)
-    made, seconds = 0, 0.0
+    computed = 0
     xyz = pieces.xyz[nodes]
-    theta, z = (place[nodes] for place in pieces.lattice.places)
-    reach = max(2.0, _FELT * settings.radius)
+    theta, z = (coordinate[nodes] for coordinate in pieces.lattice.coordinates)
+    reach = max(2.0, _DIFFERENCE * settings.radius)
     jobs = [(a, b) for a in range(count) for b in range(count) if (partners[b] & (reference == a)).any()]
     own = np.empty(0, np.int64)
-    before = -1
-    for job, (a, b) in enumerate(jobs):
-        progress(job / len(jobs))
-        if a != before:
-            own, before = np.flatnonzero(reference == a), a
-            at = np.rint(ring.cameras[a].project(xyz[own]))
+    previous = -1
+    for a, b in jobs:
+        if a != previous:
+            own, previous = np.flatnonzero(reference == a), a
+            at = np.rint(images.cameras[a].project(xyz[own]))
             stencil = surface_stencil(
-                pieces.lattice, pieces.coefficients[nodes][own], theta[own], z[own], ring.cameras[a], at, reach
+                pieces.lattice, pieces.coefficients[nodes][own], theta[own], z[own], images.cameras[a], at, reach
             )
-            filtered = ring.reference(a, at)
+            filtered = images.reference(a, at)
             px[a, own], sigma[a, own], c_ls[a, own] = at, 0.0, 0.0
-        start = warps_to(ring.cameras[b], at, stencil, reach)
+        start = warps_to(images.cameras[b], at, stencil, reach)
         if not curved:
             start[:, 6:] = 0.0
         chosen = np.flatnonzero(partners[b, own] & np.isfinite(start).all(axis=1))
         if not len(chosen):
             continue
-        found = refine_alone(filtered, ring.current(b), at[chosen], settings, start[chosen])
-        made += len(chosen)
-        seconds += found.seconds["refine"]
-        who = own[chosen]
-        px[b, who], sigma[b, who], c_ls[b, who] = at[chosen] + found.uv, found.sigma, found.c_ls
-        parts.add(ring, (a, b), found, who)
-        status[who] = np.where(status[who] == Status.GOOD, Status.GOOD, found.status)
+        matches = correlate_independently(filtered, images.current(b), at[chosen], settings, start[chosen])
+        computed += len(chosen)
+        matched = own[chosen]
+        px[b, matched], sigma[b, matched], c_ls[b, matched] = at[chosen] + matches.uv, matches.sigma, matches.c_ls
+        parts.add(images, (a, b), matches, matched)
+        status[matched] = np.where(status[matched] == Status.GOOD, Status.GOOD, matches.status)
     px[:, status != Status.GOOD] = np.nan
-    progress(1.0)
-    return NodeMatches(px, sigma, np.sqrt(parts.noise), np.sqrt(parts.systematic), c_ls, status, made, seconds)
+    return NodeMatches(px, sigma, np.sqrt(parts.noise), np.sqrt(parts.systematic), c_ls, status, computed)
 
 
 @dataclass(frozen=True)
 class _Parts:
-    """Variances (C, n, 2) px² by noise and by what is none, and the number (n,) of matches of each node."""
+    """Variances of the matches by cause, and the number of matches of each node.
+
+    noise, systematic : (C, n, 2) px², by noise and by what is not noise. matches : (n,).
+    """
 
     noise: Floats
     systematic: Floats
     matches: Floats
 
-    def add(self, ring: ReferenceImages, cameras: tuple[int, int], found: Correlation, nodes: Indices) -> None:
-        """Add the matches found from the first camera to the second. The first has the mean of its nodes' matches.
+    def add(self, images: ReferenceImages, cameras: tuple[int, int], matches: Correlation, nodes: Indices) -> None:
+        """Add the variances of the matches of some nodes (k,) from the first of two cameras to the second.
 
-        Half of what is no noise is laid to either image.
+        The variance in the first camera is the mean over the matches from it. Half of what is not noise is ascribed
+        to either image.
         """
         a, b = cameras
-        textures = ring.texture(a, found.xy), ring.texture(b, found.xy + found.uv)
-        parts = match_uncertainty(found.sigma, found.c_ls, textures, (ring.noise(a), ring.noise(b)), found.gradient)
+        textures = images.texture(a, matches.xy), images.texture(b, matches.xy + matches.uv)
+        parts = match_uncertainty(
+            matches.sigma, matches.c_ls, textures, (images.noise(a), images.noise(b)), matches.gradient
+        )
         self.noise[b, nodes], self.systematic[b, nodes] = parts.current**2, parts.systematic**2 / 2
         known = np.isfinite(parts.current).all(axis=1) & np.isfinite(parts.reference_systematic).all(axis=1)
         nodes = nodes[known]
@@ -208,7 +222,9 @@ class _Parts:
 
 
 def _of_order(settings: CorrelationSettings, order: int) -> CorrelationSettings:
-    """Settings of the subsets of an order. Second order serves the shape's pieces, which need not the last digit."""
+    """Settings of subsets of an order; those of second order serve the smooth pieces and need not converge to the last
+    digit.
+    """
     iterations = min(settings.max_iterations, _PATIENCE)
     tolerance = settings.tolerance if order == 1 or settings.order == 2 else max(settings.tolerance, _LOOSE)
     return replace(settings, order=order, max_iterations=iterations, tolerance=tolerance)

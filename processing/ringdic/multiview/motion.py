@@ -1,51 +1,48 @@
-"""The points of the reference shape through all steps: each camera follows its own, all of them make the position."""
+"""Motion of the reference shape: positions of its points at every step, from the tracks of all cameras."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Indices, Mask
-from ringdic.correlation import CorrelationSettings, Status
+from ringdic.arrays import Floats, Indices, Mask, Pixels, Points
+from ringdic.correlation import Status
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.outliers import LostPoint, grid_neighbours, surface_outliers
 from ringdic.multiview.agreement import triangulate_agreeing
-from ringdic.multiview.matching import Image
 from ringdic.multiview.shape import ReferenceShape
-from ringdic.multiview.tracking import CameraTrack, Tracking, track
+from ringdic.multiview.tracking import CameraTrack
 from ringdic.multiview.weights import smooth_sigma
 from ringdic.uncertainty.matches import match_uncertainty
 from ringdic.uncertainty.noise import camera_noise
 from ringdic.uncertainty.texture import Texture
 
-Placed = Callable[[int, Floats, Floats], Sequence[Camera]]
+#: Cameras as they stood at a step, from their pixels and standard deviations (C, n, 2) px at that step.
+PoseRefinement = Callable[[int, Pixels, Pixels], Sequence[Camera]]
 
-log = logging.getLogger(__name__)
-
-_CELL = 8  # steps of the correlation, side of the squares over which weights are levelled
-_LEAST_SIGMA = 1e-3  # px, what no match is better than
+_CELL = 8  # steps of the correlation's grid, side of the cells over which weights are smoothed
+_LEAST_SIGMA = 1e-3  # px, of the best of matches
 
 
 @dataclass(frozen=True)
 class VertexTrack:
-    """The k points that one camera followed through F steps.
+    """The k points that one camera tracked through F steps, with their uncertainty.
 
-    camera : its index. vertex : (k,) the points. px, sigma : (F, k, 2) px, sigma with all that is uncertain in it;
-    noise : (F, k, 2) px, of the displacement by the images' noise alone; weight : (F, k, 2) px, sigma level over the
-    image, by which positions are found. grey_noise : variance of the grey levels.
-    c_ls, status : (F, k). used : (F, k), whether the position rests on it.
+    camera : its index. vertex : (k,) int, the points. px : (F, k, 2) px. sigma : (F, k, 2) px, standard deviation by
+    all causes. noise : (F, k, 2) px, of the displacement by the images' noise alone. weight : (F, k, 2) px, standard
+    deviation smoothed over the image, by which positions are weighted. grey_noise : variance, grey levels². c_ls,
+    status : (F, k). used : (F, k) bool, whether the position rests on this camera.
     """
 
     camera: int
     vertex: Indices
-    px: Floats
-    sigma: Floats
-    noise: Floats
-    weight: Floats
+    px: Pixels
+    sigma: Pixels
+    noise: Pixels
+    weight: Pixels
     grey_noise: float
     c_ls: Floats
     status: NDArray[np.int8]
@@ -54,14 +51,15 @@ class VertexTrack:
 
 @dataclass(frozen=True)
 class Motion:
-    """Positions of the n points at F steps.
+    """Positions of the n points of a surface at F steps.
 
-    xyz : (F, n, 3) mm, NaN where lost. covariance : (F, n, 3, 3) mm² of the displacement since the reference.
-    chi2, degrees : (F, n). c_ls : (F, n), the largest over the cameras used. status : (F, n), 0 measured.
-    tracks : of the cameras. drift : (F, C) px, mean vertical residual of a camera: it moved between the steps.
+    xyz : (F, n, 3) mm, world frame, NaN where lost. covariance : (F, n, 3, 3) mm², of the displacement since the
+    reference. chi2, degrees : (F, n), of the triangulation. c_ls : (F, n), the largest over the cameras used. status
+    : (F, n) int, 0 where measured. tracks : of the cameras. drift : (F, C) px, mean vertical residual of each
+    camera, not zero for one that has moved between the steps.
     """
 
-    xyz: Floats
+    xyz: Points
     covariance: Floats
     chi2: Floats
     degrees: Indices
@@ -71,81 +69,57 @@ class Motion:
     drift: Floats
 
 
-def measure_motion(
-    cameras: Sequence[Camera],
-    shape: ReferenceShape,
-    image: Callable[[str, int], Image | None],
-    steps: int,
-    masks: Mapping[str, Mask],
-    correlation: CorrelationSettings,
-    options: Tracking,
-    sigma_max: float,
-    progress: Callable[[float, str], None] = lambda *_: None,
-    placed: Placed | None = None,
-) -> Motion:
-    """Follow the points in every camera that saw them at the reference and triangulate every step from all cameras.
-
-    image : gives the grey image of a camera id and a step, None where there is none. sigma_max : px, the least certain
-    match that is believed. placed : where the cameras stood at a step, by px and sigma (C, n, 2) of what they saw.
-    """
-    tracks = []
-    for k, camera in enumerate(cameras):
-        progress(k / len(cameras), f"camera {camera.id}")
-        vertex = np.flatnonzero(np.isfinite(shape.px[k, :, 0]))
-        reference = image(camera.id, 0)
-        if not len(vertex) or reference is None:
-            continue
-
-        def of_step(step: int, id_: str = camera.id) -> Image | None:
-            return image(id_, step)
-
-        def share(done: float, k: int = k, id_: str = camera.id) -> None:
-            progress((k + done) / len(cameras), f"camera {id_}")
-
-        x0 = camera.project(shape.xyz[vertex])
-        found = track(reference, of_step, steps, x0, masks.get(camera.id), correlation, options, share)
-        tracks.append(camera_track(k, x0, vertex, shape, found, correlation.step, sigma_max))
-    progress(1.0, "")
-    return motion_from(cameras, shape, tracks, steps, placed)
-
-
-def camera_track(
-    camera: int, x0: Floats, vertex: Indices, shape: ReferenceShape, found: CameraTrack, step: int, sigma_max: float
+def vertex_track(
+    camera: int, x0: Pixels, vertex: Indices, shape: ReferenceShape, track: CameraTrack, step: int, sigma_max: float
 ) -> VertexTrack:
-    """One camera's track with what its pixels are uncertain by.
+    """Complete a camera's track with the uncertainty of its pixels.
 
-    camera : its index. x0 : (k, 2) px of the points ``vertex`` (k,) at the reference. found : at all F steps, the
-    reference first. step : px, of the correlation.
+    Parameters
+    ----------
+    camera : index of the camera.
+    x0 : (k, 2) float64, px, of the points at the reference.
+    vertex : (k,) int, which points of the shape they are.
+    track : at all F steps, the reference first.
+    step : px, of the correlation's grid.
+    sigma_max : px, greatest standard deviation of a match that is believed.
     """
     with np.errstate(invalid="ignore"):
-        uncertain = (found.status == 0) & (found.sigma > sigma_max).any(axis=2)
-    status = np.where(uncertain, LostPoint.UNCERTAIN, found.status).astype(np.int8)
+        uncertain = (track.status == 0) & (track.sigma > sigma_max).any(axis=2)
+    status = np.where(uncertain, LostPoint.UNCERTAIN, track.status).astype(np.int8)
     texture = shape.textures[camera].part(vertex)
-    variance = camera_noise(float(shape.grey_noise[camera]), found.c_ls[1:], texture.contrast)
-    noise, sigma = _parted(found, texture, variance)
+    variance = camera_noise(float(shape.grey_noise[camera]), track.c_ls[1:], texture.contrast)
+    noise, sigma = _parted(track, texture, variance)
     weight = np.stack([smooth_sigma(x0, np.maximum(one, _LEAST_SIGMA), _CELL * step) for one in sigma])
     used = np.zeros(status.shape, bool)
-    return VertexTrack(camera, vertex, found.px, sigma, noise, weight, variance, found.c_ls, status, used)
+    return VertexTrack(camera, vertex, track.px, sigma, noise, weight, variance, track.c_ls, status, used)
 
 
-def _parted(found: CameraTrack, texture: Texture, variance: float) -> tuple[Floats, Floats]:
-    """Standard deviations (F, k, 2) px of the displacements by noise alone, and by all."""
-    noise, total = np.zeros_like(found.sigma), np.zeros_like(found.sigma)
-    for step in range(1, len(found.px)):
-        parts = match_uncertainty(found.sigma[step], found.c_ls[step], (texture, texture), (variance, variance))
+def _parted(track: CameraTrack, texture: Texture, variance: float) -> tuple[Floats, Floats]:
+    """Standard deviations (F, k, 2) px of the displacements: by noise alone and by all causes.
+
+    variance : of the noise, grey levels².
+    """
+    noise, total = np.zeros_like(track.sigma), np.zeros_like(track.sigma)
+    for step in range(1, len(track.px)):
+        parts = match_uncertainty(track.sigma[step], track.c_ls[step], (texture, texture), (variance, variance))
         noise[step] = np.hypot(parts.reference, parts.current)
         total[step] = np.hypot(noise[step], parts.systematic)
     return noise, total
 
 
-def motion_from(
+def surface_motion(
     cameras: Sequence[Camera],
     shape: ReferenceShape,
     tracks: Sequence[VertexTrack],
     steps: int,
-    placed: Placed | None = None,
+    refine_poses: PoseRefinement | None = None,
 ) -> Motion:
-    """The points placed at every step from the tracks of the cameras; placed : see :func:`measure_motion`."""
+    """Triangulate the points of a shape at every step from the tracks of all cameras.
+
+    tracks : of the cameras that see any of the points. steps : their number. refine_poses : gives the cameras as
+    they stood at a step, from the pixels and standard deviations (C, n, 2) px of that step; None: they have not
+    moved.
+    """
     n, count = len(shape.xyz), len(cameras)
     motion = Motion(
         xyz=np.full((steps, n, 3), np.nan),
@@ -161,30 +135,32 @@ def motion_from(
     for one in tracks:
         one.used[0] = True
     for step in range(1, steps):
-        _step(cameras, shape, motion, step, placed)
+        _step(cameras, shape, motion, step, refine_poses)
     return motion
 
 
-def _step(cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, step: int, placed: Placed | None) -> None:
-    """Fill one step of the motion."""
+def _step(
+    cameras: Sequence[Camera], shape: ReferenceShape, motion: Motion, step: int, refine_poses: PoseRefinement | None
+) -> None:
+    """Compute one step of the motion, in place."""
     n, count = len(shape.xyz), len(cameras)
     px, sigma = np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan)
     c_ls = np.full((count, n), np.nan)
     status = np.full(n, Status.NOT_REACHED, np.int8)
     for one in motion.tracks:
         good = one.status[step] == 0
-        who = one.vertex[good]
-        px[one.camera, who] = one.px[step, good]
-        sigma[one.camera, who] = one.weight[step, good]
-        c_ls[one.camera, who] = one.c_ls[step, good]
+        vertices = one.vertex[good]
+        px[one.camera, vertices] = one.px[step, good]
+        sigma[one.camera, vertices] = one.weight[step, good]
+        c_ls[one.camera, vertices] = one.c_ls[step, good]
         status[one.vertex[~good]] = one.status[step, ~good]
-    if placed is not None:
-        cameras = placed(step, px, sigma)
+    if refine_poses is not None:
+        cameras = refine_poses(step, px, sigma)
     points, used = triangulate_agreeing(cameras, px, sigma)
     enough: Mask = np.asarray(np.isfinite(px[..., 0]).sum(axis=0) >= 2)
-    lost: Mask = np.asarray(~np.isfinite(points.xyz).all(axis=1))
-    status = np.where(lost, np.where(enough, LostPoint.RESIDUAL, status), 0).astype(np.int8)
-    moved = np.where(lost[:, None], np.nan, points.xyz - shape.xyz)
+    is_lost: Mask = np.asarray(~np.isfinite(points.xyz).all(axis=1))
+    status = np.where(is_lost, np.where(enough, LostPoint.RESIDUAL, status), 0).astype(np.int8)
+    moved = np.where(is_lost[:, None], np.nan, points.xyz - shape.xyz)
     status = np.where(surface_outliers(grid_neighbours(shape.node.astype(float), 1), moved), LostPoint.SURFACE, status)
     measured: Mask = np.asarray(status == 0)
     used &= measured

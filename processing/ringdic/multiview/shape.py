@@ -1,10 +1,10 @@
-"""The reference shape: all cameras' reference images to one set of points and the triangles between them.
+"""Measurement of the reference shape: from all cameras' reference images to one set of points and triangles.
 
-Sweeps of the camera pairs find the surface roughly. Then the nodes of a lattice over it, or where it is close every
-second either way, are matched from the camera that faces them to two others, with second-order subsets; the radius so
-measured is fitted with smooth pieces, which give every subset its start value and the curvature of its warp and reach a
-little beyond the rim. With that curvature held, all cameras that see a node are matched to first order, which is free
-of the bias of flat subsets and of the noise of curved ones.
+Sweeps of the camera pairs give a first rough surface and a lattice over it. The nodes of the lattice (of a dense one,
+every second in either direction) are matched from the camera that faces them to two others, with second-order subsets.
+Smooth pieces fitted to the radius measured so give every subset its start value and the curvature of its warp, and
+reach a little beyond the rim. With that curvature held fixed, all cameras that see a node are matched to first order,
+which is free of the bias of flat subsets and of the noise of curved ones.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Image, Indices, Mask, Pixels, Points
 from ringdic.correlation import CorrelationSettings, Status
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
@@ -26,35 +26,35 @@ from ringdic.geometry.outliers import LostPoint
 from ringdic.multiview.agreement import triangulate_agreeing
 from ringdic.multiview.depth import lay_lattice, px_per_mm, rough_surface
 from ringdic.multiview.lattice import Pieces, SurfaceLattice, evaluate, robust_pieces
-from ringdic.multiview.matching import Image, NodeMatches, ReferenceImages, match_nodes
+from ringdic.multiview.matching import NodeMatches, ReferenceImages, match_nodes
 from ringdic.multiview.tube import lattice_faces
-from ringdic.multiview.views import seen
+from ringdic.multiview.views import visibility
 from ringdic.multiview.weights import smooth_sigma
-from ringdic.sweep.sweep import Search, radii_of, sweep
+from ringdic.sweep.sweep import DepthSearch, search_radii, sweep_depths
 from ringdic.uncertainty.texture import Texture, TextureMap
 
 log = logging.getLogger(__name__)
 
 _RETRIES = 3
-_EVERY = 2  # of this many columns, and rows, one has the nodes that the pieces are first fitted to
-_IN_PIECE = 20  # nodes that a piece is fitted to at the least
-_PIECE = 6  # places of a sweep that hang together: an obstacle may part the surface in several
-_FEW = 1e-3  # share of the points below which another retry is not worth it
-_REFERENCES = 3  # cameras a node is matched from, one after the other, before it is lost
+_EVERY = 2  # columns, and rows, from one node of the first pass to the next on a dense lattice
+_IN_PIECE = 20  # fewest nodes within reach of a piece
+_PIECE = 6  # fewest connected positions of a sweep that are believed: an obstacle may divide the surface
+_FEW = 1e-3  # share of the nodes that another retry must gain
+_REFERENCES = 3  # cameras that a node is matched from, one after the other, before it is given up
 
-_CELL = 8  # steps of the correlation, side of the squares over which weights are levelled
-_NOTHING = TextureMap(np.full((1, 1, 5), np.nan, np.float32), 1, (1, 1))  # of a camera without an image
+_CELL = 8  # steps of the correlation's grid, side of the cells over which weights are smoothed
+_UNKNOWN_TEXTURE = TextureMap(np.full((1, 1, 5), np.nan, np.float32), 1, (1, 1))  # of a camera without an image
 
 
 @dataclass(frozen=True)
 class ShapeSettings:
-    """How the reference shape is measured. Lengths mm, angles degrees.
+    """Settings of the reference shape's measurement. Lengths mm, angles degrees.
 
-    incidence : the steepest view that is used. spacing : of the lattice, 0 for the correlation's step as the cameras
-    see it. curvature : "geometry" holds the second derivatives that the measured shape gives each warp; "none" leaves
-    flat subsets flat. piece : reach of the smooth pieces. sigma_max : px, the least certain match that is believed.
-    floor : px, what a pixel is uncertain by beside noise and what the images' difference shows: the cameras, and a
-    shape that bends otherwise than its pieces do.
+    incidence : steepest angle of a view that is used. spacing : of the lattice, 0 for the correlation's step as the
+    cameras see it. curvature : "geometry" to hold the second derivatives that the measured shape gives each warp,
+    "none" for flat subsets. piece : reach of the smooth pieces. sigma_max : px, greatest standard deviation of a
+    match that is believed. floor : px, standard deviation of a pixel by what neither noise nor the difference of the
+    images shows: the cameras, and a shape that bends otherwise than its pieces do.
     """
 
     incidence: float = 65.0
@@ -67,23 +67,24 @@ class ShapeSettings:
 
 @dataclass(frozen=True)
 class ReferenceShape:
-    """The measured nodes of the surface and the triangles between them. n points, C cameras, M triangles.
+    """Measured points of a surface at the reference and the triangles between them: n points, C cameras, M triangles.
 
-    xyz : (n, 3) mm. node : (n, 2) column and row on the lattice. reference : (n,) index of the camera that the point
-    was matched from, where it lies on a whole pixel. px, sigma : (C, n, 2), NaN for a camera that was not used; sigma
-    with all that is uncertain in it and level over the image, noise : (C, n, 2) px, of each image's noise alone.
-    textures, grey_noise : of each camera's image at px, and its variance, NaN where it has none. covariance :
-    (n, 3, 3) mm². chi2, degrees : (n,). c_ls : (n,), the largest over the cameras.
-    faces : (M, 3), outwards. pieces : the surface as fitted. status : (columns, rows) of all nodes, 0 where measured;
-    NOT_REACHED also where there is no surface. made, seconds : matches and the time they took.
+    xyz : (n, 3) mm, world frame. node : (n, 2) int, column and row on the lattice. reference : (n,) int, index of the
+    camera that each point was matched from and in which it lies on a whole pixel. px : (C, n, 2) px, NaN for a
+    camera that was not used. sigma : (C, n, 2) px, standard deviation by all causes, smoothed over the image. noise
+    : (C, n, 2) px, by the noise of each image alone. textures : of each camera's image at px. grey_noise : (C,),
+    variance of each camera's noise, grey levels², NaN where it has no image. covariance : (n, 3, 3) mm². chi2,
+    degrees : (n,), of the triangulation. c_ls : (n,), the largest over the cameras. faces : (M, 3) int, normals
+    outwards. pieces : the fitted surface. status : (columns, rows) of all nodes, 0 where measured, NOT_REACHED also
+    where there is no surface. match_count : number of matches that were computed.
     """
 
-    xyz: Floats
+    xyz: Points
     node: Indices
     reference: Indices
-    px: Floats
-    sigma: Floats
-    noise: Floats
+    px: Pixels
+    sigma: Pixels
+    noise: Pixels
     textures: tuple[Texture, ...]
     grey_noise: Floats
     covariance: Floats
@@ -93,11 +94,10 @@ class ReferenceShape:
     faces: Indices
     pieces: Pieces
     status: NDArray[np.int8]
-    made: int
-    seconds: float
+    match_count: int
 
     def arrays(self) -> dict[str, NDArray]:
-        """All of it by name."""
+        """Arrays of the shape by name, of any shape and unit as listed for the class, as a task's output holds them."""
         lattice = self.pieces.lattice
         parts = {
             "lattice": np.array([lattice.radius, lattice.columns, *lattice.z]),
@@ -111,7 +111,7 @@ class ReferenceShape:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray]) -> ReferenceShape:
-        """From what ``arrays`` gave."""
+        """Shape from the arrays, (...) of any unit, that :meth:`arrays` gave."""
         radius, columns, *z = arrays["lattice"].tolist()
         lattice = SurfaceLattice(radius, int(columns), np.array(z))
         textures = tuple(
@@ -120,7 +120,7 @@ class ReferenceShape:
         )
         plain: dict[str, Any] = {each.name: arrays[each.name] for each in fields(cls) if each.name in arrays}
         pieces = Pieces(lattice, arrays["coefficients"], arrays["support"])
-        plain |= {"made": int(arrays["made"]), "seconds": float(arrays["seconds"])}
+        plain["match_count"] = int(arrays["match_count"])
         return cls(**plain, pieces=pieces, textures=textures)
 
 
@@ -129,66 +129,71 @@ def reference_shape(
     image: Callable[[str], Image | None],
     masks: Mapping[str, Mask],
     pairs: Sequence[tuple[int, int]],
-    search: Search,
+    search: DepthSearch,
     correlation: CorrelationSettings,
     settings: ShapeSettings | None = None,
-    progress: Callable[[float, str], None] = lambda *_: None,
 ) -> ReferenceShape:
     """Measure the surface in the reference images of all cameras.
 
-    image : gives a camera id's grey reference image, None where there is none: that camera takes no part. masks :
-    regions drawn by the user, by camera id. pairs : indices of neighbouring cameras, for the sweeps.
+    Parameters
+    ----------
+    cameras : the C calibrated cameras.
+    image : gives the grey reference image of a camera id, (height, width), or None; a camera without one takes no part.
+    masks : (height, width) bool, regions drawn by the user, by camera id.
+    pairs : indices of neighbouring cameras, for the sweeps.
+    search : where the surface may lie, mm.
+    correlation : of the subsets.
+    settings : of the shape; None for the defaults.
+
     Raises ComputationError where no two cameras share a textured surface.
     """
     settings = settings or ShapeSettings()
-    ring = ReferenceImages(cameras, image, masks, correlation)
-    samples = _samples(ring, pairs, search, lambda share: progress(0.3 * share, "searching for the surface"))
+    images = ReferenceImages(cameras, image, masks, correlation)
+    samples = _samples(images, pairs, search)
     lattice = lay_lattice(samples, settings.spacing or _spacing(cameras, samples, correlation))
-    surface = _Surface(ring, settings, rough_surface(lattice, samples))
+    surface = _Surface(images, settings, rough_surface(lattice, samples))
     surface.thin = math.pi * settings.piece**2 >= _IN_PIECE * _EVERY**2 * math.prod(lattice.spacing)
-    surface.measure(2, 2, lambda share: progress(0.3 + 0.2 * share, "first pass"))
+    surface.measure(2, 2)
     surface.fit()
-    surface.retry(2, 2, lambda share: progress(0.5 + 0.05 * share, "first pass, lost points"))
+    surface.retry(2, 2)
     surface.thin = False
-    surface.measure(correlation.order, len(cameras), lambda share: progress(0.55 + 0.4 * share, "all views"))
+    surface.measure(correlation.order, len(cameras))
     surface.fit()
-    surface.retry(correlation.order, len(cameras), lambda share: progress(0.95 + 0.05 * share, "lost points"))
+    surface.retry(correlation.order, len(cameras))
     return surface.result()
 
 
-def _spacing(cameras: Sequence[Camera], samples: Floats, correlation: CorrelationSettings) -> float:
+def _spacing(cameras: Sequence[Camera], samples: Points, correlation: CorrelationSettings) -> float:
+    """Spacing of the lattice, mm, at which its nodes lie one step of the correlation apart in the images."""
     radius = float(np.median(np.hypot(samples[:, 0], samples[:, 1])))
     return correlation.step / px_per_mm(cameras, radius)
 
 
-def _samples(
-    ring: ReferenceImages, pairs: Sequence[tuple[int, int]], search: Search, progress: Callable[[float], None]
-) -> Floats:
-    """Places (n, 3) mm where the sweeps of the pairs found the surface."""
-    found = []
-    for k, (a, b) in enumerate(pairs):
-        progress(k / len(pairs))
-        cameras = (ring.cameras[a], ring.cameras[b])
-        mask = ring.masks.get(cameras[0].id)
-        radii = radii_of(cameras, search)
-        seen_at = sweep(cameras, ring.grey(a), ring.current(b), mask, radii, search, ring.settings, _PIECE)
-        found.append(seen_at.xyz[seen_at.good])
-        log.debug("cameras %s, %s: %d places of the surface", cameras[0].id, cameras[1].id, len(found[-1]))
-    samples = np.concatenate(found)
-    if len(samples) < 12:
+def _samples(images: ReferenceImages, pairs: Sequence[tuple[int, int]], search: DepthSearch) -> Points:
+    """Positions (n, 3) mm of the surface from depth sweeps of the camera pairs."""
+    samples = []
+    for a, b in pairs:
+        cameras = (images.cameras[a], images.cameras[b])
+        mask = images.masks.get(cameras[0].id)
+        radii = search_radii(cameras, search)
+        depths = sweep_depths(cameras, images.grey(a), images.current(b), mask, radii, search, images.settings, _PIECE)
+        samples.append(depths.xyz[depths.good])
+        log.debug("cameras %s, %s: %d places of the surface", cameras[0].id, cameras[1].id, len(samples[-1]))
+    samples_of_all = np.concatenate(samples)
+    if len(samples_of_all) < 12:
         raise ComputationError(
             "no textured surface that two neighbouring cameras both see was found; check that the specimen is speckled "
             "and stands where the target stood, that masks cover it, and that the images are in focus"
         )
-    return samples
+    return samples_of_all
 
 
 class _Surface:
-    """The surface while it is being measured: what is known of each node."""
+    """The surface while it is measured: for each node of the lattice what is known so far."""
 
-    def __init__(self, ring: ReferenceImages, settings: ShapeSettings, pieces: Pieces) -> None:
-        count, (columns, rows) = len(ring.cameras), pieces.lattice.shape
-        self.ring, self.settings, self.pieces = ring, settings, pieces
+    def __init__(self, images: ReferenceImages, settings: ShapeSettings, pieces: Pieces) -> None:
+        count, (columns, rows) = len(images.cameras), pieces.lattice.shape
+        self.images, self.settings, self.pieces = images, settings, pieces
         self.xyz = np.full((columns, rows, 3), np.nan)
         self.px = np.full((count, columns, rows, 2), np.nan)
         self.sigma = np.full((count, columns, rows, 2), np.nan)
@@ -199,95 +204,97 @@ class _Surface:
         self.c_ls = np.full((columns, rows), np.nan)
         self.reference = np.full((columns, rows), -1, np.int64)
         self.status = np.full((columns, rows), Status.NOT_REACHED, np.int8)
-        self.tries, self.tried = np.zeros((columns, rows), np.int64), np.zeros((columns, rows), bool)
-        self.made, self.seconds = 0, 0.0
-        self.thin = False  # some of the nodes alone
+        self.failures, self.attempted = np.zeros((columns, rows), np.int64), np.zeros((columns, rows), bool)
+        self.match_count = 0
+        self.thin = False  # measure only every _EVERYth node either way
 
     @property
     def known(self) -> Mask:
-        """Measured nodes. (columns, rows)."""
+        """Measured nodes, (columns, rows)."""
         return self.status == Status.GOOD
 
-    def measure(self, order: int, views: int, progress: Callable[[float], None], only_lost: bool = False) -> int:
-        """Match the nodes that have a piece in up to so many cameras beside the reference; how many are new.
+    def measure(self, order: int, views: int, only_lost: bool = False) -> int:
+        """Match the nodes that have a smooth piece and triangulate them; the number of nodes that were gained.
 
-        A node is matched from the camera that faces it, or, where that failed, from the next: an obstacle or a
-        reflection in one camera leaves the others.
+        A node is matched from the camera that faces it, or, where that failed, from the next: what hides it or
+        glares in one camera spares the others. order : of the subsets. views : most cameras beside the reference
+        camera that a node is matched to.
         """
-        ring, settings = self.ring, self.settings
-        sight, cosine = seen(self.pieces, ring.cameras, ring.masks, settings.incidence, 2.0)
-        for k, camera in enumerate(ring.cameras):
-            if ring.image(camera.id) is None:
-                sight[k] = False
-            elif sight[k].any():
-                ring.look_at(k, camera.project(self.pieces.xyz[sight[k]]))
-        wanted = (sight.sum(axis=0) >= 2) & np.isfinite(self.pieces.radius)
+        images, settings = self.images, self.settings
+        visible, cosine = visibility(self.pieces, images.cameras, images.masks, settings.incidence, 2.0)
+        for k, camera in enumerate(images.cameras):
+            if images.image(camera.id) is None:
+                visible[k] = False
+            elif visible[k].any():
+                images.look_at(k, camera.project(self.pieces.xyz[visible[k]]))
+        chosen = (visible.sum(axis=0) >= 2) & np.isfinite(self.pieces.radius)
         if self.thin:
-            wanted &= _some(self.pieces.lattice.shape)
+            chosen &= _some(self.pieces.lattice.shape)
         if only_lost:
-            wanted &= ~self.known
-            self.tries[wanted & self.tried] += 1
-            wanted &= self.tries < _REFERENCES
-        self.tried |= wanted
-        nodes = _indices(wanted)
+            chosen &= ~self.known
+            self.failures[chosen & self.attempted] += 1
+            chosen &= self.failures < _REFERENCES
+        self.attempted |= chosen
+        nodes = _indices(chosen)
         if not len(nodes[0]):
             return 0
-        rank = np.where(sight, cosine, -1.0)[:, wanted]
+        rank = np.where(visible, cosine, -1.0)[:, chosen]
         best_first = np.argsort(-rank, axis=0)
-        turn = self.tries[wanted] % np.minimum((rank > 0).sum(axis=0), _REFERENCES)
-        reference = best_first[turn, np.arange(len(turn))]
-        order_of = np.argsort(best_first, axis=0)
-        partners = (rank > 0) & (order_of <= views) & (np.arange(len(rank))[:, None] != reference)
+        choice = self.failures[chosen] % np.minimum((rank > 0).sum(axis=0), _REFERENCES)
+        reference = best_first[choice, np.arange(len(choice))]
+        rank_of = np.argsort(best_first, axis=0)
+        partners = (rank > 0) & (rank_of <= views) & (np.arange(len(rank))[:, None] != reference)
         curved = settings.curvature == "geometry" or order == 2
-        found = match_nodes(
-            ring, self.pieces, nodes, reference, partners, order=order, curved=curved, progress=progress
-        )
+        matches = match_nodes(images, self.pieces, nodes, reference, partners, order=order, curved=curved)
         before = int(self.known.sum())
-        self._keep(nodes, reference, found)
-        self.made, self.seconds = self.made + found.made, self.seconds + found.seconds
+        self._store(nodes, reference, matches)
+        self.match_count += matches.count
         log.debug("order %d: %d of %d nodes measured", order, int(self.known[nodes].sum()), len(nodes[0]))
         return int(self.known.sum()) - before
 
-    def retry(self, order: int, views: int, progress: Callable[[float], None]) -> None:
-        """Match the lost nodes again, and those a little beyond the rim, until few are gained."""
-        for k in range(_RETRIES):
-            progress(k / _RETRIES)
-            gained = self.measure(order, views, lambda _: None, only_lost=True)
+    def retry(self, order: int, views: int) -> None:
+        """Match the lost nodes, and those a little beyond the rim, again until few are gained."""
+        for _ in range(_RETRIES):
+            gained = self.measure(order, views, only_lost=True)
             if self.fit() == 0 and gained < _FEW * self.known.sum():
                 return
 
     def fit(self) -> int:
-        """Smooth pieces through the measured nodes; a node off its piece is lost. How many were."""
+        """Fit smooth pieces to the measured nodes and mark nodes off them as lost; the number of these."""
         lattice = self.pieces.lattice
         radius = self._node_radius()
         density = 1.0 / _EVERY**2 if self.thin else 1.0
-        self.pieces, kept = robust_pieces(lattice, radius, self.settings.piece, density=density)
-        off = self.known & ~kept
+        self.pieces, agreeing = robust_pieces(lattice, radius, self.settings.piece, density=density)
+        off = self.known & ~agreeing
         self.status[off] = LostPoint.SURFACE
         self.xyz[off] = np.nan
         return int(off.sum())
 
     def _node_radius(self) -> Floats:
-        """Radius at the nodes from points measured near them: what is left to the piece is the same at both."""
-        lattice, coefficients = self.pieces.lattice, self.pieces.coefficients
-        theta, z = lattice.places
-        x, y, height = np.moveaxis(self.xyz, -1, 0)
-        there, _, _ = evaluate(coefficients, lattice.arc(np.arctan2(y, x), theta), height - z)
-        return np.hypot(x, y) - there + coefficients[..., 0]
+        """Radius at the nodes, (columns, rows) mm, from points measured near them.
 
-    def _keep(self, nodes: tuple[Indices, Indices], reference: Indices, found: NodeMatches) -> None:
-        settings, cameras = self.settings, self.ring.cameras
-        sigma = np.sqrt(found.noise**2 + found.systematic**2 + settings.floor**2)
+        A point lies beside its node by less than a pixel; the radius changes between the two as the smooth piece does.
+        """
+        lattice, coefficients = self.pieces.lattice, self.pieces.coefficients
+        theta, z = lattice.coordinates
+        x, y, height = np.moveaxis(self.xyz, -1, 0)
+        predicted, _, _ = evaluate(coefficients, lattice.arc(np.arctan2(y, x), theta), height - z)
+        return np.hypot(x, y) - predicted + coefficients[..., 0]
+
+    def _store(self, nodes: tuple[Indices, Indices], reference: Indices, matches: NodeMatches) -> None:
+        """Triangulate the matches of some nodes and store the result."""
+        settings, cameras = self.settings, self.images.cameras
+        sigma = np.sqrt(matches.noise**2 + matches.systematic**2 + settings.floor**2)
         with np.errstate(invalid="ignore"):
             uncertain: Mask = np.asarray((sigma > settings.sigma_max).any(axis=2))
-        uncertain[reference, np.arange(len(reference))] = False  # its pixel names the point
-        px = np.where(uncertain[..., None], np.nan, found.px)
-        cell = _CELL * self.ring.settings.step
+        uncertain[reference, np.arange(len(reference))] = False  # its pixel defines the point
+        px = np.where(uncertain[..., None], np.nan, matches.px)
+        cell = _CELL * self.images.settings.step
         sigma = np.stack([smooth_sigma(at, own, cell) for at, own in zip(px, sigma, strict=True)])
         points, used = triangulate_agreeing(cameras, px, sigma, reference)
-        status = np.where(found.status != 0, found.status, 0)
+        status = np.where(matches.status != 0, matches.status, 0)
         status = np.where((status == 0) & ~np.isfinite(points.xyz).all(axis=1), LostPoint.RESIDUAL, status)
-        few = (np.isfinite(found.px[..., 0]) & ~uncertain).sum(axis=0) < 2
+        few = (np.isfinite(matches.px[..., 0]) & ~uncertain).sum(axis=0) < 2
         status = np.where((status == LostPoint.RESIDUAL) & few & uncertain.any(axis=0), LostPoint.UNCERTAIN, status)
         good = status == 0
         used &= good
@@ -296,18 +303,18 @@ class _Surface:
         self.xyz[nodes] = np.where(good[:, None], points.xyz, np.nan)
         self.px[:, nodes[0], nodes[1]] = np.where(used[..., None], px, np.nan)
         self.sigma[:, nodes[0], nodes[1]] = np.where(used[..., None], sigma, np.nan)
-        self.noise[:, nodes[0], nodes[1]] = np.where(used[..., None], found.noise, np.nan)
+        self.noise[:, nodes[0], nodes[1]] = np.where(used[..., None], matches.noise, np.nan)
         self.covariance[nodes] = points.covariance
         self.chi2[nodes], self.degrees[nodes] = points.chi2, points.degrees
-        self.c_ls[nodes] = np.nanmax(np.where(used, found.c_ls, -np.inf), axis=0)
+        self.c_ls[nodes] = np.nanmax(np.where(used, matches.c_ls, -np.inf), axis=0)
 
     def result(self) -> ReferenceShape:
-        """What was measured, without points off the surface and without points in no triangle."""
+        """The measured shape, without points off the surface and without points in no triangle."""
         if not self.known.any():
             raise ComputationError("no point of the surface could be measured in two cameras; check focus and speckle")
         faces, used = lattice_faces(self.xyz)
         node = np.stack(used, axis=1)
-        px, ring = self.px[:, used[0], used[1]], self.ring
+        px, images = self.px[:, used[0], used[1]], self.images
         sees = np.isfinite(px).any(axis=(1, 2))
         return ReferenceShape(
             xyz=self.xyz[used],
@@ -316,8 +323,8 @@ class _Surface:
             px=px,
             sigma=self.sigma[:, used[0], used[1]],
             noise=self.noise[:, used[0], used[1]],
-            textures=tuple(ring.texture(k, one) if sees[k] else _NOTHING.at(one) for k, one in enumerate(px)),
-            grey_noise=np.array([ring.noise(k) if sees[k] else np.nan for k in range(len(px))]),
+            textures=tuple(images.texture(k, one) if sees[k] else _UNKNOWN_TEXTURE.at(one) for k, one in enumerate(px)),
+            grey_noise=np.array([images.noise(k) if sees[k] else np.nan for k in range(len(px))]),
             covariance=self.covariance[used],
             chi2=self.chi2[used],
             degrees=self.degrees[used],
@@ -325,18 +332,18 @@ class _Surface:
             faces=faces,
             pieces=self.pieces,
             status=self.status,
-            made=self.made,
-            seconds=self.seconds,
+            match_count=self.match_count,
         )
 
 
 def _some(shape: tuple[int, int]) -> Mask:
-    """The nodes (columns, rows) that are measured first where the lattice is close."""
+    """Nodes (columns, rows) of a dense lattice that are measured first."""
     out = np.zeros(shape, bool)
     out[::_EVERY, ::_EVERY] = True
     return out
 
 
 def _indices(which: Mask) -> tuple[Indices, Indices]:
+    """Columns and rows of the nodes in a mask (columns, rows)."""
     columns, rows = np.nonzero(which)
     return columns, rows

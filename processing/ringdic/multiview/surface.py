@@ -1,98 +1,47 @@
-"""One surface from all cameras at once: from calibrated cameras and images to results.
+"""One surface from all cameras at once: the reference shape and the cameras' tracks combined into results.
 
-The reference shape is measured first, then its points are followed by every camera against its own reference image
-and placed by all cameras together. The pair of a point is the two cameras that face it most squarely.
+The points of the reference shape are tracked by every camera against its own reference image and triangulated from all
+cameras together. The camera pair of a point is formed by the two cameras that face it most squarely.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ringdic.arrays import Floats, Image, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Pixels
 from ringdic.calibration.refined_cameras import RefinedCameras
-from ringdic.correlation import CorrelationSettings, Status
+from ringdic.correlation import Status
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.outliers import LostPoint
 from ringdic.geometry.triangulation import reprojection_residuals
-from ringdic.multiview.motion import Motion, VertexTrack, camera_track, measure_motion, motion_from
-from ringdic.multiview.shape import ReferenceShape, ShapeSettings, reference_shape
+from ringdic.multiview.motion import Motion, VertexTrack, surface_motion, vertex_track
+from ringdic.multiview.shape import ReferenceShape, ShapeSettings
 from ringdic.multiview.tracking import CameraTrack, Tracking
 from ringdic.multiview.uncertainty import surface_uncertainty
 from ringdic.multiview.views import incidence
 from ringdic.results.results import Matches, Results
 from ringdic.settings import Settings
-from ringdic.sweep.sweep import Search
-
-Tell = Callable[[float, str, str], None]
-
-_SHAPE_SHARE = 0.5  # of the time, with few steps
 
 
 @dataclass(frozen=True)
-class RingSurface:
-    """Results, how well the cameras agree, and a sentence for each that took no part.
+class MultiviewSurface:
+    """Results of a surface measured by all cameras, how well the cameras agree, and warnings for the operator.
 
-    drift : (F,) px for each camera, the mean vertical residual of each step. agreement : views a point, RMS residual of
-    the cameras at the reference (px), the places of the surface that two cameras see and none could be matched in, by
-    the reason, and the steps at which cameras were seen to have moved.
+    drift : (F,) px for each camera id, mean vertical residual at each step. agreement : mean number of views of a
+    point, RMS residual of the cameras at the reference (px), spacing of the lattice (mm), numbers of lost nodes by
+    reason, and the steps at which cameras were found to have moved. warnings : a sentence for each camera that took
+    no part or moved.
     """
 
     results: Results
     drift: dict[str, Floats]
     agreement: dict[str, Any]
     warnings: list[str]
-
-
-def ring_surface(
-    rig: str,
-    cameras: Sequence[Camera],
-    pairs: Sequence[tuple[str, str]],
-    image: Callable[[str, int], Image | None],
-    masks: Mapping[str, Mask],
-    steps: Sequence[str],
-    search: Search,
-    settings: Settings,
-    tell: Tell = lambda *_: None,
-) -> RingSurface:
-    """Measure the surface that all cameras see, and its motion through the steps.
-
-    pairs : ids of neighbouring cameras. image : the grey image of a camera id and a step, None where there is none.
-    masks : drawn regions by camera id. steps : names, the reference first. tell(share, what, rate) is told progress.
-    Raises ComputationError where no two cameras share a textured surface.
-    """
-    correlation = CorrelationSettings(**settings.correlation.keywords)
-    shape_share = _SHAPE_SHARE if len(steps) > 1 else 1.0
-    shape = reference_shape(
-        cameras,
-        lambda id_: image(id_, 0),
-        masks,
-        numbers_of(cameras, pairs),
-        search,
-        correlation,
-        shape_settings(settings),
-        lambda share, what: tell(shape_share * share, what, ""),
-    )
-    _require_faces(shape)
-    rate = f"{shape.made / shape.seconds:,.0f} points/s" if shape.seconds else ""
-    steadied = RefinedCameras(cameras)
-    motion = measure_motion(
-        cameras,
-        shape,
-        image,
-        len(steps),
-        masks,
-        correlation,
-        tracking_of(settings),
-        settings.surface.sigma_max_px,
-        lambda share, what: tell(shape_share + (1 - shape_share) * share, what, rate),
-        steadied if settings.calibration.refine_poses else None,
-    )
-    return _found(rig, cameras, pairs, steps, shape, motion, steadied, settings)
 
 
 def surface_of_tracks(
@@ -103,34 +52,50 @@ def surface_of_tracks(
     shape: ReferenceShape,
     tracks: Mapping[int, CameraTrack],
     settings: Settings,
-) -> RingSurface:
-    """The same from the reference shape and each camera's track through all steps, by its index."""
+) -> MultiviewSurface:
+    """Combine the reference shape and the cameras' tracks into the results of a surface.
+
+    Parameters
+    ----------
+    rig : its name.
+    cameras : all C cameras that have a reference image.
+    pairs : ids of neighbouring cameras.
+    steps : names of the F steps, the reference first.
+    shape : of the surface at the reference.
+    tracks : through all F steps, by index of the camera.
+    settings : of the run.
+
+    Raises ComputationError where the shape has no triangle.
+    """
     _require_faces(shape)
     step, sigma_max = settings.correlation.step_px, settings.surface.sigma_max_px
-    followed = []
-    for k, found in tracks.items():
-        vertex, x0 = reference_places(cameras[k], shape, k)
-        followed.append(camera_track(k, x0, vertex, shape, found, step, sigma_max))
-    steadied = RefinedCameras(cameras)
-    placed = steadied if settings.calibration.refine_poses else None
-    motion = motion_from(cameras, shape, followed, len(steps), placed)
-    return _found(rig, cameras, pairs, steps, shape, motion, steadied, settings)
+    vertex_tracks = []
+    for k, track in tracks.items():
+        vertex, x0 = reference_pixels(cameras[k], shape, k)
+        vertex_tracks.append(vertex_track(k, x0, vertex, shape, track, step, sigma_max))
+    poses = RefinedCameras(cameras)
+    refine_poses = poses if settings.calibration.refine_poses else None
+    motion = surface_motion(cameras, shape, vertex_tracks, len(steps), refine_poses)
+    return _assembled(rig, cameras, pairs, steps, shape, motion, poses, settings)
 
 
-def reference_places(camera: Camera, shape: ReferenceShape, k: int) -> tuple[Indices, Floats]:
-    """The points (n,) that camera k saw at the reference, and the pixels (n, 2) from which it follows them."""
+def reference_pixels(camera: Camera, shape: ReferenceShape, k: int) -> tuple[Indices, Pixels]:
+    """Points of the shape that camera number k saw, and the pixels from which it tracks them.
+
+    Returns indices (n,) int of the points, and their projections (n, 2) float64, px, into the reference image.
+    """
     vertex = np.flatnonzero(np.isfinite(shape.px[k, :, 0]))
     return vertex, camera.project(shape.xyz[vertex])
 
 
-def numbers_of(cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
-    """The pairs by the cameras' indices."""
+def pair_indices(cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
+    """Indices of the two cameras of each pair of camera ids."""
     ids = [camera.id for camera in cameras]
     return [(ids.index(first), ids.index(second)) for first, second in pairs]
 
 
 def shape_settings(settings: Settings) -> ShapeSettings:
-    """How the reference shape is measured."""
+    """Settings of the reference shape from those of a run."""
     return ShapeSettings(
         incidence=settings.surface.incidence_deg,
         spacing=settings.surface.spacing_mm,
@@ -140,51 +105,54 @@ def shape_settings(settings: Settings) -> ShapeSettings:
 
 
 def _require_faces(shape: ReferenceShape) -> None:
+    """Raise ComputationError where a shape has no triangle."""
     if not len(shape.faces):
         raise ComputationError("too few neighbouring points of the surface were measured to make a triangle")
 
 
-def _found(
+def _assembled(
     rig: str,
     cameras: Sequence[Camera],
     pairs: Sequence[tuple[str, str]],
     steps: Sequence[str],
     shape: ReferenceShape,
     motion: Motion,
-    steadied: RefinedCameras,
+    poses: RefinedCameras,
     settings: Settings,
-) -> RingSurface:
+) -> MultiviewSurface:
+    """Assemble the results, the agreement of the cameras and the warnings."""
     residuals = reprojection_residuals(cameras, shape.xyz, shape.px)
-    return RingSurface(
+    return MultiviewSurface(
         _results(rig, cameras, pairs, steps, shape, motion, settings),
         _drift(cameras, residuals, motion),
-        {**_agreement(shape, residuals), "moved_cameras": steadied.figures(steps)},
-        _idle(cameras, shape) + steadied.sentences(steps),
+        {**_agreement(shape, residuals), "moved_cameras": poses.figures(steps)},
+        _idle(cameras, shape) + poses.sentences(steps),
     )
 
 
-def _drift(cameras: Sequence[Camera], residuals: Floats, motion: Motion) -> dict[str, Floats]:
-    """Mean vertical residuals (F,) px of each camera that took part.
+def _drift(cameras: Sequence[Camera], residuals: Pixels, motion: Motion) -> dict[str, Floats]:
+    """Mean vertical residual (F,) px of each camera that took part, by id.
 
-    At the reference they are between the cameras; the points are followed from where the reference puts them, so what
-    the steps show is added.
+    residuals : (C, n, 2) px at the reference, where they are between the cameras. Points are tracked from where the
+    reference puts them, so the residuals of later steps are added to those.
     """
-    found = {}
+    drift = {}
     for k, camera in enumerate(cameras):
         own = residuals[k, :, 1]
         if np.isfinite(own).any():
-            found[camera.id] = float(np.nanmean(own)) + np.concatenate([[0.0], motion.drift[1:, k]])
-    return found
+            drift[camera.id] = float(np.nanmean(own)) + np.concatenate([[0.0], motion.drift[1:, k]])
+    return drift
 
 
-def _agreement(shape: ReferenceShape, residuals: Floats) -> dict[str, Any]:
+def _agreement(shape: ReferenceShape, residuals: Pixels) -> dict[str, Any]:
+    """Figures of how well the cameras agree at the reference. residuals : (C, n, 2) px."""
     reasons = {int(reason): reason.name.lower() for kind in (Status, LostPoint) for reason in kind}
     lost, count = np.unique(shape.status, return_counts=True)
-    matched = residuals.copy()
-    matched[shape.reference, np.arange(len(shape.xyz))] = np.nan  # whole pixels by definition
+    partner_residuals = residuals.copy()
+    partner_residuals[shape.reference, np.arange(len(shape.xyz))] = np.nan  # whole pixels by definition
     return {
         "views": float(np.isfinite(shape.px[..., 0]).sum(axis=0).mean()),
-        "residual_px": float(np.sqrt(np.nanmean(matched**2))),
+        "residual_px": float(np.sqrt(np.nanmean(partner_residuals**2))),
         "lattice_mm": list(shape.pieces.lattice.spacing),
         "lost": {
             reasons[int(reason)]: int(number)
@@ -195,6 +163,7 @@ def _agreement(shape: ReferenceShape, residuals: Floats) -> dict[str, Any]:
 
 
 def _idle(cameras: Sequence[Camera], shape: ReferenceShape) -> list[str]:
+    """A sentence for each camera that shares no measured point with another."""
     taking_part: Mask = np.asarray(np.isfinite(shape.px[..., 0]).any(axis=1))
     return [
         f"camera {camera.id} shares no measured point of the surface with another; check that it sees the specimen, "
@@ -204,8 +173,8 @@ def _idle(cameras: Sequence[Camera], shape: ReferenceShape) -> list[str]:
     ]
 
 
-def tracking_of(settings: Settings) -> Tracking:
-    """How points are followed."""
+def tracking_settings(settings: Settings) -> Tracking:
+    """Settings of the tracking in time from those of a run."""
     order = settings.correlation.order
     return Tracking(
         two_pass=settings.tracking.two_pass and order == 1,
@@ -223,11 +192,12 @@ def _results(
     motion: Motion,
     settings: Settings,
 ) -> Results:
+    """Arrays of the results from the shape and its motion."""
     facing, vertex_pair = _facing_pairs(cameras, pairs, shape)
     corners = vertex_pair[shape.faces]
-    alike = (corners == corners[:, :1]).all(axis=1)
+    same_pair = (corners == corners[:, :1]).all(axis=1)
     tracking = settings.correlation
-    sure = surface_uncertainty(cameras, shape, motion, tracking.radius_px, tracking.order)
+    uncertainty = surface_uncertainty(cameras, shape, motion, tracking.radius_px, tracking.order)
     with np.errstate(invalid="ignore"):
         chi2 = motion.chi2 / np.where(motion.degrees > 0, motion.degrees, 1)
     return Results(
@@ -238,15 +208,15 @@ def _results(
         vertices_ref=shape.xyz,
         vertices=motion.xyz,
         faces=shape.faces,
-        pair=np.where(alike, corners[:, 0], -1),
+        pair=np.where(same_pair, corners[:, 0], -1),
         vertex_pair=vertex_pair,
         correlation=motion.c_ls,
-        sigma_xyz=sure.position,
+        sigma_xyz=uncertainty.position,
         status=motion.status,
         matches=tuple(_matches(cameras, one, shape) for one in motion.tracks),
         settings=settings.to_toml(),
-        sigma_displacement=sure.displacement,
-        sigma_lambda=sure.stretches,
+        sigma_displacement=uncertainty.displacement,
+        sigma_lambda=uncertainty.stretches,
         chi2=chi2,
     )
 
@@ -254,9 +224,10 @@ def _results(
 def _facing_pairs(
     cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]], shape: ReferenceShape
 ) -> tuple[tuple[tuple[str, str], ...], Indices]:
-    """The pairs and, for each point (n,), which of them are the two cameras used that face it most squarely.
+    """Pair of cameras that face each point most squarely, of those that measured it.
 
-    Two cameras that are no pair of the rig are added to the list, in the order of the ring.
+    Returns the pairs of camera ids, with pairs that are not listed in the rig appended, and the index (n,) of each
+    point's pair among them.
     """
     squarely = incidence(shape.pieces, cameras)[:, shape.node[:, 0], shape.node[:, 1]]
     squarely = np.where(np.isfinite(shape.px[..., 0]) & np.isfinite(squarely), squarely, -1.0)
@@ -273,17 +244,17 @@ def _facing_pairs(
     return tuple(listed), vertex_pair
 
 
-def _matches(cameras: Sequence[Camera], one: VertexTrack, shape: ReferenceShape) -> Matches:
-    """One camera's matches. Good ones that contradicted the other cameras' are marked."""
-    sigma = one.sigma.copy()
-    sigma[0] = shape.sigma[one.camera, one.vertex]
-    status = np.where((one.status == 0) & ~one.used, LostPoint.RESIDUAL, one.status).astype(np.int8)
+def _matches(cameras: Sequence[Camera], track: VertexTrack, shape: ReferenceShape) -> Matches:
+    """Matches of one camera; good ones that contradicted the other cameras are marked as such."""
+    sigma = track.sigma.copy()
+    sigma[0] = shape.sigma[track.camera, track.vertex]
+    status = np.where((track.status == 0) & ~track.used, LostPoint.RESIDUAL, track.status).astype(np.int8)
     return Matches(
-        cameras=(cameras[one.camera].id,),
-        xy=shape.px[one.camera, one.vertex],
-        px=one.px[:, None],
-        c_ls=one.c_ls,
+        cameras=(cameras[track.camera].id,),
+        xy=shape.px[track.camera, track.vertex],
+        px=track.px[:, None],
+        c_ls=track.c_ls,
         sigma=sigma[:, None],
         status=status,
-        vertex=one.vertex,
+        vertex=track.vertex,
     )

@@ -1,7 +1,7 @@
-"""The surface that all cameras measure together as tasks: its reference shape, then each camera's points in time.
+"""Tasks of the measurement by all cameras together: the reference shape, then the tracks of each camera.
 
-A camera follows its points through blocks of steps; a block sets out from what the one before left, so the blocks of
-a camera come one after the other, and the cameras side by side.
+A camera tracks its points through blocks of steps. A block starts from the state in which the previous one ended, so
+the blocks of a camera run one after the other, and the cameras side by side.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from numpy.typing import NDArray
 from ringdic.correlation import CorrelationSettings
 from ringdic.geometry.camera import Camera
 from ringdic.multiview.shape import ReferenceShape, ShapeSettings, reference_shape
-from ringdic.multiview.surface import numbers_of, reference_places, shape_settings, tracking_of
+from ringdic.multiview.surface import pair_indices, reference_pixels, shape_settings, tracking_settings
 from ringdic.multiview.tracking import CameraTrack, Tracking, TrackState, at_reference, track_block
 from ringdic.session.folder import Capture, Session
 from ringdic.session.images import read_mask
 from ringdic.settings import Settings
-from ringdic.sweep.sweep import Search
+from ringdic.sweep.sweep import DepthSearch
 from ringdic.tasks import Arrays, Task, code_stamp, digest, read_output, work_folder
 from ringdic.tasks.step_images import Digests, Image, step_image
 
 T = TypeVar("T")
 
-_BLOCK = 4  # steps of a task: what is started anew for each, and what is lost with one, both stay small
-_SHAPE_COST = 8.0  # of a camera, in those of a camera's step
+_BLOCK = 4  # steps of a task: few enough to lose little when one is interrupted, enough that starting it costs little
+_SHAPE_COST = 8.0  # of the shape, for each camera, in units of one camera's step
 _STATE, _TRACK = "state_", "track_"
 
 
 @dataclass(frozen=True)
-class RingJob:
-    """The tasks of the whole ring: the shape, and of every camera the blocks of steps in order."""
+class MultiviewJob:
+    """Tasks of a measurement by all cameras: the reference shape, and for each camera the blocks of steps in order."""
 
     cameras: tuple[Camera, ...]
     shape: Task
@@ -43,47 +43,51 @@ class RingJob:
 
     @property
     def tasks(self) -> list[Task]:
-        """All tasks, block by block."""
+        """All tasks: the shape, then block after block of all cameras."""
         return [self.shape, *(task for turn in zip(*self.blocks, strict=True) for task in turn)]
 
-    def found(self) -> tuple[ReferenceShape, dict[int, CameraTrack]]:
-        """The shape, and the tracks through all steps of the cameras that see some of it, by index.
+    def outputs(self) -> tuple[ReferenceShape, dict[int, CameraTrack]]:
+        """Reference shape, and the track through all steps of each camera that sees some of it, by index of the camera.
 
-        Raises the ComputationError that the shape ended with.
+        Raises the ComputationError with which the shape ended.
         """
         shape = ReferenceShape.from_arrays(read_output(self.shape.output))
         tracks = {}
         for k, (camera, blocks) in enumerate(zip(self.cameras, self.blocks, strict=True)):
-            vertex, x0 = reference_places(camera, shape, k)
+            vertex, x0 = reference_pixels(camera, shape, k)
             if len(vertex):
                 later = [_part(CameraTrack, read_output(task.output), _TRACK) for task in blocks]
                 tracks[k] = CameraTrack.joined([at_reference(x0, camera.size[::-1]), *later])
         return shape, tracks
 
 
-def ring_job(
+def multiview_job(
     session: Session,
     cameras: Sequence[Camera],
     pairs: Sequence[tuple[str, str]],
     steps: Sequence[Capture],
-    search: Search,
+    search: DepthSearch,
     settings: Settings,
-) -> RingJob:
-    """The tasks over these steps, the reference first, of cameras that all have a reference image."""
+) -> MultiviewJob:
+    """Lay out the tasks of a session's measurement by all cameras together.
+
+    cameras : all with a reference image. pairs : ids of neighbouring cameras. steps : captures, the reference first.
+    search : where the surface may lie.
+    """
     digests, folder = Digests(session), work_folder(session.path)
     correlation = CorrelationSettings(**settings.correlation.keywords)
-    numbers, how = numbers_of(cameras, pairs), shape_settings(settings)
+    indices, shape_options = pair_indices(cameras, pairs), shape_settings(settings)
     masks = {camera.id: mask for camera in cameras if (mask := session.mask(camera.id)) is not None}
-    seen = [[digests.image(steps[0], camera.id), digests.mask(camera.id)] for camera in cameras]
+    references = [[digests.image(steps[0], camera.id), digests.mask(camera.id)] for camera in cameras]
     shape = Task(
-        digest(code_stamp(), "shape", list(cameras), numbers, search, correlation, how, seen),
+        digest(code_stamp(), "shape", list(cameras), indices, search, correlation, shape_options, references),
         "shape of the reference",
         shape_task,
-        (tuple(cameras), tuple(numbers), search, correlation, how, dict(steps[0].images), masks),
+        (tuple(cameras), tuple(indices), search, correlation, shape_options, dict(steps[0].images), masks),
         folder,
         cost=_SHAPE_COST * len(cameras),
     )
-    options = tracking_of(settings)
+    options = tracking_settings(settings)
     blocks = []
     for k, camera in enumerate(cameras):
         images = [step.images.get(camera.id) for step in steps]
@@ -91,10 +95,10 @@ def ring_job(
         for first in range(1, len(steps), _BLOCK):
             part = range(first, min(first + _BLOCK, len(steps)))
             needs = (shape.key, *([row[-1].key] if row else []))
-            new = [digests.image(steps[step], camera.id) for step in part]
+            images_of_block = [digests.image(steps[step], camera.id) for step in part]
             row.append(
                 Task(
-                    digest("track", needs, k, correlation, options, new),
+                    digest("track", needs, k, correlation, options, images_of_block),
                     f"camera {camera.id}, {steps[part[0]].id} to {steps[part[-1]].id}",
                     track_task,
                     (camera, k, correlation, options, tuple(images[: part[-1] + 1]), part, masks.get(camera.id)),
@@ -104,13 +108,13 @@ def ring_job(
                 )
             )
         blocks.append(tuple(row))
-    return RingJob(tuple(cameras), shape, tuple(blocks))
+    return MultiviewJob(tuple(cameras), shape, tuple(blocks))
 
 
 def shape_task(
     cameras: tuple[Camera, ...],
     pairs: tuple[tuple[int, int], ...],
-    search: Search,
+    search: DepthSearch,
     correlation: CorrelationSettings,
     how: ShapeSettings,
     images: Mapping[str, Path],
@@ -118,16 +122,20 @@ def shape_task(
     *,
     inputs: tuple[Path, ...],
 ) -> Arrays:
-    """The reference shape from the cameras' reference images."""
+    """Measure the reference shape.
+
+    cameras : all with a reference image. pairs : indices of neighbouring cameras. images, masks : files by camera id.
+    inputs : none. Returns the arrays of the shape, and "points", the number of matches computed.
+    """
     del inputs
     by_id = {camera.id: camera for camera in cameras}
-    drawn = {id_: read_mask(path, by_id[id_].size[::-1]) for id_, path in masks.items()}
+    mask_images = {id_: read_mask(path, by_id[id_].size[::-1]) for id_, path in masks.items()}
 
     def image(id_: str) -> Image | None:
         return step_image(images[id_], by_id[id_]) if id_ in images else None
 
-    shape = reference_shape(cameras, image, drawn, pairs, search, correlation, how)
-    return {**shape.arrays(), "points": np.array(shape.made)}
+    shape = reference_shape(cameras, image, mask_images, pairs, search, correlation, how)
+    return {**shape.arrays(), "points": np.array(shape.match_count)}
 
 
 def track_task(
@@ -141,24 +149,30 @@ def track_task(
     *,
     inputs: tuple[Path, ...],
 ) -> Arrays:
-    """The points of camera number k through a block of steps. images : of all steps so far, the reference first."""
-    shape_file, *before = inputs
-    _, x0 = reference_places(camera, ReferenceShape.from_arrays(read_output(shape_file)), k)
-    state = _part(TrackState, read_output(before[0]), _STATE) if before else None
+    """Track the points of one camera through a block of steps.
+
+    camera, k : the camera and its index. images : files of all steps up to the block's last one, the reference
+    first, None where there is none. steps : of the block. mask : file of the region drawn by the user. inputs :
+    outputs of the shape and of the previous block. Returns the arrays of the track and of the state in which the
+    block ends.
+    """
+    shape_file, *previous = inputs
+    _, x0 = reference_pixels(camera, ReferenceShape.from_arrays(read_output(shape_file)), k)
+    state = _part(TrackState, read_output(previous[0]), _STATE) if previous else None
 
     def image(step: int) -> Image | None:
         path = images[step]
         return None if path is None else step_image(path, camera)
 
     reference = image(0)
-    assert reference is not None  # only such cameras take part
-    drawn = None if mask is None else read_mask(mask, camera.size[::-1])
-    found, state = track_block(reference, image, steps, x0, drawn, correlation, options, state)
-    named = {f"{_TRACK}{name}": values for name, values in found.arrays().items()}
-    named |= {f"{_STATE}{name}": np.asarray(values) for name, values in state.arrays().items()}
-    return {**named, "points": np.array(len(x0) * len(steps))}
+    assert reference is not None  # cameras without a reference image take no part
+    mask_image = None if mask is None else read_mask(mask, camera.size[::-1])
+    track, state = track_block(reference, image, steps, x0, mask_image, correlation, options, state)
+    arrays = {f"{_TRACK}{name}": values for name, values in track.arrays().items()}
+    arrays |= {f"{_STATE}{name}": np.asarray(values) for name, values in state.arrays().items()}
+    return {**arrays, "points": np.array(len(x0) * len(steps))}
 
 
 def _part(kind: type[T], arrays: Mapping[str, NDArray[Any]], prefix: str) -> T:
-    """The dataclass of arrays that lies under a prefix of their names."""
+    """Dataclass whose arrays are stored under names with a prefix."""
     return kind(**{name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)})

@@ -1,7 +1,7 @@
-"""The points that are followed in a camera's images, and what about them is the same in every image.
+"""Points that are tracked in a camera's images, and what about them is the same in every image.
 
-What is smooth over the image, the field's curvature and the bias that subsets leave, is taken from a part of the
-points, the knots, one in each square not quite a subset's radius wide.
+What is smooth over the image, the field's curvature and the bias that subsets leave, is computed at a part of the
+points only, the knots: one in each square not quite a subset's radius wide.
 """
 
 from __future__ import annotations
@@ -13,139 +13,175 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Pixels
 from ringdic.correlation import CorrelationSettings, Reference
 from ringdic.correlation.quadratic import LowerQuartiles, Neighbourhoods, QuadraticFit
-from ringdic.correlation.seeds import spread
+from ringdic.correlation.seeds import even_sample
 
-_APART = 0.8  # subset radii, side of the squares with a knot each
-_REACH = 3.0  # subset radii about a knot in which its neighbours tell its curvature and its bias
-_SCATTERS = 8.0  # a point this many times off its neighbours' quadratic contradicts it
-_LEAST_OFF = 0.1  # px, and never less than this
-_STRICTER = (4.0, 1.0)  # the most distant knots go first, so that they do not drag good ones along
-_UNLIKE = 3.0  # a mean square difference this many times the usual one is not noise, which stays below 2
+_APART = 0.8  # subset radii, side of the squares with one knot each
+_REACH = 3.0  # subset radii about a knot, of the neighbours that its curvature and bias are computed from
+_SCATTERS = 8.0  # standard deviations from the neighbours' quadratic beyond which a point contradicts it
+_LEAST_OFF = 0.1  # px, least distance that is a contradiction
+_STRICTER = (4.0, 1.0)  # times the limit: the most distant knots are left out first, lest they draw the fit away
+_UNLIKE = 3.0  # times the usual mean square difference that noise alone, which stays below 2, does not reach
 
 
 @dataclass(frozen=True)
 class TrackedPoints:
     """n points of a reference image, m of them knots.
 
-    at : (n, 2) px. pixel : (n, 2), the whole pixels next to them, where their subsets lie. variance : (n,) of the grey
-    levels there; least : the mean square difference that rounding to whole grey levels makes. seeds : some points
-    spread evenly. knots : (m,) indices of the knots, knot : (n,) the one next to each point, around : their
-    neighbourhoods, quartile : of the knots about each point.
+    positions : (n, 2) float64, px. pixels : (n, 2) float64, px, the whole pixels next to them, on which their
+    subsets lie. variance : (n,), of the grey levels there, grey levels². least : mean square difference that
+    rounding to whole grey levels makes, grey levels². seeds : (s,) int, some points spread evenly. knots : (m,) int,
+    indices of the knots. knot : (n,) int, the knot next to each point. neighbourhoods : of the knots. quartile : of
+    the knots about each point.
     """
 
-    at: Floats
-    pixel: Floats
+    positions: Pixels
+    pixels: Pixels
     variance: Floats
     least: float
     seeds: Indices
     knots: Indices
     knot: Indices
-    around: Neighbourhoods
+    neighbourhoods: Neighbourhoods
     quartile: LowerQuartiles
 
     @property
-    def shift(self) -> Floats:
-        """From the points to their whole pixels. (n, 2) px."""
-        return self.pixel - self.at
-
-    @property
-    def beside(self) -> Floats:
-        """From the knot of each point to the point, whole pixels. (n, 2)."""
-        return self.pixel - self.around.xy[self.knot]
+    def shift(self) -> Pixels:
+        """Offsets from the points to their whole pixels, (n, 2) px."""
+        return self.pixels - self.positions
 
     def nearest(self, known: Mask, reach: float = np.inf) -> Indices:
-        """The nearest of the known knots (m,) of every point, (n,), -1 where none lies within reach, px."""
+        """Nearest known knot of every point.
+
+        known : (m,) bool, of the knots. reach : px. Returns indices (n,) of knots, -1 where none lies within reach.
+        """
         if not known.any():
-            return np.full(len(self.at), -1)
+            return np.full(len(self.positions), -1)
         out = self.knot.copy()
         lost = np.flatnonzero(~known[out])
         if len(lost):
             which = np.flatnonzero(known)
-            distance, index = cKDTree(self.around.xy[which]).query(self.pixel[lost], distance_upper_bound=reach)
+            distance, index = cKDTree(self.neighbourhoods.xy[which]).query(
+                self.pixels[lost], distance_upper_bound=reach
+            )
             out[lost] = np.where(np.isfinite(distance), which[np.minimum(index, len(which) - 1)], -1)
         return out
 
-    def quadratics(self, values: Floats, sigma: Floats) -> QuadraticFit:
-        """Quadratics of a field about the knots, those that contradict it left out. values (n, 2), sigma (n,)."""
-        return robust(self.around, values[self.knots], sigma[self.knots])
+    def quadratics(self, values: Pixels, sigma: Floats) -> QuadraticFit:
+        """Fit local quadratics of a displacement field about the knots, without the knots that contradict their
+        neighbours.
 
-    def contradict(self, values: Floats, sigma: Floats) -> Mask:
-        """Points (n,) whose values (n, 2) lie far off the quadratic of their neighbours; NaN does not."""
-        fit = self.quadratics(values, sigma)
-        knot = self.nearest(np.asarray(np.isfinite(fit.value).all(axis=1)), self.around.window)
-        off = np.hypot(*(values - fit.carried(knot, self.pixel - self.around.xy[knot])).T)
-        off[knot < 0] = np.nan
-        own = np.hypot(*fit.leave_out.T)
-        off[self.knots] = np.where(np.isfinite(own), own, off[self.knots])
-        with np.errstate(invalid="ignore"):
-            return np.asarray(off > _limit(off))
-
-    def most_unlike(self, rest: Floats) -> Floats:
-        """The largest mean square difference (n,) of a good match, from those of all, (n,); NaN where none is known.
-
-        A point whose subsets differ by far more than those about it is partly covered, or worn; beside what covers it
-        only the best of those about it are clear. Noise leaves the same
-        in weak and in strong texture, so weak texture is not taken for a difference.
+        values : (n, 2) px, at the points. sigma : (n,) px.
         """
-        known = np.isfinite(rest)
+        return robust_quadratics(self.neighbourhoods, values[self.knots], sigma[self.knots])
+
+    def contradict(self, values: Pixels, sigma: Floats) -> Mask:
+        """Points whose displacement lies far off the quadratic of their neighbours.
+
+        values : (n, 2) px, NaN where unknown. sigma : (n,) px. Returns (n,) bool, False where the displacement is
+        unknown.
+        """
+        fit = self.quadratics(values, sigma)
+        knot = self.nearest(np.asarray(np.isfinite(fit.value).all(axis=1)), self.neighbourhoods.window)
+        distance = np.hypot(*(values - fit.extrapolate(knot, self.pixels - self.neighbourhoods.xy[knot])).T)
+        distance[knot < 0] = np.nan
+        own = np.hypot(*fit.leave_one_out.T)
+        distance[self.knots] = np.where(np.isfinite(own), own, distance[self.knots])
+        with np.errstate(invalid="ignore"):
+            return np.asarray(distance > _limit(distance))
+
+    def largest_difference(self, mean_square: Floats) -> Floats:
+        """Largest mean square difference that a good match may have, from those of all points.
+
+        A point whose subsets differ by far more than those about it is partly covered or worn; beside an obstacle
+        only the best of its neighbours are clear, so the lower quartile about a point is taken. Noise contributes
+        equally in weak and in strong texture, so weak texture is not mistaken for a difference.
+
+        mean_square : (n,) grey levels², NaN where unknown. Returns (n,) grey levels², NaN where nothing is known.
+        """
+        known = np.isfinite(mean_square)
         if not known.any():
-            return np.full(len(rest), np.nan)
-        return _UNLIKE * np.fmax(self.quartile(rest[self.knots]), np.median(rest[known]))
+            return np.full(len(mean_square), np.nan)
+        return _UNLIKE * np.fmax(self.quartile(mean_square[self.knots]), np.median(mean_square[known]))
 
 
 def tracked_points(
-    reference: Reference, at: Floats, settings: CorrelationSettings, window: float | None = None, *, thin: bool = True
+    reference: Reference,
+    positions: Pixels,
+    settings: CorrelationSettings,
+    window: float | None = None,
+    *,
+    thin: bool = True,
 ) -> TrackedPoints:
-    """Of points ``at`` (n, 2) px of a reference image. window : px, by default 3 subset radii.
+    """Prepare points of a reference image for tracking.
 
-    thin : without it every point is a knot.
+    positions : (n, 2) float64, px. window : px, radius of the neighbourhoods; None: 3 subset radii. thin : whether only
+    one point in each square is a knot; otherwise every point is one.
     """
-    pixel = np.rint(at)
-    knots = thinned(pixel, _APART * settings.radius) if thin else np.arange(len(at))
-    around = Neighbourhoods(pixel[knots], window or _REACH * settings.radius)
-    quartile = LowerQuartiles(pixel, around.xy, around.window)
-    _, knot = cKDTree(pixel[knots]).query(pixel)
-    variance = _variance(reference, pixel, settings.radius)
+    pixels = np.rint(positions)
+    knots = thin_to_grid(pixels, _APART * settings.radius) if thin else np.arange(len(positions))
+    neighbourhoods = Neighbourhoods(pixels[knots], window or _REACH * settings.radius)
+    quartile = LowerQuartiles(pixels, neighbourhoods.xy, neighbourhoods.window)
+    _, knot = cKDTree(pixels[knots]).query(pixels)
+    variance = _variance(reference, pixels, settings.radius)
     least = (reference.grey_range / 255.0) ** 2
-    return TrackedPoints(at, pixel, variance, least, spread(at), knots, np.asarray(knot, np.int64), around, quartile)
+    return TrackedPoints(
+        positions,
+        pixels,
+        variance,
+        least,
+        even_sample(positions),
+        knots,
+        np.asarray(knot, np.int64),
+        neighbourhoods,
+        quartile,
+    )
 
 
-def thinned(xy: Floats, side: float) -> Indices:
-    """Of points (n, 2), in every square of this side the one nearest its middle. (m,) indices, rising."""
-    place = (xy - xy.min(axis=0)) / side
-    cell = np.floor(place).astype(np.int64)
+def thin_to_grid(xy: Pixels, side: float) -> Indices:
+    """Choose in every square of a grid the point nearest to its middle.
+
+    xy : (n, 2) px. side : px, of the squares. Returns indices (m,), rising.
+    """
+    position = (xy - xy.min(axis=0)) / side
+    cell = np.floor(position).astype(np.int64)
     label = cell[:, 1] * (int(cell[:, 0].max()) + 1) + cell[:, 0]
-    order = np.lexsort((np.hypot(*(place - cell - 0.5).T), label))
+    order = np.lexsort((np.hypot(*(position - cell - 0.5).T), label))
     return np.sort(order[np.flatnonzero(np.diff(label[order], prepend=-1))])
 
 
-def robust(around: Neighbourhoods, values: Floats, sigma: Floats) -> QuadraticFit:
-    """Quadratics of a field (m, 2), points far off their neighbours' left out."""
-    kept = values
-    fit = around.fit(values, sigma)
+def robust_quadratics(neighbourhoods: Neighbourhoods, values: Pixels, sigma: Floats) -> QuadraticFit:
+    """Fit local quadratics of a field without the points that lie far off them.
+
+    neighbourhoods : of the m points. values : (m, 2) px. sigma : (m,) px.
+    """
+    agreeing = values
+    fit = neighbourhoods.fit(values, sigma)
     for factor in _STRICTER:
         with np.errstate(invalid="ignore"):
-            off = np.hypot(*np.where(np.isfinite(kept), fit.leave_out, values - fit.value).T)
-            odd = off > factor * _limit(off)
-        if (odd == (np.isfinite(values) & ~np.isfinite(kept)).any(axis=1)).all():
+            distance = np.hypot(*np.where(np.isfinite(agreeing), fit.leave_one_out, values - fit.value).T)
+            contradicting = distance > factor * _limit(distance)
+        if (contradicting == (np.isfinite(values) & ~np.isfinite(agreeing)).any(axis=1)).all():
             continue
-        kept = np.where(odd[:, None], np.nan, values)
-        fit = around.fit(kept, sigma)
-    return replace(fit, leave_out=np.where(np.isfinite(kept), fit.leave_out, values - fit.value))
+        agreeing = np.where(contradicting[:, None], np.nan, values)
+        fit = neighbourhoods.fit(agreeing, sigma)
+    return replace(fit, leave_one_out=np.where(np.isfinite(agreeing), fit.leave_one_out, values - fit.value))
 
 
-def _limit(off: Floats) -> float:
-    """The distance from a quadratic beyond which a point contradicts it, from the distances of all, px."""
-    known = np.isfinite(off)
-    scatter = 1.4826 * float(np.median(off[known])) if known.any() else 0.0
+def _limit(distance: Floats) -> float:
+    """Distance from a quadratic, px, beyond which a point contradicts it, from the distances (m,) px of all points."""
+    known = np.isfinite(distance)
+    scatter = 1.4826 * float(np.median(distance[known])) if known.any() else 0.0
     return max(_LEAST_OFF, _SCATTERS * scatter)
 
 
-def _variance(reference: Reference, xy: Floats, radius: int) -> Floats:
-    """Variance (n,) of the grey levels in the squares about points xy (n, 2), what the mask cuts left out."""
+def _variance(reference: Reference, xy: Pixels, radius: int) -> Floats:
+    """Variance of the grey levels in the squares about points, without the pixels that the mask excludes.
+
+    xy : (n, 2) px. Returns (n,) grey levels².
+    """
     size = (2 * radius + 1,) * 2
     inside = reference.mask.astype(np.float32)
     level = (reference.grey - np.float32(reference.grey.mean())).astype(np.float32) * inside

@@ -1,7 +1,7 @@
-"""Points of one camera through all its images, each image compared with the camera's own reference image.
+"""Tracking of one camera's points through all its images, each compared with the camera's own reference image.
 
-No image is compared with the one before unless it must be: errors do not add up. Where the surface has changed so
-much that a point is not found again from the reference image, the last image that showed it takes the reference's
+No image is compared with the one before unless it must be, so errors do not add up. Where the surface has changed so
+much that a point is not matched from the reference image, the last image in which it was matched takes the reference's
 place, and displacement, gradient and variances are composed.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ringdic.arrays import Floats, Image, Indices, Mask
+from ringdic.arrays import Floats, Image, Indices, Mask, Pixels
 from ringdic.correlation import (
     CorrelationSettings,
     Current,
@@ -24,7 +24,7 @@ from ringdic.correlation import (
     Status,
     prepare_current,
     prepare_reference,
-    search_hypotheses,
+    search_warps,
 )
 from ringdic.errors import InputError
 from ringdic.multiview.step_matching import ImageMatches, match_tracked_points
@@ -32,20 +32,22 @@ from ringdic.multiview.tracked_points import TrackedPoints, tracked_points
 
 log = logging.getLogger(__name__)
 
-_AGREE = 0.5  # px between a point found by way of another image and from the reference itself
-_ASKED = 2  # images of earlier steps in which the points lost at a step are sought
-_FEW = 2e-3  # share of the points below which those lost are not worth another image
-_CHANGED = 0.5  # share of points found below which the image has changed, and start values are sought in it
+_AGREE = 0.5  # px, greatest distance between a point by way of another image and from the reference itself
+_ASKED = 2  # images of earlier steps from which the points lost at a step are sought
+_FEW = 2e-3  # share of the points that must be lost for another image to be filtered
+_CHANGED = 0.5  # share of matched points below which the image has changed and is searched for start values
 _SUPPORT = 4.0  # steps about a lost point from which it takes its start value
 
 
 @dataclass(frozen=True)
 class Tracking:
-    """How points are followed.
+    """Settings of the tracking in time.
 
-    two_pass : second derivatives of the neighbours' displacement held in a second first-order pass.
-    update_reference : lost points are sought from the last image that showed them.
-    order : of the subsets in time. window : px, radius of the neighbourhood of the two passes; None: 3 radii.
+    two_pass : whether second derivatives of the neighbours' displacement are held fixed in a second, first-order pass.
+    update_reference : whether lost points are sought from the last image in which they were matched. order : of the
+    subsets, 1 or 2. window : px, radius of the neighbourhood of the two passes; None: 3 subset radii.
+
+    Raises InputError for settings that contradict one another.
     """
 
     two_pass: bool = True
@@ -64,37 +66,38 @@ class Tracking:
 
 @dataclass(frozen=True)
 class CameraTrack:
-    """n points of one camera at F steps; NaN where status is not 0.
+    """Track of n points of one camera through F steps; NaN where status is not 0.
 
-    px : (F, n, 2). sigma : (F, n, 2) px, standard uncertainty of the displacement since the reference, 0 there.
-    c_ls : (F, n), 0 at the reference; the largest on the way of a point that came through another image.
-    status : (F, n), see ``Status``. updated : (F, n) bool, found by way of another image than the reference.
+    px : (F, n, 2) px. sigma : (F, n, 2) px, standard deviation of the displacement since the reference, 0 there.
+    c_ls : (F, n), 0 at the reference; for a point that was matched by way of another image the largest on the way.
+    status : (F, n) int. updated : (F, n) bool, matched by way of another image than the reference.
     """
 
-    px: Floats
-    sigma: Floats
+    px: Pixels
+    sigma: Pixels
     c_ls: Floats
     status: NDArray[np.int8]
     updated: Mask
 
     @classmethod
     def joined(cls, blocks: Sequence[CameraTrack]) -> CameraTrack:
-        """The steps of several tracks of the same points, one after the other."""
+        """Track through the steps of several tracks of the same points, one after the other."""
         names = [each.name for each in fields(cls)]
         return cls(*(np.concatenate([getattr(block, name) for block in blocks]) for name in names))
 
     def arrays(self) -> dict[str, NDArray]:
-        """All of it by name."""
+        """Arrays of the track, (F, n, ...) px or without unit, by name."""
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
 
 @dataclass(frozen=True)
 class TrackState:
-    """What a block of steps leaves to the next: the k points inside the reference image where each was seen last.
+    """State that a block of steps leaves to the next: for each of k points the last step at which it was matched.
 
-    warp, before : (k, 12) since the reference and at the step before, NaN if none. sigma : (k, 2). c_ls : (k,).
-    last : (k,) the step they belong to. by_way : (k,) step of the image that took the reference's place, or 0.
-    moved : () bool, whether any was found in any image.
+    Only points inside the reference image are counted. warp : (k, 12), since the reference, in px and its powers.
+    before : (k, 12), at the step before that, NaN if lost there. sigma : (k, 2) px. c_ls : (k,). last : (k,) int,
+    the step. by_way : (k,) int, step of the image that took the reference's place, or 0. moved : () bool, whether
+    any point was matched in any image.
     """
 
     warp: Floats
@@ -107,55 +110,42 @@ class TrackState:
 
     @classmethod
     def at_rest(cls, k: int) -> TrackState:
-        """Of k points in the reference image."""
+        """State of k points in the reference image."""
         zero = np.zeros(k, np.int64)
         return cls(
             np.zeros((k, 12)), np.full((k, 12), np.nan), np.zeros((k, 2)), np.zeros(k), zero, zero, np.array(False)
         )
 
     def arrays(self) -> dict[str, NDArray]:
-        """All of it by name."""
+        """Arrays of the state, (k, ...) px or without unit, by name."""
         return {each.name: getattr(self, each.name) for each in fields(self)}
-
-
-def track(
-    reference_image: Image,
-    image_of_step: Callable[[int], Image | None],
-    steps: int,
-    x0: Floats,
-    mask: Mask | None,
-    settings: CorrelationSettings,
-    options: Tracking = Tracking(),
-    progress: Callable[[float], None] = lambda _: None,
-) -> CameraTrack:
-    """Follow points of one camera from its reference image, step 0, through the images of steps 1 … steps - 1.
-
-    As :func:`track_block`; the reference is the first step of the result.
-    """
-    block, _ = track_block(
-        reference_image, image_of_step, range(1, steps), x0, mask, settings, options, progress=progress
-    )
-    return CameraTrack.joined([at_reference(x0, reference_image.shape), block])
 
 
 def track_block(
     reference_image: Image,
     image_of_step: Callable[[int], Image | None],
     steps: range,
-    x0: Floats,
+    x0: Pixels,
     mask: Mask | None,
     settings: CorrelationSettings,
     options: Tracking = Tracking(),
     state: TrackState | None = None,
-    progress: Callable[[float], None] = lambda _: None,
 ) -> tuple[CameraTrack, TrackState]:
-    """Follow points of one camera from its reference image through some steps, and what the next steps set out from.
+    """Track points of one camera from its reference image through a block of steps.
 
-    reference_image : (h, w). image_of_step : the image of a step, None where there is none: all points are lost there;
-    it may be asked twice, and for earlier steps. x0 : (n, 2) px, anywhere in the reference image, about settings.step
-    apart; NaN where the camera does not see the point. mask : (h, w), what belongs to the surface and may be part of a
-    subset; by default all within a step of a point. settings.order is that of ``options``. state : what the steps
-    before left; None at step 1.
+    Parameters
+    ----------
+    reference_image : (h, w) grey levels.
+    image_of_step : gives the image of a step, None where there is none, in which case all points are lost there; it
+    may be called twice for a step, and for earlier steps. steps : of the block. x0 : (n, 2) float64, px, anywhere in
+    the reference image, about ``settings.step`` apart; NaN where the camera does not see the point. mask : (h, w)
+    bool, pixels that belong to the surface and may be part of a subset; None: all within a step of a point. settings
+    : of the correlation; its order is replaced by that of ``options``. options : of the tracking. state : at the end
+    of the previous block; None before step 1.
+
+    Returns
+    -------
+    The track through the block, and the state at its end.
     """
     x0 = np.asarray(x0, dtype=np.float64)
     inside = _inside(x0, reference_image.shape)
@@ -167,19 +157,21 @@ def track_block(
     settings = replace(settings, order=options.order)
     points = _Points.of(reference_image, image_of_step, x0[index], mask, settings, options, state)
     for k, step in enumerate(steps):
-        found = points.advance(step)
-        if found is not None:
-            result.px[k, index] = x0[index] + found.warp[:, :2]
-            result.sigma[k, index] = found.sigma
-            result.c_ls[k, index] = found.c_ls
-            result.status[k, index] = found.status
-            result.updated[k, index] = found.good & (points.state.by_way > 0)
-        progress((k + 1) / len(steps))
+        matches = points.advance(step)
+        if matches is not None:
+            result.px[k, index] = x0[index] + matches.warp[:, :2]
+            result.sigma[k, index] = matches.sigma
+            result.c_ls[k, index] = matches.c_ls
+            result.status[k, index] = matches.status
+            result.updated[k, index] = matches.good & (points.state.by_way > 0)
     return result, points.state
 
 
-def at_reference(x0: Floats, shape: tuple[int, ...]) -> CameraTrack:
-    """The points x0 (n, 2) px in the reference image of this shape, one step."""
+def at_reference(x0: Pixels, shape: tuple[int, ...]) -> CameraTrack:
+    """Track of points in the reference image alone, one step.
+
+    x0 : (n, 2) float64, px. shape : (h, w) of the image.
+    """
     x0 = np.asarray(x0, dtype=np.float64)
     inside = _inside(x0, shape)
     result = _lost(1, x0, inside)
@@ -189,12 +181,13 @@ def at_reference(x0: Floats, shape: tuple[int, ...]) -> CameraTrack:
 
 
 def _inside(x0: Floats, shape: tuple[int, ...]) -> Mask:
+    """Points (n,) that lie inside an image of a shape (h, w)."""
     with np.errstate(invalid="ignore"):
         return np.asarray(((x0 >= 0) & (x0 <= (shape[1] - 1, shape[0] - 1))).all(axis=1))
 
 
 def _lost(steps: int, x0: Floats, inside: Mask) -> CameraTrack:
-    """Every point lost in every step."""
+    """Track in which every point is lost at every step."""
     n = len(x0)
     status = np.full((steps, n), Status.NOT_REACHED, np.int8)
     status[:, np.isfinite(x0).all(axis=1) & ~inside] = Status.OUTSIDE
@@ -202,8 +195,11 @@ def _lost(steps: int, x0: Floats, inside: Mask) -> CameraTrack:
     return CameraTrack(px, sigma, np.full((steps, n), np.nan), status, np.zeros((steps, n), bool))
 
 
-def painted(xy: Floats, shape: tuple[int, ...], reach: float) -> Mask:
-    """All pixels of an image of this shape within ``reach`` px of one of the points xy (n, 2). (h, w) bool."""
+def mask_about(xy: Pixels, shape: tuple[int, ...], reach: float) -> Mask:
+    """Pixels of an image within ``reach`` px of any of some points.
+
+    xy : (n, 2) px. shape : (h, w). Returns (h, w) bool.
+    """
     out = np.zeros(shape[:2], np.uint8)
     at = np.rint(xy).astype(np.int64)
     out[np.clip(at[:, 1], 0, shape[0] - 1), np.clip(at[:, 0], 0, shape[1] - 1)] = 1
@@ -213,29 +209,29 @@ def painted(xy: Floats, shape: tuple[int, ...], reach: float) -> Mask:
 
 @dataclass
 class _Points:
-    """The points of one camera, where each was seen last, and the images they are followed through."""
+    """The points of one camera, the state of their track, and the images that they are tracked through."""
 
     reference: Reference
     image_of_step: Callable[[int], Image | None]
-    x0: Floats
-    places: TrackedPoints
+    x0: Pixels
+    points: TrackedPoints
     settings: CorrelationSettings
     options: Tracking
     state: TrackState
 
     @classmethod
     def of(
-        cls, image: Image, image_of_step: Callable[[int], Image | None], x0: Floats, mask: Mask | None,
+        cls, image: Image, image_of_step: Callable[[int], Image | None], x0: Pixels, mask: Mask | None,
         settings: CorrelationSettings, options: Tracking, state: TrackState,
     ) -> _Points:  # fmt: skip
-        """The points x0 (n, 2) of the reference image, as the steps before left them."""
-        region = painted(x0, image.shape, settings.step) if mask is None else mask
+        """Points x0 (n, 2) px of a reference image, in the state in which the previous block left them."""
+        region = mask_about(x0, image.shape, settings.step) if mask is None else mask
         reference = prepare_reference(image, region, settings)
-        where = tracked_points(reference, x0, settings, options.window, thin=options.two_pass)
-        return cls(reference, image_of_step, x0, where, settings, options, state)
+        points = tracked_points(reference, x0, settings, options.window, thin=options.two_pass)
+        return cls(reference, image_of_step, x0, points, settings, options, state)
 
     def advance(self, step: int) -> ImageMatches | None:
-        """Find the points in the image of a step and remember those found. None without an image."""
+        """Match the points in the image of a step and update the state; None without an image."""
         image = self.image_of_step(step)
         if image is None:
             return None
@@ -245,31 +241,33 @@ class _Points:
                 f"{self.reference.image.shape[1]} x {self.reference.image.shape[0]} px; capture all steps at one size"
             )
         current = prepare_current(image, None, self.settings)
-        found = self._follow(self.reference, current, self.places, self._start(current))
+        matches = self._match(self.reference, current, self.points, self._start(current))
         by_way = np.zeros(len(self.x0), np.int64)
         if self.options.update_reference:
-            for s in self._worth_asking(found):
-                found = self._through(s, found, current, by_way)
-        self._remember(step, found, by_way)
-        return found
+            for s in self._steps_to_search(matches):
+                matches = self._match_by_way(s, matches, current, by_way)
+        self._update_state(step, matches, by_way)
+        return matches
 
-    def _follow(
+    def _match(
         self, reference: Reference, current: Current, points: TrackedPoints, start: Floats | None, search: bool = True
     ) -> ImageMatches:
+        """Match points in the current image with the options of this track."""
         return match_tracked_points(
             reference, current, points, start, self.settings, two_pass=self.options.two_pass, search=search
         )
 
-    def _places(self, reference: Reference, at: Floats) -> TrackedPoints:
+    def _prepared(self, reference: Reference, at: Floats) -> TrackedPoints:
+        """Points (n, 2) px of a reference image, prepared for tracking with the options of this track."""
         return tracked_points(reference, at, self.settings, self.options.window, thin=self.options.two_pass)
 
     def _start(self, current: Current) -> Floats | None:
-        """Start values (n, 12): the motion so far, or that carried on, whichever resembles the image better."""
+        """Start values (n, 12): the last warp, or its linear extrapolation, whichever resembles the image better."""
         state = self.state
         if not state.moved:
             return None
         ahead = 2.0 * state.warp - state.before
-        seeds = self.places.seeds
+        seeds = self.points.seeds
         seeds = seeds[np.isfinite(ahead[seeds]).all(axis=1)]
         if not len(seeds):
             return state.warp
@@ -277,75 +275,83 @@ class _Points:
         return state.warp if scores[0] >= scores[1] else np.where(np.isfinite(ahead), ahead, state.warp)
 
     def _resemblance(self, current: Current, seeds: Indices, warp: Floats) -> float:
+        """Median ZNCC of some points (s,) under warps (n, 12)."""
         xy = self.x0[seeds]
-        found = search_hypotheses(self.reference, current, np.rint(xy), warp[seeds][:, None, :6], self.settings.radius)
-        return float(np.median(found[1]))
+        _, zncc, _ = search_warps(self.reference, current, np.rint(xy), warp[seeds][:, None, :6], self.settings.radius)
+        return float(np.median(zncc))
 
-    def _worth_asking(self, found: ImageMatches) -> list[int]:
-        """The steps whose images showed most of the points lost now, a few at most: each has to be filtered anew."""
+    def _steps_to_search(self, matches: ImageMatches) -> list[int]:
+        """Steps whose images showed most of the points lost now; a few at most, since each has to be filtered anew."""
         last = self.state.last
-        step, count = np.unique(last[~found.good & (last > 0)], return_counts=True)
+        step, count = np.unique(last[~matches.good & (last > 0)], return_counts=True)
         order = np.argsort(-count, kind="stable")[:_ASKED]
         return [int(step[k]) for k in order if count[k] >= _FEW * len(self.x0)]
 
-    def _through(self, step: int, found: ImageMatches, current: Current, by_way: Indices) -> ImageMatches:
-        """Points lost now that were last seen at ``step``, sought from the image of that step. Fills by_way."""
+    def _match_by_way(self, step: int, matches: ImageMatches, current: Current, by_way: Indices) -> ImageMatches:
+        """Match points that are lost now and were last matched at a step from the image of that step; fills by_way
+        (n,).
+        """
         image, last, warp = self.image_of_step(step), self.state.last, self.state.warp
-        lost = np.flatnonzero(~found.good & (last == step))
+        lost = np.flatnonzero(~matches.good & (last == step))
         if image is None:
-            return found
-        held = np.flatnonzero(found.good & (last == step))
+            return matches
+        steady = np.flatnonzero(matches.good & (last == step))
         at = self.x0 + warp[:, :2]
-        if len(held):
-            near, _ = cKDTree(at[lost]).query(at[held], distance_upper_bound=_SUPPORT * self.settings.step)
-            held = held[np.isfinite(near)]
-        chosen = np.concatenate([lost, held])
+        if len(steady):
+            near, _ = cKDTree(at[lost]).query(at[steady], distance_upper_bound=_SUPPORT * self.settings.step)
+            steady = steady[np.isfinite(near)]
+        chosen = np.concatenate([lost, steady])
         start = np.full((len(chosen), 12), np.nan)
-        start[len(lost) :] = _between(warp[held], found.warp[held])
-        changed = bool(found.good.mean() < _CHANGED)
-        if not len(held) and not changed:  # a place that is hidden or worn, with nothing about it that moves along
-            return found
-        reference = prepare_reference(image, painted(at[chosen], image.shape, self.settings.step), self.settings)
-        points = self._places(reference, at[chosen])
-        since = self._follow(reference, current, points, start, search=changed).part(np.arange(len(lost)))
-        limit = self.places.most_unlike(found.rest)[lost]
-        there = since.good & ~(since.rest > limit)
-        log.debug("%d of %d lost points found from the image of step %d", there.sum(), len(lost), step)
-        if not there.any():
-            return found
-        composed = self._composed(lost[there], since.part(there))
-        # Perhaps only the start value was wanting: then the reference itself says more, and nothing adds up.
-        points = self._places(self.reference, self.x0[lost[there]])
-        direct = self._follow(self.reference, current, points, composed.warp, search=False)
-        agree = direct.good & ~(direct.rest > limit[there])
+        start[len(lost) :] = _between(warp[steady], matches.warp[steady])
+        changed = bool(matches.good.mean() < _CHANGED)
+        if not len(steady) and not changed:  # hidden or worn, with nothing about it that gives a start value
+            return matches
+        reference = prepare_reference(image, mask_about(at[chosen], image.shape, self.settings.step), self.settings)
+        points = self._prepared(reference, at[chosen])
+        since = self._match(reference, current, points, start, search=changed).part(np.arange(len(lost)))
+        limit = self.points.largest_difference(matches.mean_square)[lost]
+        accepted = since.good & ~(since.mean_square > limit)
+        log.debug("%d of %d lost points found from the image of step %d", accepted.sum(), len(lost), step)
+        if not accepted.any():
+            return matches
+        composed = self._composed(lost[accepted], since.part(accepted))
+        # Perhaps only the start value was missing: a match from the reference itself is better, as no errors add up.
+        points = self._prepared(self.reference, self.x0[lost[accepted]])
+        direct = self._match(self.reference, current, points, composed.warp, search=False)
+        agree = direct.good & ~(direct.mean_square > limit[accepted])
         agree &= np.hypot(*(direct.warp - composed.warp)[:, :2].T) < _AGREE
-        by_way[lost[there]] = np.where(agree, 0, step)
-        return self._accepted(found, lost[there], _placed(composed, np.flatnonzero(agree), direct.part(agree)))
+        by_way[lost[accepted]] = np.where(agree, 0, step)
+        return self._accepted(
+            matches, lost[accepted], _with_matches(composed, np.flatnonzero(agree), direct.part(agree))
+        )
 
-    def _accepted(self, found: ImageMatches, index: Indices, other: ImageMatches) -> ImageMatches:
-        """The points found, and the points ``index`` (k,) as others found them where they agree with the rest."""
-        both = _placed(found, index, other)
-        odd = self.places.contradict(both.warp[:, :2], np.hypot(*both.sigma.T))[index]
-        return _placed(found, index[~odd], other.part(~odd))
+    def _accepted(self, matches: ImageMatches, index: Indices, other: ImageMatches) -> ImageMatches:
+        """Matches with the points ``index`` (k,) replaced by others where these agree with their neighbours."""
+        both = _with_matches(matches, index, other)
+        odd = self.points.contradict(both.warp[:, :2], np.hypot(*both.sigma.T))[index]
+        return _with_matches(matches, index[~odd], other.part(~odd))
 
     def _composed(self, index: Indices, since: ImageMatches) -> ImageMatches:
-        """Points ``index`` (k,): their motion until they were last seen, and since."""
+        """Compose the motion of points ``index`` (k,) until they were last matched with their motion since."""
         state = self.state
         G = np.eye(2) + since.warp[:, 2:6].reshape(-1, 2, 2)
         warp = np.zeros((len(index), 12))
         warp[:, :2] = state.warp[index, :2] + since.warp[:, :2]
         warp[:, 2:6] = (G @ (np.eye(2) + state.warp[index, 2:6].reshape(-1, 2, 2)) - np.eye(2)).reshape(-1, 4)
-        # An error of the position then is carried along by the gradient since.
+        # The gradient since then carries along the error of the earlier position.
         variance = np.einsum("nij,nj->ni", G**2, state.sigma[index] ** 2) + since.sigma**2
-        return ImageMatches(warp, np.sqrt(variance), np.fmax(state.c_ls[index], since.c_ls), since.rest, since.status)
+        return ImageMatches(
+            warp, np.sqrt(variance), np.fmax(state.c_ls[index], since.c_ls), since.mean_square, since.status
+        )
 
-    def _remember(self, step: int, found: ImageMatches, by_way: Indices) -> None:
-        good, state = found.good, self.state
+    def _update_state(self, step: int, matches: ImageMatches, by_way: Indices) -> None:
+        """Update the state by the matches of a step."""
+        good, state = matches.good, self.state
         self.state = TrackState(
-            warp=np.where(good[:, None], found.warp, state.warp),
+            warp=np.where(good[:, None], matches.warp, state.warp),
             before=np.where((good & (state.last == step - 1))[:, None], state.warp, np.nan),
-            sigma=np.where(good[:, None], found.sigma, state.sigma),
-            c_ls=np.where(good, found.c_ls, state.c_ls),
+            sigma=np.where(good[:, None], matches.sigma, state.sigma),
+            c_ls=np.where(good, matches.c_ls, state.c_ls),
             last=np.where(good, step, state.last),
             by_way=by_way,
             moved=np.array(bool(state.moved) or bool(good.any())),
@@ -353,7 +359,7 @@ class _Points:
 
 
 def _between(first: Floats, second: Floats) -> Floats:
-    """The warps (n, 12) from where ``first`` leads to where ``second`` leads, at first's end, of first order."""
+    """First-order warps (n, 12) from the ends of the warps ``first`` to the ends of the warps ``second``."""
     G1 = np.eye(2) + first[:, 2:6].reshape(-1, 2, 2)
     G2 = np.eye(2) + second[:, 2:6].reshape(-1, 2, 2)
     out = np.zeros_like(first)
@@ -362,11 +368,11 @@ def _between(first: Floats, second: Floats) -> Floats:
     return out
 
 
-def _placed(found: ImageMatches, index: Indices, other: ImageMatches) -> ImageMatches:
-    """``found`` with the points ``index`` (k,) as in ``other``."""
+def _with_matches(matches: ImageMatches, index: Indices, other: ImageMatches) -> ImageMatches:
+    """Matches with the points ``index`` (k,) replaced by those of other matches."""
     arrays = []
-    for name in ("warp", "sigma", "c_ls", "rest", "status"):
-        values = getattr(found, name).copy()
+    for name in ("warp", "sigma", "c_ls", "mean_square", "status"):
+        values = getattr(matches, name).copy()
         values[index] = getattr(other, name)
         arrays.append(values)
     return ImageMatches(*arrays)

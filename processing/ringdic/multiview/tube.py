@@ -1,6 +1,6 @@
-"""Triangles over the measured nodes of a lattice: closed round the ring where the nodes are, small holes filled.
+"""Triangles between the measured nodes of a lattice: closed all round where the nodes are, small holes filled.
 
-No vertex is made: a hole is filled with triangles between the measured nodes about it.
+No vertex is added: a hole is filled with triangles between the measured nodes about it.
 """
 
 from __future__ import annotations
@@ -11,74 +11,79 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from ringdic.arrays import Floats, Indices
-from ringdic.mesh.adjacency import fan_numbers, piece_numbers
-from ringdic.mesh.mesh import half_edges
+from ringdic.arrays import Indices, Points
+from ringdic.mesh.mesh import Mesh
+from ringdic.mesh.polygon import triangulate_polygon
+from ringdic.mesh.topology import pieces, without_pinches
 
-_LARGEST_HOLE = 5.0  # mm², filled
-_MOST_NODES = 16  # lost side by side in a hole worth a look
-_LEAST_PIECE = 32  # triangles of a piece by itself, about those of a subset: fewer have no neighbours to be judged by
+_LARGEST_HOLE = 5.0  # mm², of a hole that is filled
+_MOST_NODES = 16  # lost nodes of a hole that may be filled
+_LEAST_PIECE = 32  # triangles of a piece that stays, about those of a subset: points of a smaller one cannot be judged
 
 
 @dataclass(frozen=True)
 class _Nodes:
-    """The nodes of a lattice (columns, rows) that closes round; places (columns, rows, 3) mm, NaN where lost."""
+    """The nodes of a lattice whose last column adjoins the first. xyz : (columns, rows, 3) mm, NaN where lost."""
 
-    xyz: Floats
+    xyz: Points
 
     @property
     def index(self) -> Indices:
-        """Number of each node, -1 where lost. (columns, rows)."""
+        """Number of each node, (columns, rows) int, column by column; -1 where lost."""
         numbers = np.arange(self.xyz[..., 0].size).reshape(self.xyz.shape[:2])
         return np.where(np.isfinite(self.xyz).all(axis=2), numbers, -1)
 
-    def place(self, node: Indices) -> Indices:
+    def mesh(self, faces: Indices) -> Mesh:
+        """Mesh of some triangles (M, 3) between nodes; its vertices are all nodes of the lattice."""
+        return Mesh(self.xyz.reshape(-1, 3), faces)
+
+    def coordinates(self, node: Indices) -> Indices:
         """Column and row (n, 2) of nodes (n,)."""
         return np.stack(np.divmod(node, self.xyz.shape[1]), axis=-1)
 
     def unrolled(self, node: Indices) -> Indices:
-        """Columns and rows (n, 2), the columns counted on from the first node's across the seam."""
-        place = self.place(node)
+        """Column and row (n, 2) of nodes (n,) close to one another; the columns count on across the last one."""
+        coordinates = self.coordinates(node)
         columns = self.xyz.shape[0]
-        place[:, 0] = place[0, 0] + (place[:, 0] - place[0, 0] + columns // 2) % columns - columns // 2
-        return place
+        coordinates[:, 0] = (
+            coordinates[0, 0] + (coordinates[:, 0] - coordinates[0, 0] + columns // 2) % columns - columns // 2
+        )
+        return coordinates
 
 
-def lattice_faces(xyz: Floats) -> tuple[Indices, tuple[Indices, Indices]]:
-    """Triangles between the measured nodes of a lattice (columns, rows, 3) mm that closes from the last column to the
-    first; NaN where not measured.
+def lattice_faces(xyz: Points) -> tuple[Indices, tuple[Indices, Indices]]:
+    """Lay triangles between the measured nodes of a lattice whose last column adjoins the first.
 
-    Returns faces (M, 3), counter-clockwise seen from outside, and the columns and rows (n,) of the points they use.
-    A cell with four corners is divided along its shorter diagonal, one with three is one triangle; holes of one lost
-    node, or up to 5 mm², are filled; where the sheet would hang together in a point alone, its smaller part goes, and
-    so does a loose scrap of it.
+    A cell with four measured corners is divided along its shorter diagonal, one with three is one triangle. Holes of a
+    single lost node, or of up to 5 mm², are filled. Where the surface would hang together in a point alone, its smaller
+    part is left out, and so are loose scraps.
+
+    xyz : (columns, rows, 3) float64, mm, NaN where not measured. Returns faces (M, 3) int, counter-clockwise seen from
+    outside, and the columns and rows (n,) int of the nodes that they use.
     """
     nodes = _Nodes(xyz)
     faces = _cells(nodes)
     faces = np.concatenate([faces, _fillings(nodes, faces)])
-    count = xyz.shape[0] * xyz.shape[1]
-    faces = _without_scraps(_without_pinches(faces, count))
-    used = np.unique(faces)
-    renumber = np.full(count, -1, np.int64)
-    renumber[used] = np.arange(len(used))
-    column, row = nodes.place(used).T
-    return renumber[faces], (column, row)
+    faces = faces[without_pinches(nodes.mesh(faces), np.ones(len(faces)))]
+    mesh, used = nodes.mesh(_without_scraps(nodes.mesh(faces))).compact()
+    column, row = nodes.coordinates(used).T
+    return mesh.faces, (column, row)
 
 
 def _cells(nodes: _Nodes) -> Indices:
-    """One or two triangles (M, 3) in every cell with three or four measured corners."""
+    """One or two triangles (M, 3) in every cell of the lattice with three or four measured corners."""
     index = nodes.index
     onward = np.roll(index, -1, axis=0)
     a, b, c, d = index[:, :-1].ravel(), onward[:, :-1].ravel(), onward[:, 1:].ravel(), index[:, 1:].ravel()
     flat = nodes.xyz.reshape(-1, 3)
-    whole = (a >= 0) & (b >= 0) & (c >= 0) & (d >= 0)
+    complete = (a >= 0) & (b >= 0) & (c >= 0) & (d >= 0)
     with np.errstate(invalid="ignore"):
-        first = np.linalg.norm(flat[a] - flat[c], axis=1) <= np.linalg.norm(flat[b] - flat[d], axis=1)
+        first_is_shorter = np.linalg.norm(flat[a] - flat[c], axis=1) <= np.linalg.norm(flat[b] - flat[d], axis=1)
     parts = [
-        np.stack([a, b, c], 1)[whole & first],
-        np.stack([a, c, d], 1)[whole & first],
-        np.stack([a, b, d], 1)[whole & ~first],
-        np.stack([b, c, d], 1)[whole & ~first],
+        np.stack([a, b, c], 1)[complete & first_is_shorter],
+        np.stack([a, c, d], 1)[complete & first_is_shorter],
+        np.stack([a, b, d], 1)[complete & ~first_is_shorter],
+        np.stack([b, c, d], 1)[complete & ~first_is_shorter],
     ]
     for p, q, r, missing in ((a, b, c, d), (b, c, d, a), (c, d, a, b), (d, a, b, c)):
         parts.append(np.stack([p, q, r], 1)[(p >= 0) & (q >= 0) & (r >= 0) & (missing < 0)])
@@ -86,12 +91,12 @@ def _cells(nodes: _Nodes) -> Indices:
 
 
 def _fillings(nodes: _Nodes, faces: Indices) -> Indices:
-    """Triangles (k, 3) that close the small holes of a sheet."""
-    edges = _borders(faces)
+    """Triangles (k, 3) that fill the small holes of the surface of some triangles (M, 3)."""
+    edges = nodes.mesh(faces).boundary_edges()
     holes, size = _holes(nodes)
-    where = _beside(nodes, edges)
-    hole = np.where(where[:, 1] >= 0, holes[where[:, 0], np.maximum(where[:, 1], 0)], -1)
-    found: list[tuple[int, int, int]] = []
+    lost_node = _beside(nodes, edges)
+    hole = np.where(lost_node[:, 1] >= 0, holes[lost_node[:, 0], np.maximum(lost_node[:, 1], 0)], -1)
+    fillings = [np.empty((0, 3), np.int64)]
     small = np.flatnonzero((size <= _MOST_NODES)[np.maximum(hole, 0)] & (hole >= 0))
     if not len(small):
         return np.empty((0, 3), np.int64)
@@ -101,28 +106,23 @@ def _fillings(nodes: _Nodes, faces: Indices) -> Indices:
         loop = _loop(loop_edges)
         if loop is None:
             continue
-        triangles = _clipped(loop, nodes.unrolled(loop))
-        corners = nodes.xyz.reshape(-1, 3)[triangles]
-        area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        closed = len(triangles) == len(loop) - 2
-        if closed and (area.sum() <= _LARGEST_HOLE or size[number] == 1):
-            found += [(int(a), int(b), int(c)) for a, b, c in triangles]
-    return np.array(found, np.int64).reshape(-1, 3)
-
-
-def _borders(faces: Indices) -> Indices:
-    """Edges (k, 2) with one triangle, as that triangle runs along them."""
-    directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    span = int(directed.max(initial=0)) + 1
-    _, inverse, count = np.unique(
-        directed.min(axis=1) * span + directed.max(axis=1), return_inverse=True, return_counts=True
-    )
-    return directed[count[inverse] == 1]
+        # On the lattice itself the outline never folds over, however the surface lies in space.
+        outline = np.column_stack([nodes.unrolled(loop), np.zeros(len(loop))]).astype(np.float64)
+        triangles = triangulate_polygon(outline, np.array([0.0, 0.0, 1.0]))
+        if triangles is None:
+            continue
+        filling = nodes.mesh(loop[triangles])
+        if filling.areas.sum() <= _LARGEST_HOLE or size[number] == 1:
+            fillings.append(filling.faces)
+    return np.concatenate(fillings)
 
 
 def _holes(nodes: _Nodes) -> tuple[Indices, Indices]:
-    """The number of the group of lost nodes, side by side or corner to corner, each belongs to, -1 where measured
-    (columns, rows), and the sizes of the groups. Those on the first or last row count as endless."""
+    """Groups of lost nodes that lie side by side or corner to corner.
+
+    Returns the number of each node's group (columns, rows), -1 where measured, and the sizes of the groups, which
+    count as endless where the group touches the first or last row.
+    """
     lost = nodes.index < 0
     columns, rows = lost.shape
     numbers = np.arange(lost.size).reshape(lost.shape)
@@ -145,10 +145,12 @@ def _holes(nodes: _Nodes) -> tuple[Indices, Indices]:
 
 
 def _beside(nodes: _Nodes, edges: Indices) -> Indices:
-    """A lost node (k, 2), column and row, in the cell on the open side of each border edge (k, 2); row -1 if none."""
+    """A lost node (k, 2), column and row, in the cell on the open side of each border edge (k, 2); row -1 if there is
+    none.
+    """
     index = nodes.index
     columns, rows = index.shape
-    start, end = nodes.place(edges[:, 0]), nodes.place(edges[:, 1])
+    start, end = nodes.coordinates(edges[:, 0]), nodes.coordinates(edges[:, 1])
     along = end - start
     along[:, 0] = (along[:, 0] + columns // 2) % columns - columns // 2
     middle = start + 0.5 * along + 0.5 * np.stack([along[:, 1], -along[:, 0]], axis=1)
@@ -165,8 +167,10 @@ def _beside(nodes: _Nodes, edges: Indices) -> Indices:
 
 
 def _loop(edges: Indices) -> Indices | None:
-    """The nodes (k,) of directed edges (k, 2) that make one closed loop, in the hole's own sense; None if not one."""
-    onward = {int(b): int(a) for a, b in edges}  # against the triangles' sense: the hole lies to the left
+    """Nodes (k,) of directed border edges (k, 2) that form one closed loop, counter-clockwise round the hole; None if
+    not.
+    """
+    onward = {int(b): int(a) for a, b in edges}  # against the triangles' sense, so that the hole lies to the left
     if len(onward) != len(edges):
         return None
     loop = [int(edges[0, 0])]
@@ -177,59 +181,10 @@ def _loop(edges: Indices) -> Indices | None:
     return np.array(loop) if following is not None and len(loop) == len(edges) else None
 
 
-def _clipped(loop: Indices, place: Indices) -> Indices:
-    """Triangles (k, 3) of a polygon of nodes (n,) at places (n, 2), by clipping the ear of the shortest cut."""
-    left = list(range(len(loop)))
-    found = []
-    while len(left) > 3:
-        ears = []
-        for i in range(len(left)):
-            before, here, after = left[i - 1], left[i], left[(i + 1) % len(left)]
-            if _turn(place[before], place[here], place[after]) <= 0:
-                continue
-            others = [k for k in left if k not in (before, here, after)]
-            if not any(_inside(place[k], place[[before, here, after]]) for k in others):
-                ears.append((float(np.sum((place[after] - place[before]) ** 2)), i))
-        if not ears:
-            return np.empty((0, 3), np.int64)
-        _, i = min(ears)
-        found.append((left[i - 1], left[i], left[(i + 1) % len(left)]))
-        left.pop(i)
-    if _turn(*(place[k] for k in left)) > 0:
-        found.append((left[0], left[1], left[2]))
-    return loop[np.array(found, np.int64).reshape(-1, 3)]
-
-
-def _turn(a: Indices, b: Indices, c: Indices) -> int:
-    """Twice the signed area of a triangle of places."""
-    return int((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
-
-
-def _inside(p: Indices, triangle: Indices) -> bool:
-    """Whether a place lies in a triangle or on its rim."""
-    return all(_turn(triangle[k], triangle[(k + 1) % 3], p) >= 0 for k in range(3))
-
-
-def _without_pinches(faces: Indices, count: int) -> Indices:
-    """The triangles without those that hang on the rest by one vertex alone; the larger fan at a vertex stays."""
-    for _ in range(20):
-        fan = fan_numbers(half_edges(faces)).reshape(faces.shape)
-        each, first, size = np.unique(fan, return_index=True, return_counts=True)
-        vertex = faces.ravel()[first]
-        if (np.bincount(vertex, minlength=count) <= 1).all():
-            return faces
-        order = np.lexsort((-size, vertex))
-        keep = order[np.flatnonzero(np.diff(vertex[order], prepend=-1))]
-        best = np.full(count, -1)
-        best[vertex[keep]] = each[keep]
-        faces = faces[(fan == best[faces]).all(axis=1)]
-    return faces
-
-
-def _without_scraps(faces: Indices) -> Indices:
-    """The triangles of the largest piece, and of all others that are no scraps."""
-    if not len(faces):
-        return faces
-    piece = piece_numbers(half_edges(faces))
+def _without_scraps(mesh: Mesh) -> Indices:
+    """Triangles (M, 3) of the largest piece of a mesh and of all others that are not too small to be judged."""
+    if not len(mesh.faces):
+        return mesh.faces
+    piece = pieces(mesh)
     triangles = np.bincount(piece)
-    return faces[triangles[piece] >= min(_LEAST_PIECE, triangles.max())]
+    return mesh.faces[triangles[piece] >= min(_LEAST_PIECE, triangles.max())]

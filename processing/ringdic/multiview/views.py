@@ -1,4 +1,4 @@
-"""Which cameras see a node of the surface, and how steeply."""
+"""Visibility of the surface's nodes in the cameras, and the angles of incidence."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ringdic.arrays import Floats, Mask
+from ringdic.arrays import Floats, Mask, Points
 from ringdic.geometry.camera import Camera
 from ringdic.multiview.lattice import TURN, Pieces
 
@@ -16,25 +16,39 @@ _LOOK_ALONG = np.array([2.0, 4.0, 6.0, 9.0, 13.0, 18.0, 25.0, 34.0, 46.0, 60.0])
 
 
 def incidence(pieces: Pieces, cameras: Sequence[Camera]) -> Floats:
-    """Cosine of the angle between normal and line of sight. (C, columns, rows), NaN where there is no surface."""
+    """Cosine of the angle between surface normal and line of sight at every node and camera.
+
+    pieces : the surface. Returns (C, columns, rows) without unit, NaN where there is no surface.
+    """
     xyz, normals = pieces.xyz, pieces.normals
     return np.stack([camera.incidence_cosine(xyz, normals) for camera in cameras])
 
 
-def seen(
+def visibility(
     pieces: Pieces, cameras: Sequence[Camera], masks: Mapping[str, Mask], incidence_deg: float, margin: float
 ) -> tuple[Mask, Floats]:
-    """Which cameras see which nodes, (C, columns, rows), and the cosine of incidence likewise.
+    """Which cameras see which nodes of the surface.
 
-    A node is seen under less than ``incidence_deg``, ``margin`` px inside the image, inside the camera's mask where
-    one was drawn, and not behind another part of the surface.
+    A node is visible in a camera where it is seen under less than ``incidence_deg`` degrees, lies ``margin`` px
+    inside the image and inside the camera's mask, and is not behind another part of the surface.
+
+    Parameters
+    ----------
+    pieces : the surface.
+    masks : (height, width) bool, by camera id; a camera without one sees all of its image.
+    incidence_deg : degrees, steepest angle between normal and line of sight.
+    margin : px.
+
+    Returns
+    -------
+    Visibility (C, columns, rows) bool and cosine of incidence (C, columns, rows).
     """
     cosine = incidence(pieces, cameras)
     with np.errstate(invalid="ignore"):
-        sight = cosine > math.cos(math.radians(incidence_deg))
+        visible = cosine > math.cos(math.radians(incidence_deg))
     xyz = pieces.xyz
     for k, camera in enumerate(cameras):
-        at = np.nonzero(sight[k])
+        at = np.nonzero(visible[k])
         if not len(at[0]):
             continue
         px = camera.project(xyz[at])
@@ -45,12 +59,12 @@ def seen(
             column, row = np.rint(np.where(fits[:, None], px, 0)).astype(int).T
             fits &= mask[row, column]
         fits[fits] = ~_hidden(pieces, camera, xyz[at][fits])
-        sight[k][at] = fits
-    return sight, cosine
+        visible[k][at] = fits
+    return visible, cosine
 
 
-def _hidden(pieces: Pieces, camera: Camera, xyz: Floats) -> Mask:
-    """Points (n, 3) whose line of sight passes below the surface on its way to the camera. (n,)."""
+def _hidden(pieces: Pieces, camera: Camera, xyz: Points) -> Mask:
+    """Points (n, 3) mm whose line of sight passes below the surface on its way to the camera, (n,) bool."""
     towards = camera.centre - xyz
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     hidden = np.zeros(len(xyz), bool)

@@ -1,29 +1,39 @@
-"""What a curved surface does to a subset between two cameras: the map of pixels to second order.
+"""Warp of a subset between two cameras by a curved surface, to second order.
 
 A pixel of the reference camera is taken along its line of sight to the surface and from there into the other camera.
-The derivatives are central differences over a subset's reach: what a subset of that size feels.
+The derivatives are central differences over the reach of a subset, so they are those that a subset of that size sees.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from ringdic.arrays import Floats
+from ringdic.arrays import Floats, Pixels, Points
 from ringdic.geometry.camera import Camera
 from ringdic.multiview.lattice import SurfaceLattice, evaluate
 
-#: Positions of the differences: centre, ± x, ± y, and the four corners.
+#: Offsets of the central differences, in units of the reach: centre, ± x, ± y, and the four corners.
 _STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]], dtype=float)
-_NEWTON = 6
+_NEWTON = 6  # iterations
 
 
 def surface_stencil(
-    lattice: SurfaceLattice, coefficients: Floats, theta: Floats, z: Floats, camera: Camera, px: Floats, reach: float
-) -> Floats:
-    """Where pixels about px (n, 2) of a camera meet the pieces of the surface. (n, 9, 3) mm.
+    lattice: SurfaceLattice, coefficients: Floats, theta: Floats, z: Floats, camera: Camera, px: Pixels, reach: float
+) -> Points:
+    """Intersect the lines of sight of pixels and of their eight neighbours with pieces of surface.
 
-    coefficients : (n, 10), pieces about the places theta, z (n,). reach : px from the centre to its neighbours.
-    NaN where a line of sight misses the piece.
+    Parameters
+    ----------
+    lattice : of the pieces.
+    coefficients : (n, 10) mm, of the pieces.
+    theta, z : (n,) rad and mm, nodes of the pieces.
+    camera : whose pixels they are.
+    px : (n, 2) float64, px.
+    reach : px, from each pixel to its neighbours.
+
+    Returns
+    -------
+    Positions (n, 9, 3) mm, world frame, in the order of ``_STENCIL``; NaN where a line of sight misses the piece.
     """
     d = camera.ray(px[:, None, :] + reach * _STENCIL)
     origin = camera.centre
@@ -44,13 +54,14 @@ def surface_stencil(
     return np.where(np.abs(step)[..., None] < 1e-6, origin + t[..., None] * d, np.nan)
 
 
-def warps_to(camera: Camera, px: Floats, stencil: Floats, reach: float) -> Floats:
-    """Warps (n, 12) from px (n, 2) of the reference camera into another: u v ux uy vx vy uxx uxy uyy vxx vxy vyy.
+def warps_to(camera: Camera, px: Pixels, stencil: Points, reach: float) -> Floats:
+    """Warps from a reference camera into another one, by central differences of the projections of a stencil.
 
-    stencil : (n, 9, 3) mm of :func:`surface_stencil`, with the same reach.
+    px : (n, 2) float64, px, in the reference camera. stencil : (n, 9, 3) mm, of :func:`surface_stencil` with the same
+    ``reach``, px. Returns (n, 12) u v ux uy vx vy uxx uxy uyy vxx vxy vyy, in px and its powers.
     """
-    seen = camera.project(stencil) - (px[:, None, :] + reach * _STENCIL)
-    centre, right, left, below, above, br, bl, ar, al = np.moveaxis(seen, 1, 0)
+    displacement = camera.project(stencil) - (px[:, None, :] + reach * _STENCIL)
+    centre, right, left, below, above, br, bl, ar, al = np.moveaxis(displacement, 1, 0)
     first = np.stack([(right - left) / (2 * reach), (below - above) / (2 * reach)], axis=-1)  # (n, u v, x y)
     second = np.stack(
         [

@@ -1,8 +1,9 @@
-"""Weights of views that are smooth over the image.
+"""Standard deviations that are smooth over the image, by which the views of a point are weighted.
 
-Where cameras have moved a little since they were calibrated their lines of sight miss one another by far more than
-noise, alike all over the surface, and a point lies between them as its weights share that out. A standard deviation of
-a single match scatters by a tenth from one texture to the next: shared out by it, a smooth misfit becomes rough.
+Where cameras have moved a little since they were calibrated, their lines of sight miss one another by far more than
+noise, and alike all over the surface; a point then lies between them as the weights divide the misfit. The standard
+deviation of a single match scatters by a tenth from one texture to the next: divided by it, a smooth misfit would
+become rough.
 """
 
 from __future__ import annotations
@@ -10,21 +11,22 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from ringdic.arrays import Floats
+from ringdic.arrays import Floats, Pixels
 
 
-def smooth_sigma(px: Floats, sigma: Floats, cell: float) -> Floats:
-    """The usual standard deviation about each point of one camera. (n, 2) px, NaN where ``sigma`` is.
+def smooth_sigma(px: Pixels, sigma: Floats, cell: float) -> Floats:
+    """Smooth the standard deviations of one camera's pixels over its image.
 
-    px, sigma : (n, 2). cell : px, side of the squares whose medians are taken, blurred over a square's width and
-    interpolated between their middles.
+    Medians are taken over square cells, blurred over a cell's width and interpolated between the middles of the cells.
+
+    px : (n, 2) float64, px. sigma : (n, 2) px. cell : px, side of the cells. Returns (n, 2) px, NaN where ``sigma`` is.
     """
     known = np.isfinite(px).all(axis=1) & np.isfinite(sigma).all(axis=1)
     out = np.full_like(sigma, np.nan)
     if not known.any():
         return out
-    place = (px[known] - px[known].min(axis=0)) / cell
-    column, row = place.astype(np.int64).T
+    cell_position = (px[known] - px[known].min(axis=0)) / cell
+    column, row = cell_position.astype(np.int64).T
     shape = (int(row.max()) + 1, int(column.max()) + 1)
     number = row * shape[1] + column
     order = np.argsort(number, kind="stable")
@@ -37,8 +39,8 @@ def smooth_sigma(px: Floats, sigma: Floats, cell: float) -> Floats:
             total[axis].flat[which] = len(members) * np.median(values[members, axis])
 
     def blurred(values: Floats) -> Floats:
-        soft = gaussian_filter(values, 1.0, mode="constant")
-        return np.asarray(map_coordinates(soft, place.T[::-1] - 0.5, order=1, mode="nearest"))
+        smooth = gaussian_filter(values, 1.0, mode="constant")
+        return np.asarray(map_coordinates(smooth, cell_position.T[::-1] - 0.5, order=1, mode="nearest"))
 
     out[known] = np.column_stack([blurred(total[0]), blurred(total[1])]) / blurred(count)[:, None]
     return out

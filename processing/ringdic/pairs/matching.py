@@ -19,8 +19,8 @@ from ringdic.correlation.start_field import lattice_spacing, match_from_lattice
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.pairs.tracking import CameraPixels
-from ringdic.sweep.region import lattice_region, well_seen
-from ringdic.sweep.sweep import SWEEP_RADII, Search, radii_of, sweep
+from ringdic.sweep.region import lattice_region, within_incidence
+from ringdic.sweep.sweep import SWEEP_SPACING, DepthSearch, search_radii, sweep_depths
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,13 @@ class Stereo:
     """Two calibrated cameras, the first that of the reference image, and how they are matched."""
 
     cameras: tuple[Camera, Camera]
-    search: Search
+    search: DepthSearch
     settings: CorrelationSettings
 
     @cached_property
     def radii(self) -> Floats:
         """Radii (K,) mm of the sweep."""
-        return radii_of(self.cameras, self.search)
+        return search_radii(self.cameras, self.search)
 
     @property
     def ids(self) -> tuple[str, str]:
@@ -89,7 +89,7 @@ def match_reference(stereo: Stereo, first: Image, second: Image, mask: Mask | No
     xy, faces = grid(region, settings.step)
     reference = prepare_reference(first, region, settings)
     found = match_from_lattice(
-        reference, current, xy, settings, _start_at(xy, seeds, warps), lattice_spacing(settings, SWEEP_RADII)
+        reference, current, xy, settings, _start_at(xy, seeds, warps), lattice_spacing(settings, SWEEP_SPACING)
     )
     px = np.stack([xy, xy + found.uv])  # the grid itself, exact
     sigma = np.stack([np.zeros_like(found.sigma), found.sigma]).astype(np.float32)
@@ -121,11 +121,11 @@ def at_step(at_reference: StepMatches, seen: tuple[CameraPixels | None, CameraPi
 def _find_region(stereo: Stereo, image: Image, current: Current, mask: Mask | None) -> tuple[Mask, Floats, Floats]:
     """The region of interest (height, width), lattice positions (k, 2) px in it and their warps (k, 6)."""
     first, second = stereo.cameras
-    found = sweep(stereo.cameras, image, current, mask, stereo.radii, stereo.search, stereo.settings)
+    found = sweep_depths(stereo.cameras, image, current, mask, stereo.radii, stereo.search, stereo.settings)
     good = found.good
     if mask is None:
         xyz = np.where(good[..., None], found.xyz, np.nan)
-        good = good & well_seen(xyz, stereo.cameras, stereo.search.incidence)
+        good = good & within_incidence(xyz, stereo.cameras, stereo.search.incidence)
     if good.sum() < 4:
         where = "" if mask is None else f" inside the mask of camera {first.id}"
         covered = "" if mask is None else ", that the mask covers it"

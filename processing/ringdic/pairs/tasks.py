@@ -29,7 +29,7 @@ from ringdic.pairs.tracking import (
 )
 from ringdic.session.folder import Capture, Session
 from ringdic.session.images import read_mask
-from ringdic.sweep.sweep import Search
+from ringdic.sweep.sweep import DepthSearch
 from ringdic.tasks import Arrays, Task, code_stamp, digest, process_memory, read_output, work_folder
 from ringdic.tasks.step_images import Digests, step_image
 
@@ -83,7 +83,7 @@ def pair_jobs(
     cameras: Mapping[str, Camera],
     pairs: Sequence[tuple[str, str]],
     steps: Sequence[Capture],
-    search: Search,
+    search: DepthSearch,
     correlation: CorrelationSettings,
 ) -> list[PairJob]:
     """The tasks of all pairs over these steps, the reference first."""
@@ -177,7 +177,7 @@ def _prepared(
         if not len(followed.xy):
             raise ComputationError(f"camera {camera.id}: none of its pairs gave a surface")
         reference = prepare_reference(step_image(image, camera), followed.region, settings)
-        assert reference.slopes  # computed when first asked for
+        assert reference.gradient  # computed when first asked for
         return followed, reference
 
     def size(value: tuple[CameraGrid, Reference]) -> int:

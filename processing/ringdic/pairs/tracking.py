@@ -23,10 +23,10 @@ from ringdic.correlation import (
     Status,
     correlate_points,
     prepare_current,
-    search_hypotheses,
+    search_warps,
 )
-from ringdic.correlation.lattice_field import between_corners
-from ringdic.correlation.seeds import flow_starts
+from ringdic.correlation.lattice_field import interpolate_lattice
+from ringdic.correlation.seeds import flow_start_values
 from ringdic.correlation.start_field import lattice_spacing, match_from_lattice, on_lattice
 
 _HELD = 0.6  # ZNCC under the warp that optical flow tells, from which on it is a start value
@@ -121,7 +121,7 @@ def match_camera(reference: Reference, image: Image, grid: CameraGrid, settings:
 def places(found: CameraMatches, xy: Floats) -> CameraPixels:
     """Where places xy (n, 2) px of the camera's reference image lie in its image of a step."""
     values = np.column_stack([found.uv, found.gradient.reshape(-1, 4), found.sigma, found.c_ls]).astype(np.float64)
-    told, weight = between_corners(found.xy, values, found.step, xy)
+    told, weight = interpolate_lattice(found.xy, values, found.step, xy)
     lost = ~(weight >= _LEAST)
     told[lost] = np.nan
     status = np.zeros(len(xy), np.int8)
@@ -135,9 +135,9 @@ def match_in_time(reference: Reference, current: Current, xy: Floats, settings: 
     Where that leads to few matches the correlation looks for start values in its own ways.
     """
     chosen = np.flatnonzero(on_lattice(xy, lattice_spacing(settings)))
-    flow = flow_starts(reference, current, xy[chosen], settings.radius)[:, [0, 6, 1, 2, 7, 8]]
+    flow = flow_start_values(reference, current, xy[chosen], settings.radius)[:, [0, 6, 1, 2, 7, 8]]
     known = np.flatnonzero(np.isfinite(flow).all(axis=1))
-    warps, zncc, _ = search_hypotheses(reference, current, xy[chosen[known]], flow[known][:, None], settings.radius)
+    warps, zncc, _ = search_warps(reference, current, xy[chosen[known]], flow[known][:, None], settings.radius)
     held = zncc > _HELD
     if held.sum() < _SOME * max(len(chosen), 1):
         return correlate_points(reference, current, xy, settings)

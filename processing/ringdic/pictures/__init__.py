@@ -1,6 +1,7 @@
-"""Fields drawn: on the unrolled surface, on the body seen from a side, on the photographs, and moving over the steps.
+"""Pictures of fields: on the unrolled surface, on the body from a side, over the photographs, animated over the steps.
 
-``painter`` fills triangles into an image of their numbers; everything else looks colours up by these numbers, so that
-a view painted once serves every field. ``scale`` is a field's colours with their limits and bar, ``views`` are the ways
-to look, ``overlay`` puts a field onto a photograph, ``animation`` writes GIF and MP4. What was not measured is blank.
+``painter`` rasterises the triangles into an image of triangle numbers; colours are looked up by these numbers, so that
+a view rasterised once serves every field. ``scale`` holds a field's colours, limits and colour bar, ``views`` the
+projections of the surface, ``overlay`` draws a field over a photograph, ``animation`` writes GIF and MP4. What was not
+measured stays blank.
 """

@@ -1,4 +1,4 @@
-"""A field moving over the steps, as GIF or MP4."""
+"""Animations of a field over the steps, as GIF or MP4."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from ringdic.errors import ComputationError, InputError
 from ringdic.mesh.mesh import Mesh
 from ringdic.pictures.overlay import no_larger, overlay, photograph, with_bar
-from ringdic.pictures.scale import Picture, Scale, looked_up, on_faces
+from ringdic.pictures.scale import Picture, Scale, face_colours, on_faces
 from ringdic.pictures.views import Extent, from_side, side_extent
 from ringdic.results.evaluation import EvaluatedResults
 from ringdic.session.folder import Session
@@ -25,14 +25,21 @@ _INSIDE = (219, 222, 227)
 def overlay_frames(
     seen: EvaluatedResults, session: Session, camera_id: str, scale: Scale, side: int = 720, opacity: float = 0.65
 ) -> Iterator[Picture]:
-    """A frame a step: the camera's photograph with the field over it, its colour bar and the step's name."""
+    """Frames of an animation, one a step: a camera's photograph with the field over it, colour bar and step name.
+
+    side : px, longest side of a frame. opacity : of the colours, 0 to 1. Frames are (height, width, 3) sRGB.
+    """
     for step, name in enumerate(seen.steps):
         laid = overlay(seen, camera_id, photograph(session, name, camera_id), scale, step, opacity)
         yield _framed(no_larger(laid, side), scale, f"{step}: {name}, camera {camera_id}")
 
 
 def surface_frames(seen: EvaluatedResults, scale: Scale, azimuth: float, side: int = 720) -> Iterator[Picture]:
-    """A frame a step: the body seen from ``azimuth`` (rad), as it stood, or moved back if the evaluation says so."""
+    """Frames of an animation, one a step: the coloured surface seen from an azimuth (rad).
+
+    The surface is drawn where it stood, or freed of its rigid motion if the evaluation removes it. side : px, height of
+    a frame. Frames are (height, width, 3) sRGB. Raises ComputationError if no step has a measured triangle.
+    """
     meshes = [Mesh(seen.positions(step), seen.results.faces) for step in range(len(seen.steps))]
     extents = np.array([side_extent(mesh, azimuth) for mesh in meshes if mesh.whole_faces().any()])
     if not len(extents):
@@ -42,7 +49,7 @@ def surface_frames(seen: EvaluatedResults, scale: Scale, azimuth: float, side: i
     for step, mesh in enumerate(meshes):
         view = from_side(mesh, azimuth, height=2 * side, extent=common)  # twice as fine, for smooth rims
         values = on_faces(seen, scale.field, seen.step(step).scalar(scale.field), step)
-        drawn = looked_up(view.faces, values, scale)
+        drawn = face_colours(view.faces, values, scale)
         picture = np.where(drawn[..., 3:] > 0, np.rint(255.0 * drawn[..., :3]), 255.0).astype(np.uint8)
         picture[view.inside] = _INSIDE
         yield _framed(no_larger(picture, side), scale, f"{step}: {seen.steps[step]}")
@@ -68,7 +75,7 @@ def write_animation(path: Path, frames: Sequence[Picture], seconds: float = 0.8)
 
 
 def _write_gif(path: Path, frames: Sequence[Picture], seconds: float) -> None:
-    """All frames with the colours of all of them together, so that nothing flickers."""
+    """Write a GIF whose frames share one palette, so that colours do not flicker."""
     together = Image.fromarray(np.vstack([frame[::4, ::4] for frame in frames]))
     palette = together.quantize(256, dither=Image.Dither.NONE)
     pictures = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]

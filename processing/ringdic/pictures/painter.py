@@ -1,4 +1,4 @@
-"""Triangles filled into an image of their numbers, the nearest one in front."""
+"""Rasterisation of triangles into an image of triangle numbers, the nearest triangle in front."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _AT_ONCE = 2_000_000  # pixels tried at a time
 
 
 def paint(corners: Floats, depth: Floats, shape: tuple[int, int]) -> FaceImage:
-    """The number of the triangle that each pixel's centre shows, (height, width); -1 where there is none.
+    """Rasterise triangles: the number of the triangle seen at each pixel's centre, (height, width); −1 for none.
 
     corners : (M, 3, 2) px; a triangle with a corner that is not finite is left out. depth : (M,), the smaller the
     nearer. Triangles are taken from far to near, each as a whole, as is right where none pass through one another.
@@ -48,7 +48,7 @@ def _fill(
     across: Indices,
     tried: Indices,
 ) -> None:
-    """Fill some triangles, in their order, by trying every pixel of their bounding boxes."""
+    """Rasterise some triangles in their order by testing every pixel of their bounding boxes."""
     of = np.repeat(np.arange(len(faces)), tried)
     row, column = np.divmod(np.arange(len(of)) - np.repeat(np.cumsum(tried) - tried, tried), across[of])
     x, y = first[of, 0] + column, first[of, 1] + row
@@ -59,7 +59,7 @@ def _fill(
 
 
 def _turn(a: Floats, b: Floats, x: Indices, y: Indices, of: Indices) -> Floats:
-    """On which side of the line from a to b a pixel lies."""
+    """Signed distance of pixels from the line a to b, times its length: its sign says on which side a pixel lies."""
     along = b - a
     constant = along[:, 0] * a[:, 1] - along[:, 1] * a[:, 0]
     return np.asarray(along[of, 0] * y - along[of, 1] * x - constant[of])

@@ -1,4 +1,4 @@
-"""A field's colours: limits, values to colours, and the bar that tells them."""
+"""Colour scales of fields: limits, colours of values, and the colour bar."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Scale:
-    """Colours of a field between two limits; diverging where the field has a middle."""
+    """Colour scale of a field between two limits; diverging where the field has a centre, else sequential."""
 
     field: Field
     low: float
@@ -36,7 +36,7 @@ class Scale:
 
     @property
     def diverging(self) -> bool:
-        """Whether the colours have a middle."""
+        """Whether the scale diverges from the field's centre."""
         return self.field.centre is not None
 
     @property
@@ -45,16 +45,16 @@ class Scale:
         return f"{self.field.label}, {self.field.unit}" if self.field.unit else self.field.label
 
     def colours(self, values: Floats) -> Floats:
-        """sRGB (..., 3) from 0 to 1."""
+        """Colours of values (...) in the unit of the field: sRGB (..., 3), 0 to 1."""
         return colours(values, self.low, self.high, self.diverging)
 
     def mappable(self) -> ScalarMappable:
-        """The same colours for a plot's colour bar."""
+        """The colour scale as matplotlib's mappable, for the colour bar of a plot."""
         listed = ListedColormap(colours(np.linspace(0.0, 1.0, 256), 0.0, 1.0, self.diverging).tolist())
         return ScalarMappable(Normalize(self.low, self.high), listed)
 
     def bar(self, height: int) -> Picture:
-        """The colour bar with its title as a picture of its own, (height, ·, 3), black on white."""
+        """Picture of the colour bar with its title, (height, width, 3), black on white. height : px."""
         dpi = max(70.0, height / 7.0)
         picture = Figure(figsize=(1.15, height / dpi), dpi=dpi, layout="constrained")
         axes = picture.subplots()
@@ -70,13 +70,16 @@ class Scale:
 
 
 def scale_of(seen: EvaluatedResults, name: str, limits: tuple[float, float] | None = None) -> Scale:
-    """The scale of a field, by default between limits that serve all steps. InputError for a field there is not."""
+    """Colour scale of a field, between ``limits`` or limits that suit all steps. Raises InputError if unknown."""
     low, high = seen.limits(name) if limits is None else limits
     return Scale(seen.field(name), float(low), float(high))
 
 
 def on_faces(seen: EvaluatedResults, entry: Field, values: Floats, step: int) -> Floats:
-    """Values of a field at a step on the triangles (M,): of points, the mean of the corners; NaN where not measured."""
+    """Values of a field on the triangles (M,), in its unit, NaN where a corner was not measured at the step.
+
+    values : (N,) or (M,) of the field, by its location; values of points are averaged over a triangle's corners.
+    """
     faces = seen.results.faces
     if entry.location == "point":
         values = values[faces].mean(axis=1)
@@ -85,14 +88,17 @@ def on_faces(seen: EvaluatedResults, entry: Field, values: Floats, step: int) ->
 
 
 def palette(scale: Scale) -> Picture:
-    """256 colours (256, 3) that a drawing in this scale is made of: the scale's own and greys for lines and letters."""
+    """Palette (256, 3), uint8 sRGB, for drawings in this scale: 224 of its colours and 32 greys for lines and text."""
     steps = scale.colours(np.linspace(scale.low, scale.high, 224))
     greys = np.repeat(np.linspace(0.0, 1.0, 32)[:, None], 3, axis=1)
     return np.rint(255.0 * np.concatenate([steps, greys])).astype(np.uint8)
 
 
-def looked_up(faces: NDArray[np.int32], values: Floats, scale: Scale) -> Floats:
-    """The picture (h, w, 4) RGBA from 0 to 1 of an image of face numbers; clear where nothing was measured."""
+def face_colours(faces: NDArray[np.int32], values: Floats, scale: Scale) -> Floats:
+    """Colours of an image of triangle numbers: RGBA (height, width, 4), 0 to 1, clear where nothing was measured.
+
+    faces : (height, width), −1 for none, as `ringdic.pictures.painter.paint` makes it. values : (M,) of the field.
+    """
     of_face = np.zeros((len(values) + 1, 4))
     of_face[:-1, :3] = scale.colours(values)
     of_face[:-1, 3] = np.isfinite(values)

@@ -1,4 +1,4 @@
-"""Ways to look at a surface: unrolled about the axis, from a side without perspective, through a camera of the rig."""
+"""Projections of a surface: unrolled about the axis, from a side without perspective, through a camera of the rig."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _STEEPEST = 0.05  # cosine below which a triangle is seen edge-on and is not dra
 
 @dataclass(frozen=True)
 class View:
-    """A surface painted.
+    """A rasterised view of a surface.
 
-    faces : (h, w) number of the triangle, -1 for none. inside : (h, w) whether its inner side is seen.
+    faces : (height, width) number of the triangle, −1 for none. inside : (height, width) whether its inner side shows.
     extent : left, right, bottom, top in the units of the axes (degrees and mm when unrolled, else mm).
     aspect : width over height of what is shown, on the body.
     """
@@ -39,17 +39,17 @@ class View:
 
 
 def mean_azimuth(mesh: Mesh) -> float:
-    """Direction about z, rad, that the whole surface faces; 0 for one that faces all sides alike."""
+    """Azimuth about z (rad) that the surface faces on average; 0 for a surface that faces all sides alike."""
     facing = np.nansum(mesh.area_vectors, axis=0)
     total = float(np.nansum(mesh.areas))
     return float(np.arctan2(facing[1], facing[0])) if np.hypot(*facing[:2]) > 0.1 * total else 0.0
 
 
 def unrolled(mesh: Mesh, width: int = 720) -> View:
-    """The surface over azimuth about z (degrees) and height z (mm), seen from outside.
+    """The surface unrolled over azimuth about z (degrees) and height z (mm), seen from outside.
 
-    A whole ring runs from 0° to 360°; a part of one is cut where there is none of it. Azimuth runs to the right, as it
-    does for whoever stands outside with z upwards.
+    A closed ring runs from 0° to 360°; an open surface is cut in the middle of its gap. Azimuth increases to the right,
+    as seen from outside with z upwards. width : px.
     """
     azimuth = np.degrees(np.arctan2(mesh.vertices[:, 1], mesh.vertices[:, 0]))
     z = mesh.vertices[:, 2]
@@ -71,9 +71,10 @@ def unrolled(mesh: Mesh, width: int = 720) -> View:
 
 
 def from_side(mesh: Mesh, azimuth: float, height: int = 560, tilt: float = _TILT, extent: Extent | None = None) -> View:
-    """The surface seen from afar at an azimuth (rad), from ``tilt`` above the horizontal; extent in mm, up is up.
+    """The surface seen without perspective from an azimuth (rad) and ``tilt`` (rad) above the horizontal.
 
-    extent : what the picture shows, by default the whole surface. Lost triangles are left out.
+    height : px. extent : left, right, bottom, top in mm; the whole surface unless given. Triangles with a lost corner
+    are left out.
     """
     towards, right, up = _axes(azimuth, tilt)
     extent = side_extent(mesh, azimuth, tilt) if extent is None else extent
@@ -96,14 +97,17 @@ def side_extent(mesh: Mesh, azimuth: float, tilt: float = _TILT) -> Extent:
 
 
 def _axes(azimuth: float, tilt: float) -> tuple[Floats, Floats, Floats]:
-    """Unit vectors towards the onlooker, to the right and up of the picture."""
+    """Unit vectors towards the viewer, to the right and upwards in the picture."""
     towards = np.array([np.cos(azimuth) * np.cos(tilt), np.sin(azimuth) * np.cos(tilt), np.sin(tilt)])
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     return towards, right, np.cross(towards, right)
 
 
 def through_camera(mesh: Mesh, camera: Camera) -> FaceImage:
-    """The triangles that a camera of the rig sees, in pixels of its image (h, w); lost ones and back sides are not."""
+    """Numbers of the triangles that a camera sees, per pixel of its image (height, width), −1 for none.
+
+    Triangles with a lost corner and those that face away are left out.
+    """
     corners = mesh.vertices[mesh.faces]
     centroids = corners.mean(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -115,7 +119,7 @@ def through_camera(mesh: Mesh, camera: Camera) -> FaceImage:
 
 
 def _cut(azimuth: Floats) -> float:
-    """Where a surface is cut to be unrolled, degrees: in the middle of its widest gap, at 0 for a whole ring."""
+    """Azimuth (degrees) at which a surface is cut to be unrolled: the middle of its widest gap, 0 for a closed ring."""
     ordered = np.sort(azimuth[np.isfinite(azimuth)])
     gaps = np.diff(ordered, append=ordered[0] + 360.0)
     widest = int(np.argmax(gaps))
@@ -123,7 +127,7 @@ def _cut(azimuth: Floats) -> float:
 
 
 def _in_pixels(xy: Floats, extent: Extent, shape: tuple[int, int]) -> Floats:
-    """Places (..., 2) of the axes in pixels of a picture whose borders are the extent's."""
+    """Pixels (..., 2) of positions xy (..., 2) on the axes, in a picture whose borders are the extent."""
     left, right, low, high = extent
     x = (xy[..., 0] - left) / (right - left) * shape[1] - 0.5
     y = (high - xy[..., 1]) / (high - low) * shape[0] - 0.5

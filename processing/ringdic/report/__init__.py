@@ -1,7 +1,7 @@
-"""One self-contained HTML page of a processing run: what was measured, with what, how well; for archives and readers.
+"""The report of a processing run as one self-contained HTML page: what was measured, with what, and how well.
 
-It fetches nothing: styles and pictures are inside. ``document`` is the HTML, ``hardware`` measures what the images tell
-of cameras and pattern, ``tables`` are the reporting tables, ``noise`` the noise floor, ``plots`` the drawings.
+Styles and pictures are inside the page; it fetches nothing. ``document`` builds the page, ``hardware`` measures cameras
+and pattern on the images, ``tables`` are the reporting tables, ``noise`` the noise floor, ``plots`` the drawings.
 """
 
 from ringdic.report.report import write_report

@@ -1,4 +1,4 @@
-"""What a report needs of the fields, gathered in one pass: a step is costly to evaluate and is evaluated once."""
+"""Fields, scales and statistics for a report, gathered in one pass, because evaluating a step is costly."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ from ringdic.results.ranges import Ranges, even_limits
 class Gathered:
     """Fields of a run over its steps.
 
-    scales : by name, with limits that serve all steps. faces : by name and step, the values on the triangles (M,), of
-    the steps that get maps. values : by name and step, where the field lies. statistics : by name and step.
+    steps : names. shown : indices of the steps that get maps. scales : by field, with limits for all steps.
+    faces : by field and shown step, values on the triangles (M,) in the unit of the field. values : by field and shown
+    step, the finite values (n,) of its points or triangles. statistics : by field and step.
     """
 
     steps: tuple[str, ...]
@@ -39,7 +40,7 @@ def gather(
     shown: Sequence[int],
     progress: Callable[[float], None] = lambda _: None,
 ) -> Gathered:
-    """Gather the fields of these names that the run has; keep the values of the steps shown."""
+    """Gather those of the named fields that the run has. shown : steps whose values are kept for maps."""
     fields = [entry for name in names for entry in seen.fields if entry.name == name]
     ranges = Ranges(fields)
     weights = _weights(seen)
@@ -65,7 +66,7 @@ def _scale(entry: Field, row: dict[str, Any]) -> Scale:
 
 
 def _weights(seen: EvaluatedResults) -> dict[str, Floats]:
-    """Area in the reference of each triangle, and of each point a third of its triangles'."""
+    """Weights in mm²: the reference area of each triangle, and for each point a third of that of its triangles."""
     mesh = seen.results.mesh
     areas = mesh.areas
     shares = np.bincount(mesh.faces.ravel(), np.repeat(areas / 3.0, 3), len(mesh.vertices))

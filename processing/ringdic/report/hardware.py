@@ -1,4 +1,4 @@
-"""What the cameras and their pattern were: image size, scale, distance, exposure, speckle, noise; as measured."""
+"""Measured facts of cameras and pattern: image size, scale, distance, exposure, speckle size, noise."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SIDE = 1200  # px, of the part of an image that is looked at
 
 @dataclass(frozen=True)
 class CameraFacts:
-    """One camera at the reference, over the points that it sees squarely. None for what is not known.
+    """Facts of one camera at the reference step, over the points that it sees under a small angle; None where unknown.
 
     size : (width, height) px. stand_off : mm, median distance of the points. scale : px a mm across the line of sight.
     field : (width, height) mm that the image shows at that distance. focal : px. speckle : px, see ``speckle_size``.
@@ -50,7 +50,7 @@ class CameraFacts:
 
 
 def camera_facts(session: Session, results: Results) -> tuple[CameraFacts, ...]:
-    """The facts of every calibrated camera. Reads a reference image each, and those at rest."""
+    """Facts of every calibrated camera; reads its reference image and its images at rest."""
     captures = {capture.id: capture for capture in session.captures}
     reference = captures.get(results.steps[0])
     at_rest = session.of_kind("static")
@@ -66,7 +66,7 @@ def _facts(
     found: dict[str, object] = {"focal": None if lens is None else float(np.sqrt(lens.K[0, 0] * lens.K[1, 1]))}
     with np.errstate(invalid="ignore"):
         xyz = mesh.vertices[camera.incidence_cosine(mesh.vertices, normals) > _SQUARELY]
-    px, slope = camera.project_with_slope(xyz)
+    px, slope = camera.project_with_jacobian(xyz)
     shown = ((px > 0) & (px < np.array(camera.size) - 1.0)).all(axis=1)
     px, slope, xyz = px[shown], slope[shown], xyz[shown]
     if len(px) >= _FEWEST:
@@ -87,7 +87,7 @@ def _facts(
 def _of_images(
     camera: Camera, px: Floats, reference: Capture, at_rest: tuple[Capture, ...]
 ) -> dict[str, float | bool | None]:
-    """Speckle, contrast and noise about the middle of the points."""
+    """Speckle size, contrast and noise in the part of the reference image around the middle of the points px (n, 2)."""
     middle = np.median(px, axis=0)
     low = np.maximum(np.maximum(px.min(axis=0), middle - _SIDE / 2), 0).astype(int)
     high = np.minimum(np.minimum(px.max(axis=0), middle + _SIDE / 2), np.array(camera.size) - 1).astype(int) + 1

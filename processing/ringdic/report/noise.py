@@ -1,4 +1,4 @@
-"""The noise floor: from captures of the specimen at rest, else as the measurement itself states its uncertainty."""
+"""The report's section on noise: the noise floor from captures at rest, and the stated standard deviations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STATED = {
 
 
 def noise_rows(results: Results, gathered: Gathered) -> dict[str, str]:
-    """The noise floors of displacement and strain as rows of the analysis table."""
+    """Noise floors of displacement and strain, as rows of the analysis table."""
     floor = results.summary.get("noise_floor")
     if floor:
         moved, strain = floor["quantities"]["displacement"], floor["quantities"]["E_magnitude"]
@@ -44,7 +44,7 @@ def noise_rows(results: Results, gathered: Gathered) -> dict[str, str]:
 
 
 def noise(document: Document, results: Results, gathered: Gathered) -> None:
-    """The section on noise and uncertainty."""
+    """Write the section on noise and uncertainty."""
     floor: dict[str, Any] | None = results.summary.get("noise_floor")
     if floor:
         document.heading("Noise floor from captures at rest")

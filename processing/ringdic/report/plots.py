@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ringdic.arrays import Floats
-from ringdic.pictures.scale import Scale, looked_up
+from ringdic.pictures.scale import Scale, face_colours
 from ringdic.pictures.views import View
 from ringdic.report.gathered import Gathered
 
@@ -18,23 +18,23 @@ _LINES = ("#1d6ec4", "#c4581d", "#2c8a4b", "#7b3fa0", "#a0762f")
 
 
 class StepViews:
-    """How one step is looked at: the map painted at the reference, and views of the body as it stood."""
+    """The views of one step: the unrolled map at the reference, and the body at that step from its sides."""
 
     def __init__(self, step: int, name: str, unrolled: View, sides: Sequence[tuple[str, View]]) -> None:
         self.step, self.name, self.unrolled, self.sides = step, name, unrolled, tuple(sides)
 
 
 def maps(gathered: Gathered, scale: Scale, shown: Sequence[StepViews]) -> Figure:
-    """One field: a row a step, its map and the body from its sides, with one scale for all."""
+    """Maps of one field: a row a step with its unrolled map and the body from its sides, one colour scale for all."""
     views = [(step.unrolled, *(view for _, view in step.sides)) for step in shown]
     widths = [max(1.0, 2.9 * min(view.aspect, 2.0)) for view in views[0]]
     drawn = Figure(figsize=(sum(widths) + 1.6, 3.2 * len(shown) + 0.5), layout="constrained")
     axes = drawn.subplots(len(shown), len(widths), squeeze=False, width_ratios=widths)
     for row, step in zip(axes, shown, strict=True):
         values = gathered.faces[scale.field.name, step.step].astype(float)
-        _map(row[0], step.unrolled, looked_up(step.unrolled.faces, values, scale), step.name)
+        _map(row[0], step.unrolled, face_colours(step.unrolled.faces, values, scale), step.name)
         for each, (side, view) in zip(row[1:], step.sides, strict=True):
-            _body(each, view, looked_up(view.faces, values, scale), side)
+            _body(each, view, face_colours(view.faces, values, scale), side)
     drawn.colorbar(scale.mappable(), ax=axes, label=scale.title, shrink=min(1.0, 3.0 / len(shown)), pad=0.01)
     return drawn
 
@@ -56,7 +56,7 @@ def _body(axes: Axes, view: View, picture: Floats, side: str) -> None:
 
 
 def courses(gathered: Gathered, names: Sequence[str]) -> Figure:
-    """Median of each field over the steps, and the band that holds nine tenths of it."""
+    """Plots of the median of each field over the steps, with the band from the 5th to the 95th percentile."""
     scales = [gathered.scales[name] for name in names]
     drawn = Figure(figsize=(10.5, 2.7 * ((len(names) + 1) // 2)), layout="constrained")
     axes = drawn.subplots((len(names) + 1) // 2, 2, squeeze=False).ravel()
@@ -77,7 +77,7 @@ def courses(gathered: Gathered, names: Sequence[str]) -> Figure:
 
 
 def histograms(gathered: Gathered, names: Sequence[str]) -> Figure:
-    """How each field is spread at the steps shown: share of the surface's points or triangles."""
+    """Histograms of each field at the steps shown: shares of the points or triangles."""
     scales = [gathered.scales[name] for name in names]
     rows = (len(scales) + 2) // 3
     drawn = Figure(figsize=(10.5, 2.3 * rows), layout="constrained")

@@ -1,4 +1,4 @@
-"""The report of a run, from its first line to its last."""
+"""Writing the report of a run: gather its fields, fill the sections, write the page."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def write_report(
     run: int | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Path:
-    """Write the report of a run and return where it lies.
+    """Write the report of a run; the path of its HTML file.
 
     session_path : the session's folder. out : the HTML file, by default ``report.html`` beside the results. run : its
     number, the newest unless given. progress : is told the share done.
@@ -130,9 +130,7 @@ def _pictures(
         for name in chosen:
             if name in gathered.scales:
                 scale = gathered.scales[name]
-                document.picture(
-                    f"map-{name}", plots.maps(gathered, scale, views), _caption(scale), palette(scale), dpi=100
-                )
+                document.picture(f"map-{name}", plots.maps(gathered, scale, views), _caption(scale), palette(scale))
                 done += 1
                 progress(0.2 + 0.8 * done / len(gathered.scales))
 
@@ -159,14 +157,14 @@ def _statistics(document: Document, gathered: Gathered) -> None:
 
 
 def shown_steps(count: int) -> list[int]:
-    """Steps that get maps: all after the reference if they are few, else some spread evenly, the last among them."""
+    """Indices of the steps that get maps: all after the reference, or a few spread evenly that include the last."""
     if count == 1:
         return [0]
     return sorted({int(k) for k in np.rint(np.linspace(1, count - 1, min(_STEPS_SHOWN, count - 1)))})
 
 
 def _views(seen: EvaluatedResults, steps: Sequence[int]) -> list[plots.StepViews]:
-    """The views of the steps shown; the map lies over the reference, so that a place stays where it is."""
+    """The views of the steps shown. Maps are drawn over the reference, so that a material place stays where it is."""
     reference = unrolled(seen.results.mesh)
     front = mean_azimuth(seen.results.mesh)
     made = []

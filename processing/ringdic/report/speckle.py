@@ -1,4 +1,4 @@
-"""How large the speckles are, from the autocorrelation of the image."""
+"""Size of the speckles from the autocorrelation of the image."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _PATCHES = 64
 
 
 def speckle_size(image: Image, px: Floats, noise: float = 0.0) -> float | None:
-    """Width at half height of the autocorrelation's peak, px, the mean over all directions; None without patches.
+    """Speckle size in px: full width at half maximum of the autocorrelation, over all directions; None if unknown.
 
     image : (h, w) grey levels. px : (n, 2) places about which patches of 64 px are taken. noise : variance, grey
-    levels²: it stands on the peak without width and is taken off. A disk's peak is 0.81 of its diameter wide.
+    levels²: it adds a peak of no width, which is removed. A disk's peak is 0.81 of its diameter wide.
     """
     half = _SIDE // 2
     height, width = image.shape[:2]

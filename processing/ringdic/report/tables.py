@@ -32,7 +32,7 @@ _REASONS: dict[int, str] = {
 
 
 def hardware(document: Document, session: Session, results: Results, cameras: Sequence[CameraFacts]) -> None:
-    """What it was measured with."""
+    """Write the tables of cameras, optics and pattern."""
     document.facts("hardware-table", _hardware(session, results, cameras))
     document.table(
         "cameras",
@@ -78,7 +78,7 @@ def _hardware(session: Session, results: Results, cameras: Sequence[CameraFacts]
 
 
 def analysis(document: Document, results: Results, version: str, floor: dict[str, str]) -> None:
-    """How it was evaluated; ``floor`` are the rows of the noise floors."""
+    """Write the table of the analysis. floor : rows of the noise floors."""
     settings = Settings.model_validate(tomllib.loads(results.settings))
     correlation, surface = settings.correlation, settings.surface
     alone, over = gauge(results, 0.0), gauge(results, results.window_mm)
@@ -117,9 +117,45 @@ def analysis(document: Document, results: Results, version: str, floor: dict[str
 
 
 def calibration(document: Document, session: Session, results: Results) -> None:
-    """How the cameras were calibrated and how well."""
+    """Write the tables of the calibration and its quality."""
+    document.facts("calibration-table", _calibration(session, results))
+    document.table(
+        "camera-calibration",
+        ("camera", "azimuth, °", "off nominal, °", "dots", "left out", "dots' residual, px", "board views used",
+         "board residual, px", "image covered", "residual distortion, px", "lens error, px"),
+        (
+            (row["camera"], f"{row['azimuth_deg']:.1f}", f"{row.get('azimuth_off_deg', float('nan')):+.1f}",
+             row["dots"], row["left_out"], figure(row["residual_rms"], 3),
+             f"{row['board_views_used']} of {row['board_views']}", figure(row["board_rms"], 3),
+             _percent(row.get("board_coverage")), figure(row.get("residual_distortion"), 3),
+             figure(row.get("lens_error"), 3))
+            for row in results.summary.get("cameras", [])
+        ),
+        "RMS distances. Lens error: how far the standard errors of the lens shift the dots' images.",
+    )  # fmt: skip
+    figures = results.summary.get("calibration", {})
+    rows = [
+        (" – ".join(row["pair"]), row["points"], figure(row["mean"], 3), figure(row["rms"], 3),
+         f"{row['angle_deg']:.1f}", figure(row["epipolar_rms"], 3))
+        for row in figures.get("pairs", [])
+    ] or [
+        (" – ".join(row["pair"]), row["points"], figure(row["mean_mm"], 3), figure(row["rms_mm"], 3), "–", "–")
+        for row in results.calibration.get("pairs", [])
+    ]  # fmt: skip
+    document.table(
+        "pair-calibration",
+        ("pair", "dots in common", "mean vector, mm", "RMS, mm", "angle, °", "epipolar residual, px"),
+        rows,
+        "Control points reconstructed by each pair, against their places on the target.",
+    )
+    if figures.get("advice"):
+        document.heading("What would make it better")
+        document.sentences(figures["advice"])
+
+
+def _calibration(session: Session, results: Results) -> dict[str, Any]:
+    """Method, lens, board and target of the calibration, and how well the control points are reconstructed."""
     summary, target, board = results.summary, session.rig.target, session.rig.board
-    found = summary.get("calibration", {})
     settings = Settings.model_validate(tomllib.loads(results.settings)).calibration
     methods = {"dlt": "direct linear transformation, each camera alone",
                "bundle": "all cameras, lenses and the target adjusted together (bundle), from the direct linear "
@@ -137,7 +173,7 @@ def calibration(document: Document, session: Session, results: Results) -> None:
         "Control points, all pairs": f"mean vector {figure(control.get('mean_mm'))} mm, RMS "
         f"{figure(control.get('rms_mm'))} mm",
     }
-    bundle = found.get("bundle")
+    bundle = summary.get("calibration", {}).get("bundle")
     if bundle:
         facts |= {
             "Centroids of the dots": f"{figure(bundle['centroid_sigma_px'], 3)} px (standard deviation)",
@@ -146,42 +182,11 @@ def calibration(document: Document, session: Session, results: Results) -> None:
             "Target as adjusted": f"radius {bundle['radius_mm']:.3f} mm, pitch {bundle['pitch_mm']:.3f} mm, seam "
             f"{bundle['seam_mm']:.3f} mm, turn of the sheet {bundle['tilt_deg']:.3f}°",
         }
-    document.facts("calibration-table", facts)
-    document.table(
-        "camera-calibration",
-        ("camera", "azimuth, °", "off nominal, °", "dots", "left out", "dots' residual, px", "board views used",
-         "board residual, px", "image covered", "residual distortion, px", "lens error, px"),
-        (
-            (row["camera"], f"{row['azimuth_deg']:.1f}", f"{row.get('azimuth_off_deg', float('nan')):+.1f}",
-             row["dots"], row["left_out"], figure(row["residual_rms"], 3),
-             f"{row['board_views_used']} of {row['board_views']}", figure(row["board_rms"], 3),
-             _percent(row.get("board_coverage")), figure(row.get("residual_distortion"), 3),
-             figure(row.get("lens_error"), 3))
-            for row in summary.get("cameras", [])
-        ),
-        "RMS distances. Lens error: how far the standard errors of the lens shift the dots' images.",
-    )  # fmt: skip
-    rows = [
-        (" – ".join(row["pair"]), row["points"], figure(row["mean"], 3), figure(row["rms"], 3),
-         f"{row['angle_deg']:.1f}", figure(row["epipolar_rms"], 3))
-        for row in found.get("pairs", [])
-    ] or [
-        (" – ".join(row["pair"]), row["points"], figure(row["mean_mm"], 3), figure(row["rms_mm"], 3), "–", "–")
-        for row in results.calibration.get("pairs", [])
-    ]  # fmt: skip
-    document.table(
-        "pair-calibration",
-        ("pair", "dots in common", "mean vector, mm", "RMS, mm", "angle, °", "epipolar residual, px"),
-        rows,
-        "Control points reconstructed by each pair, against their places on the target.",
-    )
-    if found.get("advice"):
-        document.heading("What would make it better")
-        document.sentences(found["advice"])
+    return facts
 
 
 def steps(document: Document, session: Session, results: Results) -> None:
-    """Every step: what was captured, measured and lost, and why."""
+    """Write the tables of the steps: captures, measured and lost points by reason, residuals."""
     captures = {capture.id: capture for capture in session.captures}
     document.table(
         "steps",

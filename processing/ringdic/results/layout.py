@@ -14,8 +14,8 @@
         settings, calibration, summary    text: TOML, JSON, JSON
 
 What follows from the stored arrays is computed when it is read: a step takes about 100 bytes a point, 130 a triangle.
-A reader ignores groups, arrays and attributes that it does not know, and refuses a file whose schema is newer than its
-own. The schema number is raised when a reader of the number before would misread the file.
+A reader ignores groups, arrays and attributes that it does not know, and refuses a file of another schema than its own.
+The schema is raised by a change that an older reader would misunderstand.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ def read_results(path: Path, matches: bool = True) -> Results:
     """The results in a file, as they were written; fields are not read, since they follow from the positions.
 
     matches : whether to read the 2D matches as well.
-    Raises InputError for a file that is missing, unreadable, unfinished or of a newer version.
+    Raises InputError for a file that is missing, unreadable, unfinished or of another schema.
     """
     with _open(path) as file:
         own, group = file["ringdic"], file["VTKHDF"]
@@ -166,17 +166,15 @@ def _open(path: Path) -> h5py.File:
 
 
 def _check_schema(path: Path, file: h5py.File) -> None:
-    """Refuse a file that this version cannot read."""
+    """Refuse a file that is not a whole results file of the schema that this version reads."""
     if "ringdic" not in file or "VTKHDF" not in file:
         raise InputError(f"{path}: an HDF5 file, but not results of a processing run")
     schema = file["ringdic"].attrs.get("schema")
     if schema is None:
         raise InputError(f"{path}: the results were not written to their end; process the session again")
-    if int(schema) > SCHEMA:
-        raise InputError(
-            f"{path}: results of schema {int(schema)}, written by a newer ringdic; this version reads schemas up to "
-            f"{SCHEMA}. Install the newer ringdic, or process the session again with this one"
-        )
+    if int(schema) != SCHEMA:
+        remedy = "update RingDIC, or process the session again" if schema > SCHEMA else "process the session again"
+        raise InputError(f"{path}: results of schema {int(schema)}, but this version reads schema {SCHEMA}; {remedy}")
 
 
 def _check_step(path: Path, own: h5py.Group, step: int) -> None:

@@ -1,1 +1,1 @@
-"""From positions of a mesh to deformation: stretches, strains, and the rigid part of a motion."""
+"""Deformation of a triangulated surface: stretches, strains, strain windows, and rigid motion."""

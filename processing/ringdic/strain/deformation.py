@@ -1,8 +1,9 @@
-"""Deformation of every triangle as a triangular Cosserat point element (Solav et al. 2018, eq. 12-18).
+"""Deformation of the triangles of a surface as triangular Cosserat point elements (Solav et al. 2018, eq. 12-18).
 
 A triangle with corners P1 P2 P3 carries the directors ``D1 = P2 - P1``, ``D2 = P3 - P1`` and its unit normal ``D3``;
 the deformation gradient maps the reference directors to the current ones, so its third principal stretch is 1, along
-the normal. All tensors are Cartesian in the world frame; E lives in the reference, e in the current configuration.
+the normal. All tensors have Cartesian components in the world frame. The Green-Lagrange strain E refers to the
+reference configuration, the Euler-Almansi strain e to the current one.
 """
 
 from __future__ import annotations
@@ -11,9 +12,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ringdic.arrays import Floats
+from ringdic.arrays import Floats, Indices, Points, Vectors
 from ringdic.strain import families as strain
 from ringdic.strain import kernels
 
@@ -22,27 +22,28 @@ _I = np.eye(3)
 
 @dataclass(frozen=True)
 class Deformation:
-    """Deformation of M triangles, with any leading axes (steps). NaN where a corner is lost or the triangle is flat.
+    """Deformation of M triangles between two configurations; NaN where a corner is lost or a triangle has no area.
+
+    The leading axes ``...`` are those of the current positions, such as steps. Lengths are in mm, stretches and strains
+    have no unit. Strains e and those derived from E and e are computed when they are asked for; other families of
+    strain follow from the stretches and directions by :mod:`ringdic.strain.families`.
 
     F : (..., M, 3, 3) deformation gradient.
     E, e : (..., M, 3, 3) Green-Lagrange and Euler-Almansi strain.
     J, lambda1, lambda2 : (..., M) area ratio λ1 λ2 and in-plane principal stretches, λ1 ≤ λ2.
     E1, E2, e1, e2 : (..., M) in-plane principal strains, first ≤ second.
-    E_magnitude, e_magnitude : (..., M) Frobenius norms.
-    E_equivalent, e_equivalent : (..., M) √(⅔ dev:dev).
-    E_shear, e_shear : (..., M) largest in-plane shear strain, ½ (second - first principal).
+    E_magnitude, e_magnitude : (..., M) Frobenius norms of E and e.
+    E_equivalent, e_equivalent : (..., M) equivalent strains √(⅔ dev:dev) of E and e.
+    E_shear, e_shear : (..., M) largest in-plane shear strain, half the difference of the principal strains.
     direction1_reference, direction2_reference : (..., M, 3) unit principal directions in the reference configuration;
         the sign is arbitrary, direction 2 is normal × direction 1.
-    direction1_current, direction2_current : (..., M, 3) the same lines in the current configuration.
+    direction1_current, direction2_current : (..., M, 3) unit principal directions in the current configuration, the
+        images of the reference ones.
     shear_direction_reference, shear_direction_current : (..., M, 2, 3) the two lines of largest shear, ± 45° from the
         principal directions of that configuration.
     directors_reference : (M, 3, 3); directors_current : (..., M, 3, 3) mm, rows D1 D2 and the unit normal.
-    area : (M,) mm², reference. isotropy : (..., M) 1 equilateral … 0 degenerate, current.
-    normal_reference : (M, 3); normal_current : (..., M, 3), unit.
-
-    What few ask for follows from the rest when it is asked for.
-
-    Other families of strain follow from the stretches and directions: :mod:`ringdic.strain.families`.
+    area : (M,) mm², reference. isotropy : (..., M) shape, 1 equilateral … 0 degenerate, current.
+    normal_reference : (M, 3); normal_current : (..., M, 3), unit normals.
     """
 
     F: Floats
@@ -52,12 +53,12 @@ class Deformation:
     lambda2: Floats
     E1: Floats
     E2: Floats
-    direction1_reference: Floats
-    direction2_reference: Floats
-    direction1_current: Floats
-    direction2_current: Floats
-    directors_reference: Floats
-    directors_current: Floats
+    direction1_reference: Vectors
+    direction2_reference: Vectors
+    direction1_current: Vectors
+    direction2_current: Vectors
+    directors_reference: Vectors
+    directors_current: Vectors
     area: Floats
     isotropy: Floats
 
@@ -67,74 +68,74 @@ class Deformation:
 
     @cached_property
     def e(self) -> Floats:
-        """Euler-Almansi strain."""
+        """Euler-Almansi strain e, (..., M, 3, 3) without unit."""
         out = np.empty_like(self.F)
         kernels.euler_almansi(_matrices(self.directors_reference), _matrices(self.directors_current), _matrices(out))
         return out
 
     @property
     def e1(self) -> Floats:
-        """The smaller principal value of e."""
+        """Smaller in-plane principal value of the Euler-Almansi strain, (..., M) without unit."""
         return self.E1 / (1.0 + 2.0 * self.E1)  # e = ½ (1 - λ⁻²), monotonic in E
 
     @property
     def e2(self) -> Floats:
-        """The larger principal value of e."""
+        """Larger in-plane principal value of the Euler-Almansi strain, (..., M) without unit."""
         return self.E2 / (1.0 + 2.0 * self.E2)
 
     @property
     def E_magnitude(self) -> Floats:
-        """Frobenius norm of E."""
+        """Frobenius norm of the Green-Lagrange strain, (..., M) without unit."""
         return _norm(self.E)
 
     @property
     def e_magnitude(self) -> Floats:
-        """Frobenius norm of e."""
+        """Frobenius norm of the Euler-Almansi strain, (..., M) without unit."""
         return _norm(self.e)
 
     @property
     def E_equivalent(self) -> Floats:
-        """√(⅔ dev:dev) of E."""
+        """Equivalent strain √(⅔ dev:dev) of the Green-Lagrange strain, (..., M) without unit."""
         return _equivalent(self.E)
 
     @property
     def e_equivalent(self) -> Floats:
-        """√(⅔ dev:dev) of e."""
+        """Equivalent strain √(⅔ dev:dev) of the Euler-Almansi strain, (..., M) without unit."""
         return _equivalent(self.e)
 
     @property
     def E_shear(self) -> Floats:
-        """Largest in-plane shear strain of E."""
+        """Largest in-plane shear strain of the Green-Lagrange strain, (..., M) without unit."""
         return strain.shear(self.E1, self.E2)
 
     @property
     def e_shear(self) -> Floats:
-        """Largest in-plane shear strain of e."""
+        """Largest in-plane shear strain of the Euler-Almansi strain, (..., M) without unit."""
         return strain.shear(self.e1, self.e2)
 
     @property
-    def shear_direction_reference(self) -> Floats:
-        """The two lines of largest shear in the reference configuration."""
+    def shear_direction_reference(self) -> Vectors:
+        """Directions of the two lines of largest shear in the reference configuration, (..., M, 2, 3) unit vectors."""
         return _diagonals(self.direction1_reference, self.direction2_reference)
 
     @property
-    def shear_direction_current(self) -> Floats:
-        """The two lines of largest shear in the current configuration."""
+    def shear_direction_current(self) -> Vectors:
+        """Directions of the two lines of largest shear in the current configuration, (..., M, 2, 3) unit vectors."""
         return _diagonals(self.direction1_current, self.direction2_current)
 
     @property
-    def normal_reference(self) -> Floats:
-        """Unit normals of the reference configuration."""
+    def normal_reference(self) -> Vectors:
+        """Normals of the reference configuration as unit vectors, (M, 3)."""
         return self.directors_reference[..., 2, :]
 
     @property
-    def normal_current(self) -> Floats:
-        """Unit normals of the current configuration."""
+    def normal_current(self) -> Vectors:
+        """Normals of the current configuration as unit vectors, (..., M, 3)."""
         return self.directors_current[..., 2, :]
 
 
-def deformation(reference: Floats, current: Floats, faces: NDArray[np.int_]) -> Deformation:
-    """Every field of the triangles ``faces`` between two configurations.
+def deformation(reference: Points, current: Points, faces: Indices) -> Deformation:
+    """Deformation of the triangles of a mesh between two configurations.
 
     Parameters
     ----------
@@ -145,34 +146,42 @@ def deformation(reference: Floats, current: Floats, faces: NDArray[np.int_]) -> 
     reference, current = np.asarray(reference, dtype=float), np.asarray(current, dtype=float)
     D, area = directors(reference, faces)
     d, _ = directors(current, faces)
-    return of_directors(D, d, area, isotropy(current, faces))
+    return deformation_of_directors(D, d, area, isotropy(current, faces))
 
 
-def of_directors(D: Floats, d: Floats, area: Floats, isotropy: Floats) -> Deformation:
-    """The same from directors (..., M, 3, 3), rows D1 D2 in the tangent plane and D3 the unit normal, before and after.
+def deformation_of_directors(D: Vectors, d: Vectors, area: Floats, isotropy: Floats) -> Deformation:
+    """Deformation of surface elements from their directors in two configurations.
 
-    area : (M,) mm². isotropy : (..., M).
+    Parameters
+    ----------
+    D, d : (M, 3, 3) and (..., M, 3, 3) mm, reference and current directors: rows D1 and D2 in the tangent plane, D3 the
+        unit normal.
+    area : (M,) mm², reference. isotropy : (..., M) shape, 1 equilateral … 0 degenerate. Both are passed on.
     """
     D, d = np.ascontiguousarray(D, dtype=float), np.ascontiguousarray(d, dtype=float)
-    places = d.shape[:-2]
+    leading = d.shape[:-2]
     F, E = np.empty(d.shape), np.empty(d.shape)
-    scalars, directions = np.empty((5, *places)), np.empty((4, *places, 3))
+    scalars, directions = np.empty((5, *leading)), np.empty((4, *leading, 3))
     kernels.fill_deformation(
         _matrices(D), _matrices(d), _matrices(F), _matrices(E), scalars.reshape(5, -1), directions.reshape(4, -1, 3)
     )
     lambda1, lambda2, J, E1, E2 = scalars
-    first, second, first_now, second_now = directions
+    first_reference, second_reference, first_current, second_current = directions
     return Deformation(
         F=F, E=E, J=J, lambda1=lambda1, lambda2=lambda2, E1=E1, E2=E2,
-        direction1_reference=first, direction2_reference=second,
-        direction1_current=first_now, direction2_current=second_now,
+        direction1_reference=first_reference, direction2_reference=second_reference,
+        direction1_current=first_current, direction2_current=second_current,
         directors_reference=D, directors_current=d, area=area, isotropy=isotropy,
     )  # fmt: skip
 
 
-def directors(vertices: Floats, faces: NDArray[np.int_]) -> tuple[Floats, Floats]:
-    """Directors (..., M, 3, 3), rows D1 D2 D3 (eq. 12), and areas (..., M) mm², of vertices (..., N, 3) mm."""
-    vertices, faces = _steps(vertices), np.ascontiguousarray(faces)
+def directors(vertices: Points, faces: Indices) -> tuple[Vectors, Floats]:
+    """Directors and areas of triangles (Solav et al. 2018, eq. 12).
+
+    vertices : (..., N, 3) mm. faces : (M, 3) vertex indices. Returns directors (..., M, 3, 3), rows D1 and D2 along two
+    edges in mm and D3 the unit normal, and areas (..., M) mm².
+    """
+    vertices, faces = np.ascontiguousarray(vertices, dtype=float), np.ascontiguousarray(faces)
     D, area = np.empty((*vertices.shape[:-2], len(faces), 3, 3)), np.empty((*vertices.shape[:-2], len(faces)))
     kernels.fill_directors(
         vertices.reshape(-1, *vertices.shape[-2:]), faces, D.reshape(-1, len(faces), 3, 3), area.reshape(-1, len(faces))
@@ -180,32 +189,34 @@ def directors(vertices: Floats, faces: NDArray[np.int_]) -> tuple[Floats, Floats
     return D, area
 
 
-def isotropy(vertices: Floats, faces: NDArray[np.int_]) -> Floats:
-    """Shape of triangles, (..., M), 1 equilateral … 0 degenerate: ``2 σ2/(σ2 + σ3)`` of ``X Xᵀ/3`` about centroids."""
-    vertices, faces = _steps(vertices), np.ascontiguousarray(faces)
+def isotropy(vertices: Points, faces: Indices) -> Floats:
+    """Shape of triangles: 1 for an equilateral one, 0 for a degenerate one.
+
+    ``2 σ2/(σ2 + σ3)`` with the singular values σ1 = 0 ≤ σ2 ≤ σ3 of ``X Xᵀ/3``, X the corners about the centroid.
+    vertices : (..., N, 3) mm. faces : (M, 3) vertex indices. Returns (..., M) without unit.
+    """
+    vertices, faces = np.ascontiguousarray(vertices, dtype=float), np.ascontiguousarray(faces)
     out = np.empty((*vertices.shape[:-2], len(faces)))
     kernels.fill_isotropy(vertices.reshape(-1, *vertices.shape[-2:]), faces, out.reshape(-1, len(faces)))
     return out
 
 
-def _steps(vertices: Floats) -> Floats:
-    return np.ascontiguousarray(vertices, dtype=float)
-
-
 def _matrices(tensors: Floats) -> Floats:
-    """Contiguous tensors (..., 3, 3) in one row, (n, 3, 3), without a copy."""
+    """Contiguous tensors (..., 3, 3) as one list (n, 3, 3), a view that shares their memory."""
     return tensors.reshape(-1, 3, 3)
 
 
 def _norm(T: Floats) -> Floats:
+    """Frobenius norms (...) of tensors (..., 3, 3)."""
     return np.sqrt(np.einsum("...ij,...ij->...", T, T))
 
 
 def _equivalent(T: Floats) -> Floats:
+    """Equivalent strains √(⅔ dev:dev) (...) of tensors (..., 3, 3)."""
     deviator = T - np.einsum("...ii->...", T)[..., None, None] / 3.0 * _I
     return np.sqrt(2.0 / 3.0) * _norm(deviator)
 
 
-def _diagonals(first: Floats, second: Floats) -> Floats:
-    """The two unit lines half-way between two perpendicular unit directions, stacked on the last axis but one."""
+def _diagonals(first: Vectors, second: Vectors) -> Vectors:
+    """Unit vectors (..., 2, 3) at ± 45° to two perpendicular unit vectors (..., 3), in their plane."""
     return np.stack([first + second, second - first], axis=-2) / np.sqrt(2.0)

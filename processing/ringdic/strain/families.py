@@ -1,6 +1,6 @@
-"""Families of strain as functions of the principal stretches.
+"""Strain measures as functions of the principal stretches, and invariants of a plane strain.
 
-Every family gives the same principal directions; only the scale along them differs. Seth-Hill (Seth 1964; Hill 1968):
+The families share their principal directions; they differ in the principal values. Seth-Hill (Seth 1964; Hill 1968):
 ``(λ^(2m) - 1) / (2m)``, and ``ln λ`` for m = 0.
 
 =====  =======================  ====================
@@ -13,74 +13,105 @@ m      family                   principal value
 -1     Euler-Almansi            ``(1 - λ⁻²) / 2``
 =====  =======================  ====================
 
-For m ≥ 0 the tensor is usually drawn on the directions of the reference (material) configuration, for m < 0 on those of
-the current (spatial) one. The third principal value, along the normal, is 0 by the kinematics of the triangle: what the
-surface does in thickness is not measured.
+For m ≥ 0 the tensor is usually referred to the principal directions of the reference (material) configuration, for
+m < 0 to those of the current (spatial) one. The third principal value, along the normal, is 0 by the kinematics of the
+triangle: the change of thickness is not measured.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from ringdic.arrays import Floats
+from ringdic.arrays import Floats, Vectors
 from ringdic.strain.kernels import linear_principal
 
 GREEN_LAGRANGE, BIOT, HENCKY, EULER_ALMANSI = 1.0, 0.5, 0.0, -1.0
-_LOGARITHMIC = 1e-18  # an exponent below it changes no digit of the logarithm, and products with it may underflow
+_LOGARITHMIC = 1e-18  # an exponent below it gives ln λ to all digits, and products with it might underflow
 
 
 def seth_hill(stretch: Floats, m: float) -> Floats:
-    """Principal strain of the Seth-Hill family with exponent ``m``, of principal stretches of any shape.
+    """Principal strains of the Seth-Hill family: ``(λ^(2m) - 1) / (2m)``, and ``ln λ`` for m = 0.
 
-    Written with ``expm1``: small strains keep their digits, and small m runs smoothly into the logarithm.
+    stretch : (..., M) principal stretches λ. Returns (..., M) without unit. Computed by ``expm1`` of the logarithm, so
+    that small strains keep their digits and small m approaches the logarithm smoothly.
     """
     return seth_hill_of_log(np.log(stretch), m)
 
 
 def seth_hill_of_log(log: Floats, m: float) -> Floats:
-    """The same of the logarithms of stretches."""
+    """Principal strains of the Seth-Hill family from the logarithms of the principal stretches.
+
+    log : (..., M) ln λ. Returns ``(exp(2 m ln λ) - 1) / (2m)``, (..., M) without unit.
+    """
     return log if abs(m) < _LOGARITHMIC else np.expm1(2.0 * m * log) / (2.0 * m)
 
 
 def bazant(stretch: Floats, m: float) -> Floats:
-    """Bažant's (1998) symmetric family ``(λ^m - λ^-m) / (2m)``: opposite for inverse stretches; ``ln λ`` for m = 0."""
+    """Principal strains of Bažant's (1998) symmetric family: ``(λ^m - λ^-m) / (2m)``, and ``ln λ`` for m = 0.
+
+    stretch : (..., M) principal stretches λ. Returns (..., M) without unit; inverse stretches have opposite strains.
+    """
     log = np.log(stretch)
     return log if abs(m) < _LOGARITHMIC else np.sinh(m * log) / m
 
 
 def magnitude(first: Floats, second: Floats) -> Floats:
-    """Frobenius norm of the tensor with these in-plane principal values and none along the normal."""
+    """Frobenius norm of a strain whose principal value along the normal is 0.
+
+    first, second : (..., M) in-plane principal strains. Returns (..., M) without unit.
+    """
     return np.asarray(np.sqrt(first * first + second * second))
 
 
 def equivalent(first: Floats, second: Floats) -> Floats:
-    """Equivalent strain ``√(⅔ dev:dev)`` of the same tensor."""
+    """Equivalent strain ``√(⅔ dev:dev)`` of a strain whose principal value along the normal is 0.
+
+    first, second : (..., M) in-plane principal strains. Returns (..., M) without unit.
+    """
     return np.sqrt(2.0 / 3.0 * (first**2 + second**2 - (first + second) ** 2 / 3.0))
 
 
 def shear(first: Floats, second: Floats) -> Floats:
-    """Largest in-plane shear strain of the tensor, half the difference of its principal values."""
+    """Largest in-plane shear strain, half the difference of the principal strains.
+
+    first, second : (..., M) in-plane principal strains, first ≤ second. Returns (..., M) without unit.
+    """
     return 0.5 * (second - first)
 
 
-def tensor(first: Floats, second: Floats, direction1: Floats, direction2: Floats) -> Floats:
-    """The Cartesian tensor (..., 3, 3) of principal values (...) along unit directions (..., 3)."""
+def tensor(first: Floats, second: Floats, direction1: Vectors, direction2: Vectors) -> Floats:
+    """Cartesian strain tensor of two principal strains, ``first N1 ⊗ N1 + second N2 ⊗ N2``.
+
+    first, second : (...) principal strains. direction1, direction2 : (..., 3) unit principal directions N1, N2.
+    Returns (..., 3, 3).
+    """
     return first[..., None, None] * _square(direction1) + second[..., None, None] * _square(direction2)
 
 
-def infinitesimal(F: Floats, normal_reference: Floats) -> Floats:
-    """Linear strain ``½ (F + Fᵀ) - I`` in the tangent plane of the reference, (..., 3, 3).
+def infinitesimal(F: Floats, normal_reference: Vectors) -> Floats:
+    """Linear strain ``½ (F + Fᵀ) - I``, projected onto the tangent plane of the reference.
 
-    It takes a rotation for strain (``cos φ - 1``): remove the rigid motion first, and use it for small rotations only.
-    F : (..., 3, 3). normal_reference : (..., 3) unit.
+    A rotation by φ gives it a strain ``cos φ - 1``: remove the rigid motion first, and use it for small rotations only.
+    F : (..., 3, 3) deformation gradient. normal_reference : (..., 3) unit normals. Returns (..., 3, 3) without unit.
     """
     in_plane = np.eye(3) - _square(normal_reference)
     linear = 0.5 * (F + np.swapaxes(F, -1, -2)) - np.eye(3)
     return np.asarray(in_plane @ linear @ in_plane)
 
 
-def infinitesimal_principal(F: Floats, normal_reference: Floats, turn: Floats | None = None) -> tuple[Floats, Floats]:
-    """Principal values (...), first ≤ second, of the same tensor, after a rotation (3, 3) if there is one."""
+def infinitesimal_principal(F: Floats, normal_reference: Vectors, turn: Floats | None = None) -> tuple[Floats, Floats]:
+    """Principal values of the linear strain ``½ (F + Fᵀ) - I`` in the tangent plane of the reference.
+
+    Parameters
+    ----------
+    F : (..., 3, 3) deformation gradient.
+    normal_reference : (..., 3) unit normals.
+    turn : (3, 3) rotation that is applied to F first, such as the inverse of the rigid motion; None for none.
+
+    Returns
+    -------
+    The smaller and the larger principal strain, (...) each, without unit.
+    """
     shape = F.shape[:-2]
     normal = np.ascontiguousarray(np.broadcast_to(normal_reference, (*shape, 3)))
     out = np.empty((2, *shape))
@@ -90,5 +121,6 @@ def infinitesimal_principal(F: Floats, normal_reference: Floats, turn: Floats | 
     return out[0], out[1]
 
 
-def _square(direction: Floats) -> Floats:
+def _square(direction: Vectors) -> Floats:
+    """Dyads ``N ⊗ N`` (..., 3, 3) of vectors N (..., 3)."""
     return direction[..., :, None] * direction[..., None, :]

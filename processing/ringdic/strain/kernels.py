@@ -1,7 +1,7 @@
-"""The loops over triangles, compiled: directors, deformation, linear strain, and what noise makes of the stretches.
+"""Compiled loops over triangles: directors, deformation, linear strain, and variances of the stretches by image noise.
 
-:mod:`ringdic.strain.deformation` and :mod:`ringdic.uncertainty.strain` say what is computed; a kernel of one triangle
-is a few hundred operations on numbers that stay in registers.
+The equations are explained where the kernels are called: :mod:`ringdic.strain.deformation` and
+:mod:`ringdic.uncertainty.strain`. S is the number of steps, M that of triangles, N that of vertices.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _cross(a, b, c):  # type: ignore[no-untyped-def]
+    """Write the vector product ``a × b`` into c."""
     c[0] = a[1] * b[2] - a[2] * b[1]
     c[1] = a[2] * b[0] - a[0] * b[2]
     c[2] = a[0] * b[1] - a[1] * b[0]
@@ -21,12 +22,13 @@ def _cross(a, b, c):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _dot(a, b):  # type: ignore[no-untyped-def]
+    """Scalar product of two vectors (3,)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _reciprocal(D, R):  # type: ignore[no-untyped-def]
-    """Reciprocal directors, rows of R, of the rows of D; the third is a unit normal."""
+    """Write the reciprocal directors of D (3, 3) into the rows of R, ``D_i · R^j = δ_ij``; D3 is a unit normal."""
     _cross(D[0], D[1], R[2])
     volume = _dot(R[2], D[2])
     _cross(D[1], D[2], R[0])
@@ -39,7 +41,10 @@ def _reciprocal(D, R):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def fill_directors(vertices, faces, D, area):  # type: ignore[no-untyped-def]
-    """vertices (S, N, 3), faces (M, 3); D (S, M, 3, 3) and area (S, M) are filled."""
+    """Directors D (S, M, 3, 3) and areas (S, M) mm² of triangles are filled; eq. 12 of Solav et al. 2018.
+
+    vertices (S, N, 3) mm. faces (M, 3) vertex indices. area : the array of the areas.
+    """
     for s in range(len(vertices)):
         for m in range(len(faces)):
             out = D[s, m]
@@ -58,7 +63,10 @@ def fill_directors(vertices, faces, D, area):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def fill_isotropy(vertices, faces, out):  # type: ignore[no-untyped-def]
-    """vertices (S, N, 3), faces (M, 3); out (S, M) is filled."""
+    """Isotropy of the shape of triangles, 1 equilateral … 0 degenerate; out (S, M) is filled.
+
+    vertices (S, N, 3) mm. faces (M, 3) vertex indices.
+    """
     X, S = np.empty((3, 3)), np.empty((3, 3))
     for s in range(len(vertices)):
         for m in range(len(faces)):
@@ -73,7 +81,7 @@ def fill_isotropy(vertices, faces, out):  # type: ignore[no-untyped-def]
                 for j in range(3):
                     S[i, j] = (X[0, i] * X[0, j] + X[1, i] * X[1, j] + X[2, i] * X[2, j]) / 3.0
                     square += S[i, j] * S[i, j]
-            # One singular value is zero; the other two have the sum tr S and the product of S's second invariant.
+            # One singular value of S is zero; the sum of the others is tr S, their product S's second invariant.
             trace = S[0, 0] + S[1, 1] + S[2, 2]
             product = 0.5 * (trace * trace - square)
             root = trace * trace - 4.0 * product
@@ -82,21 +90,25 @@ def fill_isotropy(vertices, faces, out):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _smaller_axis(half, E12, radius):  # type: ignore[no-untyped-def]
-    """Cosine and sine of the angle ``½ atan2(E12, half) + ½ π`` of the smaller principal value's axis."""
+    """Cosine and sine of the angle ``½ atan2(E12, half) + ½ π`` of the axis of the smaller principal strain.
+
+    half is ½ (E11 - E22), radius that of Mohr's circle.
+    """
     if radius == 0:
         return 0.0, 1.0
     larger = math.sqrt(0.5 * (1.0 + abs(half) / radius))
     smaller = 0.5 * abs(E12) / (radius * larger)
-    cos, sin = (larger, smaller) if half >= 0 else (smaller, larger)  # of half the angle, but for its sign
+    cos, sin = (larger, smaller) if half >= 0 else (smaller, larger)  # of ½ |atan2(E12, half)|
     return -math.copysign(sin, E12), cos
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def fill_deformation(D, d, F, E, scalars, directions):  # type: ignore[no-untyped-def]
-    """Eq. 13 to 16 and the principal values in the plane.
+    """Deformation gradient, Green-Lagrange strain and its in-plane principal values (Solav et al. 2018, eq. 13-16).
 
-    D (M, 3, 3), d (S M, 3, 3): directors before and after. Filled: F, E (S M, 3, 3), scalars (5, S M) λ1 λ2 J E1 E2,
-    directions (4, S M, 3) the first and second before, the first and second after.
+    D (M, 3, 3), d (S M, 3, 3): reference and current directors. Filled: F and E (S M, 3, 3); scalars (5, S M): λ1, λ2,
+    J, E1, E2; directions (4, S M, 3): first and second principal direction in the reference, then in the current
+    configuration.
     """
     R, a, along = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3))
     for n in range(len(d)):
@@ -134,7 +146,10 @@ def fill_deformation(D, d, F, E, scalars, directions):  # type: ignore[no-untype
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def euler_almansi(D, d, out):  # type: ignore[no-untyped-def]
-    """Eq. 17: ``½ (I - F⁻ᵀ F⁻¹)`` with ``F⁻¹ = Σ D_i ⊗ d^i``. D (M, 3, 3), d (S M, 3, 3); out (S M, 3, 3) is filled."""
+    """Euler-Almansi strain ``½ (I - F⁻ᵀ F⁻¹)`` with ``F⁻¹ = Σ D_i ⊗ d^i`` (Solav et al. 2018, eq. 17).
+
+    D (M, 3, 3), d (S M, 3, 3): reference and current directors. out (S M, 3, 3) is filled.
+    """
     R, inverse = np.empty((3, 3)), np.empty((3, 3))
     for n in range(len(d)):
         before = D[n % len(D)]
@@ -150,9 +165,10 @@ def euler_almansi(D, d, out):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def linear_principal(turn, F, normal, out):  # type: ignore[no-untyped-def]
-    """Principal values of the linear strain of ``turn F`` in the tangent plane.
+    """Principal values of the linear strain ``½ (G + Gᵀ) - I`` of ``G = turn F``, in the tangent plane.
 
-    turn (3, 3), F (M, 3, 3), normal (M, 3) unit; out (2, M) is filled, the smaller value first.
+    turn (3, 3) rotation. F (M, 3, 3) deformation gradients. normal (M, 3) unit normals of the reference. out (2, M) is
+    filled, the smaller value first.
     """
     L, P, G = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for m in range(len(F)):
@@ -181,11 +197,11 @@ def linear_principal(turn, F, normal, out):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def stretch_variance(slopes, gain, sigma, alike, faces, variance):  # type: ignore[no-untyped-def]
-    """Add what the noise of C images makes of the stretches to their variances (M, 2).
+    """Add the variances of both principal stretches that come from the matching errors in C images to variance (M, 2).
 
-    slopes (2, M, 3, 3): stretch, triangle, corner, component. gain (C, N, 3, 2). sigma (C, N, 2), NaN for none. alike
-    (C or 1, M, 3): correlation of the errors of corners 0 and 1, 1 and 2, 2 and 0. An image in which no corner of a
-    triangle takes part adds nothing to it.
+    slopes (2, M, 3, 3) mm⁻¹: d(stretch)/d(corner), axes stretch, triangle, corner, component. gain (C, N, 3, 2) mm/px:
+    d(vertex)/d(pixel), zero where an image does not see the vertex. sigma (C, N, 2) px, NaN for an exact pixel. alike
+    (C or 1, M, 3): correlation of the errors at corners 0 and 1, 1 and 2, 2 and 0. faces (M, 3) vertex indices.
     """
     felt = np.empty((3, 2))
     for m in range(len(faces)):
@@ -217,10 +233,11 @@ def stretch_variance(slopes, gain, sigma, alike, faces, variance):  # type: igno
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def fill_stretch_slopes(D, F, directions, stretches, current, before):  # type: ignore[no-untyped-def]
-    """How λ1 and λ2 move with the corners, as :func:`ringdic.uncertainty.strain.stretch_slopes`.
+    """Derivatives of the principal stretches λ1 and λ2 by the positions of the triangles' corners, mm⁻¹.
 
-    D, F (M, 3, 3), directions (2, M, 3) before, stretches (2, M); current, before (2, M, 3, 3) are filled, before not
-    where it has no triangles.
+    D (M, 3, 3) reference directors, F (M, 3, 3) deformation gradients, directions (2, M, 3) principal directions in the
+    reference, stretches (2, M). Filled: current and before (2, M, 3, 3), derivatives by the current and by the
+    reference corners, axes stretch, triangle, corner, component; before is left out if its second axis has length 0.
     """
     R = np.empty((3, 3))
     wanted = before.shape[1] > 0

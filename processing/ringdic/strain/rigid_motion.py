@@ -1,4 +1,4 @@
-"""The rigid part of a motion, by least squares, and the motion without it (Kabsch 1976; Umeyama 1991)."""
+"""Least-squares rigid motion between two sets of points (Kabsch 1976; Umeyama 1991)."""
 
 from __future__ import annotations
 
@@ -6,27 +6,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ringdic.arrays import Floats
+from ringdic.arrays import Floats, Points, Vectors
 
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """``x -> R x + t``. R : (3, 3) proper rotation; t : (3,) mm."""
+    """A rigid motion ``x -> R x + t``. R : (3, 3) proper rotation, without unit. t : (3,) translation, mm."""
 
     R: Floats
-    t: Floats
+    t: Vectors
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "R", np.asarray(self.R, dtype=float).reshape(3, 3))
         object.__setattr__(self, "t", np.asarray(self.t, dtype=float).reshape(3))
 
-    def apply(self, xyz: Floats) -> Floats:
-        """Moved points, (..., 3) mm."""
-        x, y, z = np.moveaxis(np.asarray(xyz, dtype=float), -1, 0)  # a product with so small a matrix is slower
+    def apply(self, xyz: Points) -> Points:
+        """Positions ``R x + t`` of points after the motion. xyz : (..., 3) mm. Returns (..., 3) mm."""
+        x, y, z = np.moveaxis(np.asarray(xyz, dtype=float), -1, 0)  # a matrix product is slower for so small a matrix
         return np.stack([x * a + y * b + z * c + t for (a, b, c), t in zip(self.R, self.t, strict=True)], axis=-1)
 
-    def rotate(self, directions: Floats) -> Floats:
-        """Turned directions, (..., 3); the translation does not act on them."""
+    def rotate(self, directions: Vectors) -> Vectors:
+        """Directions ``R d`` after the motion; the translation does not act on them.
+
+        directions : (..., 3) of any unit. Returns (..., 3) in that unit.
+        """
         return np.asarray(directions, dtype=float) @ self.R.T
 
     @property
@@ -38,8 +41,8 @@ class RigidMotion:
         return float(np.arctan2(sine, 0.5 * (np.trace(self.R) - 1.0)))
 
 
-def kabsch(source: Floats, destination: Floats, weights: Floats | None = None) -> RigidMotion:
-    """The rigid motion that takes ``source`` to ``destination`` with the least sum of squared distances.
+def kabsch(source: Points, destination: Points, weights: Floats | None = None) -> RigidMotion:
+    """Rigid motion that takes points ``source`` to ``destination`` with the least weighted sum of squared distances.
 
     Parameters
     ----------
@@ -63,10 +66,13 @@ def kabsch(source: Floats, destination: Floats, weights: Floats | None = None) -
     return RigidMotion(R, q_mean - R @ p_mean)
 
 
-def motion_to_reference(reference: Floats, current: Floats, weights: Floats | None = None) -> RigidMotion:
-    """The motion that takes the current configuration back onto the reference; identity if too few points remain.
+def motion_to_reference(reference: Points, current: Points, weights: Floats | None = None) -> RigidMotion:
+    """Least-squares rigid motion that takes the current configuration back onto the reference.
 
-    reference, current : (n, 3) mm. ``motion.apply(current) - reference`` is the displacement without rigid motion.
+    reference, current : (n, 3) mm, NaN where lost. weights : (n,) without unit, or None for equal weights.
+
+    ``motion.apply(current) - reference`` is the displacement without rigid motion. The identity is returned where fewer
+    than three points are common to both.
     """
     try:
         return kabsch(current, reference, weights)

@@ -1,1 +1,1 @@
-"""Where the surface lies: start values between cameras and the region of interest."""
+"""Depth sweep between two calibrated cameras: the region that both see, and start values of its matches."""

@@ -1,8 +1,7 @@
-"""The region of interest of a camera pair, found from the images.
+"""Lattices of image positions, and the region of interest of a camera pair from where a depth sweep matches them.
 
-A coarse lattice of positions in the reference image is matched into the second camera by a sweep of proxies. Where
-the match is convincing, alone of its kind and at a depth like its neighbours', the specimen is there and textured.
-What neither camera can see well, by the angle between surface and line of sight, is left out.
+A position belongs to the specimen where its match is unambiguous and its depth agrees with that of its neighbours.
+Parts that a camera sees too obliquely, by the angle between surface normal and line of sight, are left out.
 """
 
 from __future__ import annotations
@@ -16,33 +15,49 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Mask
+from ringdic.arrays import Floats, Mask, Pixels, Points, Vectors
 from ringdic.geometry.camera import Camera
 
 
 @dataclass(frozen=True)
 class ImageLattice:
-    """Positions on a regular lattice over an image. ``xy`` (rows, columns, 2) px, ``spacing`` px."""
+    """Positions on a regular lattice over an image.
 
-    xy: Floats
+    xy : (rows, columns, 2) float64, px. spacing : px.
+    """
+
+    xy: Pixels
     spacing: int
 
 
 def image_lattice(size: tuple[int, int], spacing: int, margin: int) -> ImageLattice:
-    """All multiples of ``spacing`` that keep ``margin`` px from the image's edge; size is (width, height)."""
+    """Lattice of all multiples of ``spacing`` that keep a margin from the edge of an image.
+
+    size : (width, height) px. spacing, margin : px.
+    """
     first = -(-margin // spacing) * spacing
     x = np.arange(first, size[0] - margin, spacing, dtype=float)
     y = np.arange(first, size[1] - margin, spacing, dtype=float)
     return ImageLattice(np.stack(np.meshgrid(x, y), axis=-1), spacing)
 
 
-def coherent(radius: Floats, convincing: Mask, tolerance: float, least: int = 0) -> Mask:
-    """Lattice positions whose radius (rows, columns) mm agrees with the convincing ones around it.
+def coherent_depths(radius: Floats, candidates: Mask, tolerance: float, min_positions: int = 0) -> Mask:
+    """Lattice positions whose depth agrees with that of the matched positions around them.
 
-    At least three of the 8 neighbours must be convincing, and the radius must lie within ``tolerance`` mm of their
-    median; then the largest connected piece is kept, or, where ``least`` is given, every piece of so many positions.
+    Parameters
+    ----------
+    radius : (rows, columns) float64, mm, distance of the surface from the z axis at each position, as a measure of
+        depth.
+    candidates : (rows, columns) bool, positions with an unambiguous match.
+    tolerance : mm, largest difference from the median radius of the candidates among the 8 neighbours, of which there
+        must be at least three.
+    min_positions : size of a connected group that is kept; 0 keeps the largest group alone.
+
+    Returns
+    -------
+    coherent : (rows, columns) bool.
     """
-    padded = np.pad(np.where(convincing, radius, np.nan), 1, constant_values=np.nan)
+    padded = np.pad(np.where(candidates, radius, np.nan), 1, constant_values=np.nan)
     rows, columns = radius.shape
     around = np.stack(
         [
@@ -55,19 +70,21 @@ def coherent(radius: Floats, convincing: Mask, tolerance: float, least: int = 0)
     count = np.isfinite(around).sum(axis=0)
     ordered = np.sort(around, axis=0)  # NaN last
     middle = np.take_along_axis(ordered, (np.maximum(count, 1)[None] - 1) // 2, axis=0)[0]
-    good = convincing & (count >= 3) & (np.abs(radius - middle) < tolerance)
-    labels_count, labels, stats, _ = cv2.connectedComponentsWithStats(good.astype(np.uint8), connectivity=8)
+    coherent = candidates & (count >= 3) & (np.abs(radius - middle) < tolerance)
+    labels_count, labels, stats, _ = cv2.connectedComponentsWithStats(coherent.astype(np.uint8), connectivity=8)
     if labels_count < 2:
-        return np.zeros_like(good)
+        return np.zeros_like(coherent)
     area = stats[1:, cv2.CC_STAT_AREA]
-    kept = area >= least if least else np.arange(len(area)) == np.argmax(area)
-    return np.asarray(np.append(False, kept)[labels])
+    large = area >= min_positions if min_positions else np.arange(len(area)) == np.argmax(area)
+    return np.asarray(np.append(False, large)[labels])
 
 
-def contrast(image: NDArray[np.generic], xy: Floats, half_width: int) -> Floats:
-    """Root mean square of the grey level's gradient in a square about each position (..., 2) of an image. (...).
+def contrast(image: NDArray[np.generic], xy: Pixels, half_width: int) -> Floats:
+    """Root mean square of the grey level's gradient in a square around positions of an image, by Sobel differences.
 
-    By Sobel's differences, of what of the square lies inside the image.
+    image : (height, width) grey levels. xy : (..., 2) float64, px. half_width : px, of the square, of which the part
+        inside the image counts.
+    Returns (...), in grey levels per px.
     """
     at = np.ascontiguousarray(xy.reshape(-1, 2), dtype=np.float64)
     out = np.empty(len(at))
@@ -77,7 +94,7 @@ def contrast(image: NDArray[np.generic], xy: Floats, half_width: int) -> Floats:
 
 @nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
 def _contrast(image, xy, half_width, out):  # type: ignore[no-untyped-def]
-    """Fills out (n,) with the contrast about positions xy (n, 2)."""
+    """Fill out (n,) with the contrast of ``contrast`` around positions xy (n, 2)."""
     (height, width), one = image.shape, np.uint64(1)
     kind: Any = np.float32
     for k in range(len(xy)):
@@ -98,10 +115,11 @@ def _contrast(image, xy, half_width, out):  # type: ignore[no-untyped-def]
         out[k] = math.sqrt(total / count) / 8.0 if count else 0.0
 
 
-def lattice_normals(xyz: Floats) -> Floats:
-    """Outward unit normals (rows, columns, 3) of a lattice of points (rows, columns, 3), NaN where unknown.
+def lattice_normals(xyz: Points) -> Vectors:
+    """Outward unit normals of a surface that is given by a lattice of points.
 
-    Differences reach over two neighbours where they exist; outward is away from the z axis.
+    xyz : (rows, columns, 3) float64, mm, in the world frame. Returns (rows, columns, 3), no unit, NaN where unknown.
+    Differences are central where both neighbours exist; outward is away from the z axis.
     """
     along_x = _difference(xyz, axis=1)
     along_y = _difference(xyz, axis=0)
@@ -113,8 +131,12 @@ def lattice_normals(xyz: Floats) -> Floats:
     return normals
 
 
-def well_seen(xyz: Floats, cameras: tuple[Camera, Camera], limit_deg: float) -> Mask:
-    """Lattice positions that both cameras see under less than ``limit_deg``. (rows, columns)."""
+def within_incidence(xyz: Points, cameras: tuple[Camera, Camera], limit_deg: float) -> Mask:
+    """Lattice positions whose surface both cameras see at an angle of incidence below a limit.
+
+    xyz : (rows, columns, 3) float64, mm, in the world frame. limit_deg : degrees, between normal and line of sight.
+    Returns (rows, columns) bool.
+    """
     normals = lattice_normals(xyz)
     limit = np.cos(np.radians(limit_deg))
     with np.errstate(invalid="ignore"):
@@ -122,7 +144,10 @@ def well_seen(xyz: Floats, cameras: tuple[Camera, Camera], limit_deg: float) -> 
 
 
 def lattice_region(points: ImageLattice, good: Mask, size: tuple[int, int]) -> Mask:
-    """The lattice's good positions as a filled region of the image. (height, width)."""
+    """Region of an image that the good positions of a lattice cover, gaps between them closed.
+
+    good : (rows, columns) bool. size : (width, height) px. Returns (height, width) bool.
+    """
     width, height = size
     region = np.zeros((height, width), bool)
     at = points.xy[good].astype(int)
@@ -139,8 +164,10 @@ def lattice_region(points: ImageLattice, good: Mask, size: tuple[int, int]) -> M
     return region
 
 
-def _difference(xyz: Floats, axis: int) -> Floats:
-    """Central difference along a lattice axis, one-sided where a neighbour is missing."""
+def _difference(xyz: Points, axis: int) -> Vectors:
+    """Differences (rows, columns, 3) of points along a lattice axis: central, or one-sided where a neighbour is
+    missing.
+    """
     forward = np.full_like(xyz, np.nan)
     backward = np.full_like(xyz, np.nan)
     lower = [slice(None)] * 3

@@ -9,7 +9,6 @@ import uuid
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from ringdic.compiled import source_digest
 from ringdic.errors import ComputationError, InputError
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -127,12 +127,9 @@ def digest(*parts: Any) -> str:
     return sha.hexdigest()[:32]
 
 
-@cache
 def code_stamp() -> str:
     """Digest of the source of this package. It is part of every key, so another version computes all outputs anew."""
-    root = Path(__file__).resolve().parents[1]
-    sources = sorted(root.rglob("*.py"))
-    return digest([(str(path.relative_to(root).as_posix()), path.read_bytes()) for path in sources])
+    return source_digest()
 
 
 def file_digest(path: Path, record: Mapping[str, Any] | None = None) -> str:

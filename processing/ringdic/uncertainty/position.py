@@ -37,7 +37,7 @@ def position_gain(cameras: Sequence[Camera], xyz: Points, sigma: Pixels) -> Floa
     slopes = np.full((len(cameras), len(xyz), 2, 3), np.nan)
     for k, camera in enumerate(cameras):
         index = np.flatnonzero(np.isfinite(sigma[k]).all(axis=1) & np.isfinite(xyz).all(axis=1))
-        slopes[k, index] = camera.project_with_slope(xyz[index])[1]
+        slopes[k, index] = camera.project_with_jacobian(xyz[index])[1]
     gain = np.empty((len(cameras), len(xyz), 3, 2))
     kernels.gain(slopes, sigma, gain)
     return gain
@@ -69,7 +69,7 @@ def along_surface(cameras: Sequence[Camera], reference: Indices, xyz: Points, no
     tangents = np.stack([first, np.cross(normals, first)], axis=-1)  # (n, 3, 2)
     for k in np.unique(reference[reference >= 0]):
         index = np.flatnonzero(reference == k)
-        _, slope = cameras[k].project_with_slope(xyz[index])
+        _, slope = cameras[k].project_with_jacobian(xyz[index])
         out[index] = tangents[index] @ np.linalg.inv(slope @ tangents[index])
     return out
 
@@ -148,7 +148,7 @@ def linear_sigma(cameras: Sequence[Camera], system: LinearSystem, sigma: Pixels)
     slopes = np.full((*system.undistorted.shape, 2), np.nan)
     for k, camera in enumerate(cameras):
         if camera.intrinsics is not None:
-            slopes[k] = camera.intrinsics.slope(system.undistorted[k])
+            slopes[k] = camera.intrinsics.jacobian(system.undistorted[k])
     scatter = np.ascontiguousarray(sigma, dtype=float)
     solved = system.normal, system.solvable, system.solution
     return np.sqrt(kernels.linear_variance(system.P, system.undistorted, slopes, *solved, scatter))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from threading import Thread
 
 import pytest
 from ringdic_controller.jobs.jobs import Job, Jobs
@@ -16,19 +17,21 @@ print("{not json", file=sys.stderr)
 """
 DONE = 'print(json.dumps({"state": "done", "run": "0004", "summary": {}}))'
 
+DONE_AT_ONCE = "import json\n" + DONE
+
 
 class Recorder:
-    """Keeps every change."""
+    """List of all changes that are reported; complete once the jobs are closed."""
 
     def __init__(self) -> None:
-        self.seen: list[Job] = []
+        self.changes: list[Job] = []
 
     def __call__(self, job: Job) -> None:
-        self.seen.append(job)
+        self.changes.append(job)
 
     def states(self, job_id: str) -> list[str]:
         """States of one job in order, each once."""
-        return list(dict.fromkeys(job.state for job in self.seen if job.id == job_id))
+        return list(dict.fromkeys(job.state for job in self.changes if job.id == job_id))
 
 
 def jobs_of(folder: Path, script: str, recorder: Recorder | None = None) -> Jobs:
@@ -39,14 +42,14 @@ def test_a_job_reports_its_stage_and_keeps_the_rest_as_log(tmp_path: Path) -> No
     recorder = Recorder()
     jobs = jobs_of(tmp_path, TALK + DONE, recorder)
     job = jobs.wait(jobs.submit("limb", tmp_path, reason="asked for").id, 20)
+    jobs.close()
     assert (job.state, job.run, job.done, job.error) == ("done", "0004", 1.0, None)
     assert recorder.states(job.id) == ["queued", "running", "done"]
-    told = next(seen for seen in recorder.seen if seen.stage == "calibrate")
-    assert (told.done, told.rate, told.left_s, told.message) == (0.25, "3 views/s", 9.0, "camera 201")
-    step, *rest = jobs.log(job.id).splitlines()
-    assert step.split(" ", 1)[1] == "calibrate camera 201"
+    progress = next(change for change in recorder.changes if change.stage == "calibrate")
+    assert (progress.done, progress.rate, progress.left_s, progress.message) == (0.25, "3 views/s", 9.0, "camera 201")
+    stage, *rest = jobs.log(job.id).splitlines()
+    assert stage.split(" ", 1)[1] == "calibrate camera 201"
     assert rest == ["a line of log with ångström", "{not json"]
-    jobs.close()
 
 
 @pytest.mark.parametrize(
@@ -69,7 +72,7 @@ def test_a_job_that_fails_says_why(tmp_path: Path, end: str, sentence: str) -> N
 
 
 def test_a_program_that_is_not_there_fails_its_job_and_the_next_is_run(tmp_path: Path) -> None:
-    commands = iter([["/no/such/program"], [sys.executable, "-c", "import json\n" + DONE]])
+    commands = iter([["/no/such/program"], [sys.executable, "-c", DONE_AT_ONCE]])
     jobs = Jobs(tmp_path, lambda _: next(commands))
     first, second = (jobs.submit("limb", tmp_path, reason="asked for") for _ in range(2))
     assert jobs.wait(second.id, 20).state == "done"
@@ -93,8 +96,8 @@ time.sleep(60)
     assert jobs.cancel(job.id).state == "cancelled"
     _until(lambda: _gone(grandchild))
     assert jobs.cancel(job.id).state == "cancelled"
-    assert recorder.states(job.id) == ["queued", "running", "cancelled"]
     jobs.close()
+    assert recorder.states(job.id) == ["queued", "running", "cancelled"]
 
 
 def test_a_newer_capture_takes_the_place_of_a_waiting_job_but_not_of_others(tmp_path: Path) -> None:
@@ -126,6 +129,25 @@ def test_a_waiting_job_can_be_cancelled_and_never_starts(tmp_path: Path) -> None
     jobs.wait(third.id, 20)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "c", "jobs"]
     jobs.close()
+
+
+def test_changes_are_reported_in_their_order_with_the_queue_free(tmp_path: Path) -> None:
+    changes: list[Job] = []
+    listings: list[int] = []
+
+    def ask_from_elsewhere(job: Job) -> None:
+        changes.append(job)
+        other = Thread(target=lambda: listings.append(len(jobs.list())))
+        other.start()
+        other.join(20)  # would last as long if the queue were locked
+
+    jobs = Jobs(tmp_path, lambda session: [sys.executable, "-c", DONE_AT_ONCE], ask_from_elsewhere)
+    ids = [jobs.submit("limb", tmp_path, reason="asked for").id for _ in range(3)]
+    jobs.wait(ids[-1], 20)
+    jobs.close()
+    assert len(listings) == len(changes)
+    for job_id in ids:
+        assert [job.state for job in changes if job.id == job_id] == ["queued", "running", "done"]
 
 
 def test_jobs_outlive_the_controller_and_an_unfinished_one_has_failed(tmp_path: Path) -> None:

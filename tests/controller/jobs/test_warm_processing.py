@@ -44,9 +44,9 @@ class Station:
 
     def __init__(self, folder: Path) -> None:
         self.child = WarmChild([sys.executable, "-c", CHILD])
-        self.seen: list[Job] = []
+        self.changes: list[Job] = []
         self.folder = folder
-        self.jobs = Jobs(folder / "jobs", self.child, self.seen.append)
+        self.jobs = Jobs(folder / "jobs", self.child, self.changes.append)
 
     def submit(self, what: str, **more) -> str:
         return self.jobs.submit(what, self.folder / what, reason="asked for", **more).id
@@ -62,8 +62,8 @@ class Station:
 
     def states(self, job: str) -> list[str]:
         """States of one job in order, repeats left out."""
-        told = [seen.state for seen in self.seen if seen.id == job]
-        return [state for k, state in enumerate(told) if k == 0 or state != told[k - 1]]
+        states = [change.state for change in self.changes if change.id == job]
+        return [state for k, state in enumerate(states) if k == 0 or state != states[k - 1]]
 
 
 @pytest.fixture
@@ -74,14 +74,14 @@ def station(tmp_path: Path) -> Iterator[Station]:
 
 
 def test_it_warms_before_there_is_work_and_tells_how_long_that_took(station: Station) -> None:
-    told: list[tuple[str, bool, float | None]] = []
-    station.child.on_change = lambda: told.append(
+    warmths: list[tuple[str, bool, float | None]] = []
+    station.child.on_change = lambda: warmths.append(
         (station.child.warmth.state, station.child.warmth.compiling, station.child.warmth.seconds)
     )
     assert station.child.warmth.state == "cold"
     station.child.warm()
     station.until(lambda: station.child.warmth.state == "ready")
-    assert told[-2:] == [("warming", True, None), ("ready", False, 1.5)]
+    assert warmths[-2:] == [("warming", True, None), ("ready", False, 1.5)]
 
 
 def test_one_child_carries_out_job_after_job_and_keeps_their_logs_apart(station: Station) -> None:
@@ -101,6 +101,21 @@ def test_a_crash_fails_its_job_alone_and_a_new_child_is_warmed(station: Station)
     after = station.wait(station.submit("a"))
     assert after.state == "done"
     assert after.run != before.run
+
+
+def test_an_order_that_comes_as_its_child_ends_fails_and_does_not_wait_for_ever(tmp_path: Path) -> None:
+    child = WarmChild([sys.executable, "-c", "pass"])
+    child.warm()
+    serving = child._child
+    assert serving is not None
+    assert serving.wait() == 0
+    deadline = time.monotonic() + 20
+    while serving.warmth.state != "ended":
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    work = serving.take({"session": str(tmp_path), "step": None, "settings": None})
+    assert list(work.lines()) == []
+    child.close()
 
 
 def test_cancelling_ends_the_child_and_the_next_job_gets_a_new_one(station: Station) -> None:
@@ -132,8 +147,7 @@ def test_a_step_goes_before_what_waits_and_only_the_newest_is_processed(station:
     newer = station.submit("limb", automatic=True, step="0005-specimen")
     station.wait(whole)
     assert station.jobs.get(older).state == "superseded"
-    finished = [seen.id for seen in station.seen if seen.state == "done"]
-    assert finished[-2:] == [newer, whole]
+    station.until(lambda: [job.id for job in station.changes if job.state == "done"][-2:] == [newer, whole])
     another = station.submit("limb", automatic=True, step="0006-specimen")
     station.wait(another)
     assert {job.id for job in station.jobs.list()} >= {whole, another}
@@ -172,7 +186,8 @@ def test_the_real_processing_serves_failures_without_ending_and_ends_with_its_or
         sentences = []
         for name in ("absent", "empty"):
             work = child.begin(Order(tmp_path / name))
-            outcome = [said for line in work.lines() if (said := message_of(line)) and "state" in said][-1]
+            messages = [message_of(line) for line in work.lines()]
+            outcome = [message for message in messages if message and "state" in message][-1]
             assert (work.wait(), outcome["state"]) == (0, "failed")
             sentences.append(outcome["error"])
         assert "no such session folder" in sentences[0]

@@ -81,9 +81,9 @@ def test_a_preview_shows_the_image_and_comes_once(client) -> None:
     assert (again.status_code, again.content) == (304, b"")
 
 
-def test_a_missing_node_is_named_and_an_override_captures_without_it(client, ring) -> None:
+def test_a_missing_node_is_named_and_an_override_captures_without_it(client, nodes) -> None:
     client.post(f"{API}/sessions", json={"name": "limb"})
-    ring.absent = {"03"}
+    nodes.absent = {"03"}
     refused = client.post(f"{API}/captures", json={"kind": "target"})
     assert refused.status_code == 409
     assert "03" in refused.json()["detail"]
@@ -95,9 +95,9 @@ def test_a_missing_node_is_named_and_an_override_captures_without_it(client, rin
     assert client.get(f"{API}/sessions/limb/captures/0001-target/images/03").status_code == 404
 
 
-def test_a_second_capture_at_once_is_refused_and_the_first_goes_on(client, ring) -> None:
+def test_a_second_capture_at_once_is_refused_and_the_first_goes_on(client, nodes) -> None:
     client.post(f"{API}/sessions", json={"name": "limb"})
-    ring.gate.clear()
+    nodes.gate.clear()
     first = client.post(f"{API}/captures", json={"kind": "board"}).json()
     address = f"{API}/rounds/{first['id']}"
     until(lambda: client.get(address).json()["state"] == "open")
@@ -105,7 +105,7 @@ def test_a_second_capture_at_once_is_refused_and_the_first_goes_on(client, ring)
     assert second.status_code == 409
     assert "under way" in second.json()["detail"]
     assert "under way" in client.get(f"{API}/rig").json()["refusal"]
-    ring.gate.set()
+    nodes.gate.set()
     until(lambda: client.get(address).json()["state"] == "closed")
     assert len(client.get(f"{API}/sessions/limb/captures").json()) == 1
     assert client.get(f"{API}/rig").json()["refusal"] is None
@@ -113,16 +113,16 @@ def test_a_second_capture_at_once_is_refused_and_the_first_goes_on(client, ring)
 
 def test_how_a_round_ended_can_be_read_until_the_next_begins(client, desk) -> None:
     client.post(f"{API}/sessions", json={"name": "limb"})
-    assert desk.snapshot()["round"] is None
+    assert desk.state.snapshot()["round"] is None
     for number, kind in enumerate(("board", "target"), start=1):
         assert capture(client, kind)["state"] == "closed"
-        told = desk.snapshot()["round"]
-        assert (told["capture_id"], told["state"]) == (f"{number:04d}-{kind}", "closed")
+        newest = desk.state.snapshot()["round"]
+        assert (newest["capture_id"], newest["state"]) == (f"{number:04d}-{kind}", "closed")
 
 
-def test_a_round_that_the_ring_refuses_tells_why_and_leaves_no_capture(client, ring) -> None:
+def test_a_round_that_the_nodes_refuse_tells_why_and_leaves_no_capture(client, nodes) -> None:
     client.post(f"{API}/sessions", json={"name": "limb"})
-    ring.unarmed = "02"
+    nodes.unarmed = "02"
     ended = capture(client, "board")
     assert ended["state"] == "refused"
     assert "camera 02 is not armed" in ended["error"]

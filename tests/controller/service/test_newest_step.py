@@ -18,9 +18,9 @@ QUIET = 0.6  # seconds
 @pytest.fixture
 def desk(desk_of: Callable[..., Desk], warm_stand_in: WarmChild) -> Desk:
     """A desk whose processing is a warm stand-in, with a session."""
-    made = desk_of(warm_stand_in, quiet=QUIET)
-    made.create_session("limb")
-    return made
+    desk = desk_of(warm_stand_in, quiet=QUIET)
+    desk.create_session("limb")
+    return desk
 
 
 def until(condition: Callable[[], Any]) -> Any:
@@ -33,18 +33,18 @@ def until(condition: Callable[[], Any]) -> Any:
 
 def capture(desk: Desk, *kinds: str) -> None:
     for kind in kinds:
-        round_ = until(lambda: desk.why_no_capture() is None and desk.capture(kind)).id  # noqa: B023
-        until(lambda: desk.round(round_).state == "closed")  # noqa: B023
+        round_ = until(lambda: desk.rounds.refusal() is None and desk.rounds.begin(kind)).id  # noqa: B023
+        until(lambda: desk.rounds.get(round_).state == "closed")  # noqa: B023
 
 
 def newest(desk: Desk) -> str:
-    return (desk.newest_step("limb") or {}).get("capture_id", "")
+    return (desk.sessions.newest_step("limb") or {}).get("capture_id", "")
 
 
 def test_the_newest_step_is_served_and_is_no_run(desk: Desk, client: TestClient) -> None:
-    told: list[tuple[str, dict[str, Any]]] = []
-    publish = desk.live.publish
-    desk.live.publish = lambda name, what: (told.append((name, what)), publish(name, what))  # type: ignore
+    events: list[tuple[str, dict[str, Any]]] = []
+    publish = desk.state.events.publish
+    desk.state.events.publish = lambda *event: (events.append(event), publish(*event))  # type: ignore
     address = "/api/v1/sessions/limb/live"
     capture(desk, "board", "target")
     assert client.get(address).status_code == 404
@@ -64,7 +64,7 @@ def test_the_newest_step_is_served_and_is_no_run(desk: Desk, client: TestClient)
     assert again.status_code == 304
     faces = np.frombuffer(client.get(f"{of_step}/faces").content, "<u4")
     assert len(faces) == 3 * header["faces"]
-    until(lambda: ("newest", desk.newest_step("limb")) in told)
+    until(lambda: ("newest", desk.sessions.newest_step("limb")) in events)
     assert client.get(f"{address}/0009-specimen").status_code == 404
     assert client.get("/api/v1/sessions/absent/live").status_code == 404
     assert client.get("/api/v1/sessions/limb/results").json() == []
@@ -79,9 +79,9 @@ def test_the_whole_session_is_processed_once_when_the_capturing_has_ended(desk: 
     runs = [job for job in desk.jobs.list() if job.step is None and job.state == "done"]
     assert len(runs) == 1
     assert newest(desk) == "0010-specimen"
-    kept = sorted(path.name for path in (desk.root / "limb" / "live").iterdir())
-    assert kept[-1] == "0010-specimen"
-    assert len(kept) <= 5  # newer ones have taken the place of the others
+    folders = sorted(path.name for path in (desk.catalogue.root / "limb" / "live").iterdir())
+    assert folders[-1] == "0010-specimen"
+    assert len(folders) <= 5  # newer ones have taken the place of the others
 
 
 def test_without_live_processing_the_whole_session_is_processed_at_once(

@@ -86,7 +86,7 @@ def test_the_event_stream_tells_a_capture_from_arming_to_the_close_and_does_not_
 def test_a_session_that_another_program_makes_is_shown(tmp_path: Path) -> None:
     desk = Desk(tmp_path, lambda _: [], watch=0.05)
     shown: queue.Queue = queue.Queue()
-    desk.live.publish_snapshot = lambda: shown.put(desk.snapshot())  # type: ignore[method-assign]
+    desk.state.events.publish_snapshot = lambda: shown.put(desk.state.snapshot())  # type: ignore[method-assign]
     Archive(tmp_path).create_session("imported", RIG, source="import")
     assert [session["name"] for session in shown.get(timeout=10)["sessions"]] == ["imported"]
     desk.close()
@@ -135,9 +135,9 @@ def test_a_signal_ends_the_controller_with_its_streams_and_jobs(tmp_path: Path, 
 
 def test_without_a_rig_the_controller_shows_and_captures_nothing(tmp_path: Path) -> None:
     with open_desk(ControllerConfig(archive=tmp_path / "archive")) as desk:
-        assert desk.roster() == []
-        assert "without a rig" in (desk.why_no_capture() or "")
-        assert desk.snapshot()["sessions"] == []
+        assert desk.roster.cameras() == []
+        assert "without a rig" in (desk.rounds.refusal() or "")
+        assert desk.state.snapshot()["sessions"] == []
 
 
 def test_a_port_that_is_taken_is_named(desk: Desk) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from ringdic.geometry.camera import Camera
 from ringdic.results.results import Results
-from ringdic_controller.studies.truth import TURN, SurfaceGrid, errors, face_middles
+from ringdic_controller.studies.truth import TURN, SurfaceGrid, errors, face_centroids
 from ringdic_node.virtual_rig.rig import paper_rig
 from ringdic_node.virtual_rig.scenes import Cylinder, Damage, Limb, Specimen, SpoiltPatch
 
@@ -73,7 +73,7 @@ def test_steps_may_be_numbered_otherwise() -> None:
 
 
 def test_the_middle_of_a_triangle_across_the_seam_lies_at_the_seam() -> None:
-    theta, z = face_middles(np.array([6.2, 0.1, 6.25]), np.array([1.0, 2.0, 6.0]), np.array([[0, 1, 2]]))
+    theta, z = face_centroids(np.array([6.2, 0.1, 6.25]), np.array([1.0, 2.0, 6.0]), np.array([[0, 1, 2]]))
     assert np.cos(theta[0]) > 0.99
     assert z[0] == pytest.approx(3.0)
 
@@ -83,7 +83,7 @@ def test_a_closed_tube_covers_its_whole_height_and_a_hole_is_missed() -> None:
     grid = SurfaceGrid.of(specimen)
     theta, z, faces = lattice(120, 60, *specimen.band)
     assert grid.covered(theta, z, faces).mean() > 0.999
-    middle_theta, middle_z = face_middles(theta, z, faces)
+    middle_theta, middle_z = face_centroids(theta, z, faces)
     hole = (np.abs(middle_z - 125) < 20) & (np.abs(middle_theta - 3.0) < 0.3)
     covered = grid.covered(theta, z, faces[~hole])
     gap = np.abs(grid.theta - 3.0) < 0.27

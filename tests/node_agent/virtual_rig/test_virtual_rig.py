@@ -11,7 +11,7 @@ from ringdic_node.virtual_rig.lens import VirtualCamera, distort, ideal_of_pixel
 from ringdic_node.virtual_rig.render import radiance, render
 from ringdic_node.virtual_rig.rig import paper_rig, write_truth
 from ringdic_node.virtual_rig.scenes import Cylinder, Limb, Specimen, TargetScene, scene
-from ringdic_node.virtual_rig.sensor import FULL_WELL, READ_NOISE, expose, quantise
+from ringdic_node.virtual_rig.sensor import FULL_WELL, READ_NOISE, expose, srgb_coded
 from ringdic_node.virtual_rig.texture import speckle
 from scipy.stats import norm
 
@@ -183,7 +183,7 @@ def test_a_subset_moves_as_its_material_does_to_a_thousandth_of_a_pixel() -> Non
     K = full.K - np.array([[0, 0, full.width / 2 - 150], [0, 0, full.height / 2 - 150], [0, 0, 0]])
     window = replace(full, K=K, width=300, height=300)
     cylinder = Cylinder(per_step=(0.0, 0.0, 0.05))
-    before, after = (255 * quantise(radiance(window, Specimen(cylinder, step))) for step in (0, 1))
+    before, after = (255 * srgb_coded(radiance(window, Specimen(cylinder, step))) for step in (0, 1))
     facing = np.arctan2(full.centre[1], full.centre[0])
     theta, z = np.meshgrid(facing + np.linspace(-0.3, 0.3, 60), np.linspace(60, 200, 150))
     xy, moved = (window.project(cylinder.position(theta.ravel(), z.ravel(), step)) for step in (0, 1))

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ringdic.cli.app import application
 from ringdic.errors import InputError, RingdicError
 from ringdic.results.results import Results
 from ringdic.results.writer import write_results
-from ringdic_controller.cli.app import app
 from typer.testing import CliRunner, Result
 
 STRETCH = 1.2
@@ -40,7 +40,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def ringdic(*words: object) -> Result:
-    return CliRunner().invoke(app, [str(word) for word in words])
+    return CliRunner().invoke(application(), [str(word) for word in words])
 
 
 def table(*words: object) -> list[dict[str, str]]:

@@ -10,7 +10,7 @@ from ringdic.correlation import (
     grid,
     prepare_current,
     prepare_reference,
-    search_hypotheses,
+    search_warps,
 )
 
 SIZE = 220
@@ -227,11 +227,11 @@ def test_the_true_warp_wins_among_hypotheses():
     warps[:, :, :2] = np.stack(affine(*xy.T), axis=1)[:, None]
     warps[:, :, 0] += shifts
     warps[:, :, 2:] = [0.02, -0.03, 0.04, 0.01]
-    best, zncc, second = search_hypotheses(*prepared, xy, warps, 12)
+    best, zncc, second = search_warps(*prepared, xy, warps, 12)
     np.testing.assert_allclose(best[:, :2], np.stack(affine(*xy.T), axis=1))
     assert zncc.min() > 0.97
     assert second.max() < 0.8
     warps[:, :, 0] += 1000.0
-    best, zncc, _ = search_hypotheses(*prepared, xy, warps, 12)
+    best, zncc, _ = search_warps(*prepared, xy, warps, 12)
     assert np.isnan(best).all()
     assert (zncc == -1).all()

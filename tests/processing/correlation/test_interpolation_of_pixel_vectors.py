@@ -4,22 +4,22 @@ import numba as nb
 import numpy as np
 import pytest
 from ringdic.correlation.interpolation import SCATTERED, WIDE, make_interpolation
-from ringdic.correlation.kernels import _place
+from ringdic.correlation.kernels import _locate_vectors
 from ringdic.correlation.lanes import (
     BITS,
     LANES,
     WINDOW,
     absolute,
-    chosen,
+    bit_count,
     floor,
+    gather,
+    lane_sum,
     load,
-    marked,
-    picked,
+    mask_from_bits,
+    nonzero_bits,
     pointer,
-    population,
     select,
     store,
-    total,
 )
 from ringdic.correlation.spline import PAD, coefficients
 from scipy import ndimage
@@ -50,7 +50,7 @@ def levels(image, degree, x, y, slopes, bends):
     p = np.zeros(12)
     p[[1, 7]], p[[3, 9]] = slopes, 2.0 * np.array(bends)
     place, cell = np.zeros((4, LANES), np.float32), np.zeros((3, LANES), np.int32)
-    _place(np.float32(x % 1), np.float32(y % 1), p, np.zeros((2, LANES), np.float32), 1, place, cell)
+    _locate_vectors(np.float32(x % 1), np.float32(y % 1), p, np.zeros((2, LANES), np.float32), 1, place, cell)
     tap = 1 if degree == 3 else 2
     row, column = int(y) + cell[1, 0] + PAD - tap, int(x) + cell[0, 0] + PAD - tap
     out, spare = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
@@ -85,13 +85,13 @@ def _arithmetic(a, b, bits, out):
     x, y, at = load(pointer(a), _U(0)), load(pointer(b), _U(0)), pointer(out)
     store(at, _U(0), 2.0 * x - y * x + 1.0)
     store(at, _U(LANES), select(x >= y, floor(x), absolute(y)))
-    store(at, _U(2 * LANES), select(chosen(bits), x, 0.0))
-    return total(x)
+    store(at, _U(2 * LANES), select(mask_from_bits(bits), x, 0.0))
+    return lane_sum(x)
 
 
 @nb.njit
 def _pick(a, which, out):
-    store(pointer(out), _U(0), picked(pointer(a), _U(3), load(pointer(which), _U(0))))
+    store(pointer(out), _U(0), gather(pointer(a), _U(3), load(pointer(which), _U(0))))
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
@@ -112,7 +112,7 @@ def test_lanes_compute_as_arrays_do(kind):
 
 @nb.njit
 def _marks(mask):
-    return marked(pointer(mask), _U(1))
+    return nonzero_bits(pointer(mask), _U(1))
 
 
 def test_marked_bytes_become_bits():
@@ -122,7 +122,7 @@ def test_marked_bytes_become_bits():
 
 @nb.njit
 def _count(bits):
-    return population(bits)
+    return bit_count(bits)
 
 
 def test_bits_are_counted():

@@ -33,8 +33,8 @@ def test_a_quadratic_field_is_its_own_fit_at_every_point_and_at_lost_ones():
     np.testing.assert_allclose(fit.value[known], values[known], atol=1e-6)
     np.testing.assert_allclose(fit.gradient[known], slope[known], atol=1e-6)
     np.testing.assert_allclose(fit.curvature[known], np.broadcast_to(CURVATURE, (known.sum(), 2, 3)), atol=1e-7)
-    assert np.nanmax(np.abs(fit.leave_out)) < 1e-5
-    assert np.isnan(fit.leave_out[::7]).all()
+    assert np.nanmax(np.abs(fit.leave_one_out)) < 1e-5
+    assert np.isnan(fit.leave_one_out[::7]).all()
 
 
 def test_the_scatter_of_second_derivatives_is_the_stated_one():
@@ -57,7 +57,7 @@ def test_a_point_that_is_off_shows_by_as_much_against_the_others():
     values = quadratic(xy)
     values[50] += (0.4, -0.3)
     fit = Neighbourhoods(xy, 40.0).fit(values)
-    np.testing.assert_allclose(fit.leave_out[50], (0.4, -0.3), atol=1e-6)
+    np.testing.assert_allclose(fit.leave_one_out[50], (0.4, -0.3), atol=1e-6)
 
 
 def test_points_on_one_line_claim_no_certainty_across_it():
@@ -88,4 +88,4 @@ def test_a_fit_carried_to_other_places_is_the_field_there():
     fit = Neighbourhoods(xy, 40.0).fit(quadratic(xy))
     inner = np.flatnonzero(((xy > 30) & (xy < 170)).all(axis=1))
     away = np.random.default_rng(2).uniform(-12, 12, (len(inner), 2))
-    np.testing.assert_allclose(fit.carried(inner, away), quadratic(xy[inner] + away), atol=1e-5)
+    np.testing.assert_allclose(fit.extrapolate(inner, away), quadratic(xy[inner] + away), atol=1e-5)

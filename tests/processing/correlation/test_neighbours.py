@@ -1,7 +1,7 @@
 """Neighbours on a grid and among scattered points, and what they say about one another."""
 
 import numpy as np
-from ringdic.correlation.neighbours import inconsistent, local_fit, point_neighbours
+from ringdic.correlation.neighbours import inconsistent_points, local_affine_fit, point_neighbours
 from scipy.spatial import cKDTree
 
 STEP = 10.0
@@ -21,7 +21,9 @@ def affine(xy: np.ndarray) -> np.ndarray:
 
 
 def judged(xy: np.ndarray, p: np.ndarray, good: np.ndarray) -> np.ndarray:
-    return inconsistent(xy, p, good, point_neighbours(xy, STEP), np.full(len(xy), np.nan), np.ones(len(xy), bool))
+    return inconsistent_points(
+        xy, p, good, point_neighbours(xy, STEP), np.full(len(xy), np.nan), np.ones(len(xy), bool)
+    )
 
 
 def test_neighbours_are_all_points_within_reach_on_a_grid_and_off_it():
@@ -54,7 +56,7 @@ def test_the_judgement_of_what_has_changed_is_that_of_everything():
         p[some, 0] += random.normal(0.0, 2.0, 12)
         good[some[:4]] = False
         stale[some] = True
-        bad = inconsistent(xy, p, good, near, jump, stale)
+        bad = inconsistent_points(xy, p, good, near, jump, stale)
         np.testing.assert_array_equal(bad, judged(xy, p, good))
         assert not stale.any()
 
@@ -65,12 +67,12 @@ def test_a_fit_continues_an_affine_field_and_a_row_of_points_along_itself():
     good = np.abs(xy[:, 0] - 150.0) > 25.0
     wanted = np.flatnonzero(~good)
     p[wanted] = np.nan
-    np.testing.assert_allclose(local_fit(xy, p, good, near, wanted), affine(xy[wanted]), atol=1e-6)
+    np.testing.assert_allclose(local_affine_fit(xy, p, good, near, wanted), affine(xy[wanted]), atol=1e-6)
     row = STEP * np.stack([np.arange(20.0), np.zeros(20)], 1)
     good = np.arange(20) != 7
-    fit = local_fit(row, affine(row), good, point_neighbours(row, STEP), np.array([7]))
+    fit = local_affine_fit(row, affine(row), good, point_neighbours(row, STEP), np.array([7]))
     np.testing.assert_allclose(fit[0, [0, 1, 6, 7]], affine(row[7:8])[0, [0, 1, 6, 7]], atol=1e-6)
     np.testing.assert_allclose(fit[0, [2, 8]], 0.0, atol=1e-9)
     assert np.isnan(
-        local_fit(row[:6], affine(row[:6]), np.arange(6) > 0, point_neighbours(row[:6], STEP), np.array([0]))
+        local_affine_fit(row[:6], affine(row[:6]), np.arange(6) > 0, point_neighbours(row[:6], STEP), np.array([0]))
     ).all()

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from ringdic.correlation import Row, prepare_current, prepare_reference, search_hypotheses, search_row
+from ringdic.correlation import WarpHypotheses, prepare_current, prepare_reference, search_hypotheses, search_warps
 
 RADIUS, SIZE = 12, 220
 
@@ -66,7 +66,7 @@ def row_through_the_match(xy, seed=3):
     knots[..., 1] = affine(*xy.T)[1][:, None] + 0.1 * along + rng.uniform(-0.4, 0.4, (len(xy), 1))
     knots[..., 2:] = np.array([0.02, -0.03, 0.04, 0.01]) + rng.normal(0, 0.02, (len(xy), 1, 4))
     knots[::3, 0] = np.nan
-    return Row(knots, np.linspace(0.0, 10.0, 81))
+    return WarpHypotheses(knots, np.linspace(0.0, 10.0, 81))
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.uint8, np.uint16])
@@ -77,9 +77,9 @@ def test_the_thinned_first_trial_loses_no_match(kind):
     row = row_through_the_match(xy)
     plain = zncc_of_every_warp(reference.astype(float), current.astype(float), xy, row.warps)
     assert (plain == -1.0).mean() > 0.1  # of those that leave the image the test says something too
-    found = search_row(reference, prepare_current(current), xy, row, RADIUS)
+    found = search_hypotheses(reference, prepare_current(current), xy, row, RADIUS)
     everyone, best = np.arange(len(xy)), plain.argmax(axis=1)
-    assert (found.which == best).all()
+    assert (found.index == best).all()
     np.testing.assert_array_equal(found.warps, row.warps[everyone, best])
     np.testing.assert_allclose(found.zncc, plain[everyone, best], atol=1e-5)
     apart = np.hypot(*np.moveaxis(row.warps[..., :2] - found.warps[:, None, :2], -1, 0)) > 4.0
@@ -95,8 +95,8 @@ def test_two_like_places_on_a_row_are_both_told():
     xy = np.array([[90.0, 100.0], [92.0, 120.0]])  # 36 px farther it looks the same
     knots = np.zeros((2, 2, 6))
     knots[:, :, 0] = [-20.0, 60.0]
-    row = Row(knots, np.linspace(0.0, 1.0, 81))
-    found = search_row(image, prepare_current(image), xy, row, RADIUS)
+    row = WarpHypotheses(knots, np.linspace(0.0, 1.0, 81))
+    found = search_hypotheses(image, prepare_current(image), xy, row, RADIUS)
     np.testing.assert_allclose(found.warps[:, 0], 0.0, atol=1e-9)
     np.testing.assert_allclose(found.second_peak, 1.0, atol=1e-6)
 
@@ -107,10 +107,10 @@ def test_a_match_of_use_is_found_and_what_is_of_none_stays_below():
     xy = points()
     row = row_through_the_match(xy)
     prepared = prepare_current(current)
-    plain, pruned = (search_row(reference, prepared, xy, row, RADIUS, least=least) for least in (-1.0, 0.8))
+    plain, pruned = (search_hypotheses(reference, prepared, xy, row, RADIUS, least=least) for least in (-1.0, 0.8))
     of_use = plain.zncc > 0.8
     assert 0.2 < of_use.mean() < 0.8
-    np.testing.assert_array_equal(pruned.which[of_use], plain.which[of_use])
+    np.testing.assert_array_equal(pruned.index[of_use], plain.index[of_use])
     np.testing.assert_array_equal(pruned.zncc[of_use], plain.zncc[of_use])
     np.testing.assert_array_equal(pruned.second_peak[of_use], plain.second_peak[of_use])
     assert (pruned.zncc[~of_use] <= 0.8).all()
@@ -120,8 +120,8 @@ def test_a_row_of_all_its_warps_is_the_search_of_given_warps():
     reference, current = pair()
     xy = points()
     row, prepared = row_through_the_match(xy), prepare_current(current)
-    found = search_row(reference, prepared, xy, row, RADIUS)
-    warps, zncc, second = search_hypotheses(prepare_reference(reference), prepared, xy, row.warps, RADIUS)
+    found = search_hypotheses(reference, prepared, xy, row, RADIUS)
+    warps, zncc, second = search_warps(prepare_reference(reference), prepared, xy, row.warps, RADIUS)
     np.testing.assert_allclose(warps, found.warps, atol=1e-12)
     np.testing.assert_allclose(zncc, found.zncc, atol=1e-6)
     np.testing.assert_allclose(second, found.second_peak, atol=1e-6)
@@ -131,6 +131,6 @@ def test_an_even_image_is_like_nothing():
     reference, xy = speckle(), np.array([[110.0, 110.0]])
     for level in (7.3, 250.0, 60000.0):
         even = prepare_current(np.full(reference.shape, level))
-        found = search_row(reference, even, xy, row_through_the_match(xy), RADIUS)
+        found = search_hypotheses(reference, even, xy, row_through_the_match(xy), RADIUS)
         assert found.zncc[0] == -1.0
         assert np.isnan(found.warps).all()

@@ -2,7 +2,7 @@
 
 import numpy as np
 from ringdic.correlation import Correlation, CorrelationSettings
-from ringdic.correlation.start_field import between, lattice_spacing, on_lattice
+from ringdic.correlation.start_field import interpolate_start_values, lattice_spacing, on_lattice
 
 SPACING = 40
 
@@ -31,7 +31,7 @@ def test_a_quadratic_field_is_met_exactly_between_its_corners() -> None:
     xy, coarse = grid(10), grid(SPACING)
     coarse = coarse[on_lattice(coarse, SPACING)]
     for order in (1, 2):
-        start = between(matched(coarse, np.zeros(len(coarse), int)), xy, SPACING, order)
+        start = interpolate_start_values(matched(coarse, np.zeros(len(coarse), int)), xy, SPACING, order)
         uv, slope, bend = quadratic(xy)
         known = np.isfinite(start).all(axis=1)
         inside = (xy <= coarse.max(axis=0)).all(axis=1)
@@ -46,7 +46,7 @@ def test_where_a_corner_is_lost_nothing_is_said() -> None:
     xy, coarse = grid(10), grid(SPACING)
     lost = (coarse == (240, 320)).all(axis=1).astype(int)
     assert lost.sum() == 1
-    start = between(matched(coarse, lost), xy, SPACING, 1)
+    start = interpolate_start_values(matched(coarse, lost), xy, SPACING, 1)
     beside = (np.abs(xy - (240, 320)) < SPACING).all(axis=1)
     assert np.isnan(start[beside]).all()
     inside = (xy <= coarse.max(axis=0)).all(axis=1)

@@ -45,14 +45,14 @@ def test_the_lens_derivative_is_that_of_its_formula() -> None:
     for axis in range(2):
         step = np.eye(2)[axis] * h
         difference = (LENS.distort_normalised(xy + step) - LENS.distort_normalised(xy - step)) / (2 * h)
-        np.testing.assert_allclose(LENS._jacobian_normalised(xy)[..., axis], difference, atol=1e-8)
+        np.testing.assert_allclose(LENS.jacobian_normalised(xy)[..., axis], difference, atol=1e-8)
 
 
 @pytest.mark.parametrize("lens", [LENS, None])
 def test_the_slope_of_the_projection_is_that_of_the_projection(lens: Intrinsics | None) -> None:
     c, h = camera(lens=lens), 1e-3
     xyz = np.array([[50.0, 10, 20], [40, 30, 200], [55, 5, 120]])
-    px, slope = c.project_with_slope(xyz)
+    px, slope = c.project_with_jacobian(xyz)
     np.testing.assert_array_equal(px, c.project(xyz))
     difference = np.stack([(c.project(xyz + d) - c.project(xyz - d)) / (2 * h) for d in np.eye(3) * h], axis=-1)
     np.testing.assert_allclose(slope, difference, atol=1e-7)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from ringdic.mesh.nearest import among_alike, cubes, near
+from ringdic.mesh.nearest import away_from_other_labels, cubes, near
 
 
 @pytest.mark.parametrize("size", [0.02, 0.3, 5.0])
@@ -25,7 +25,7 @@ def test_points_among_their_like_have_no_others_near() -> None:
     """Two labels on either side of a plane: whoever is said to be among its like is, and most are told so."""
     points = np.random.default_rng(2).random((4000, 3)) * [10, 2, 2]
     label = (points[:, 0] > 5).astype(np.int64)
-    alike = among_alike(cubes(points, 0.5), label, 0.9)
+    alike = away_from_other_labels(cubes(points, 0.5), label, 0.9)
     assert (np.abs(points[alike, 0] - 5) > 0.9).all()
     assert alike.mean() > 0.6
 

@@ -1,7 +1,10 @@
 """The surface that several cameras see together, from exact geometry and from rendered images with truth."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from ringdic.correlation import CorrelationSettings
@@ -11,19 +14,20 @@ from ringdic.mesh.mesh import Mesh
 from ringdic.mesh.topology import holes, inconsistent_edges, is_closed_tube, non_manifold_vertices
 from ringdic.multiview.agreement import triangulate_agreeing
 from ringdic.multiview.lattice import Pieces, SurfaceLattice, fit_pieces
-from ringdic.multiview.motion import measure_motion
+from ringdic.multiview.motion import Motion
 from ringdic.multiview.shape import reference_shape
-from ringdic.multiview.surface import ring_surface
-from ringdic.multiview.tracking import Tracking
+from ringdic.multiview.surface import pair_indices, shape_settings, surface_of_tracks
+from ringdic.multiview.tasks import MultiviewJob, shape_task
 from ringdic.multiview.tube import lattice_faces
-from ringdic.multiview.views import seen
+from ringdic.multiview.views import visibility
 from ringdic.multiview.warps import surface_stencil, warps_to
 from ringdic.results.reader import read_results
 from ringdic.results.writer import write_results
 from ringdic.settings import BEST, CorrelationGroup
 from ringdic.strain.deformation import deformation
-from ringdic.sweep.proxies import on_cylinder
-from ringdic.sweep.sweep import Search
+from ringdic.sweep.proxies import cylinder_intersections
+from ringdic.sweep.sweep import DepthSearch
+from ringdic.tasks import LocalExecutor, Task, process_memory
 from ringdic_node.virtual_rig.render import render
 from ringdic_node.virtual_rig.rig import paper_rig
 from ringdic_node.virtual_rig.scenes.specimen import Limb, Specimen
@@ -53,9 +57,9 @@ def test_warps_are_those_of_exact_lines_of_sight_to_a_cylinder() -> None:
     """Second differences over one pixel of lines of sight cut with the cylinder itself, no pieces."""
     first, second = CAMERAS[0], CAMERAS[1]
     pieces = cylinder()
-    sight, _ = seen(pieces, (first, second), {}, 40.0, 30.0)
+    sight, _ = visibility(pieces, (first, second), {}, 40.0, 30.0)
     nodes = tuple(index[::53] for index in np.nonzero(sight.all(axis=0)))
-    theta, z = (place[nodes] for place in LATTICE.places)
+    theta, z = (place[nodes] for place in LATTICE.coordinates)
     px = np.rint(first.project(pieces.xyz[nodes]))
     stencil = surface_stencil(LATTICE, pieces.coefficients[nodes], theta, z, first, px, 3.0)
     assert np.abs(np.hypot(stencil[..., 0], stencil[..., 1]) - 57.0).max() < 1e-9
@@ -63,7 +67,7 @@ def test_warps_are_those_of_exact_lines_of_sight_to_a_cylinder() -> None:
 
     def moved(dx: float, dy: float) -> np.ndarray:
         at = px + np.array([dx, dy])
-        return second.project(on_cylinder(first, at, np.array([57.0]))[:, 0]) - at
+        return second.project(cylinder_intersections(first, at, np.array([57.0]))[:, 0]) - at
 
     assert len(px) > 50
     np.testing.assert_allclose(warps[:, :2], moved(0, 0), rtol=0, atol=1e-7)
@@ -80,7 +84,7 @@ def test_warps_are_those_of_exact_lines_of_sight_to_a_cylinder() -> None:
 
 def test_cameras_see_the_nodes_that_face_them() -> None:
     pieces = cylinder()
-    sight, cosine = seen(pieces, CAMERAS, {}, 60.0, 0.0)
+    sight, cosine = visibility(pieces, CAMERAS, {}, 60.0, 0.0)
     towards = np.array([camera.centre for camera in CAMERAS])[:, None, None] - pieces.xyz
     normal = pieces.xyz * np.array([1, 1, 0]) / 57.0
     true = np.sum(towards * normal, axis=-1) / np.linalg.norm(towards, axis=-1)
@@ -92,7 +96,7 @@ def test_cameras_see_the_nodes_that_face_them() -> None:
 
 
 def test_a_mask_and_a_hidden_place_are_not_seen() -> None:
-    theta, z = LATTICE.places
+    theta, z = LATTICE.coordinates
     collar = 57.0 + 12.0 * np.exp(-(((z - 120.0) / 4.0) ** 2))  # stands 12 mm out at half height
     down = np.array([-np.sqrt(0.5), 0.0, -np.sqrt(0.5)])  # a camera 45° above the middle looks down on it
     right = np.array([0.0, 1.0, 0.0])
@@ -101,8 +105,8 @@ def test_a_mask_and_a_hidden_place_are_not_seen() -> None:
     P = np.diag([1000.0, 1000.0, 1.0]) @ np.column_stack([R, -R @ centre])
     P[:2] += np.outer([600.0, 600.0], P[2])
     above = Camera("above", P / P[2, 3], (1200, 1200))
-    free, _ = seen(fit_pieces(LATTICE, collar, 4.0), [above], {}, 80.0, 0.0)
-    plain, _ = seen(cylinder(), [above], {}, 80.0, 0.0)
+    free, _ = visibility(fit_pieces(LATTICE, collar, 4.0), [above], {}, 80.0, 0.0)
+    plain, _ = visibility(cylinder(), [above], {}, 80.0, 0.0)
     # The collar's shadow ends where the line over its edge meets the cylinder again.
     assert not free[0][(np.abs(z - 111.0) < 2) & plain[0]].any()
     assert plain[0][np.abs(z - 111.0) < 2].any()
@@ -112,7 +116,7 @@ def test_a_mask_and_a_hidden_place_are_not_seen() -> None:
     camera = CAMERAS[0]
     mask = np.zeros((camera.size[1], camera.size[0]), bool)
     mask[:, : camera.size[0] // 2] = True
-    masked, _ = seen(cylinder(), [camera], {camera.id: mask}, 60.0, 0.0)
+    masked, _ = visibility(cylinder(), [camera], {camera.id: mask}, 60.0, 0.0)
     assert masked.any()
     assert (camera.project(cylinder().xyz[masked[0]])[:, 0] < camera.size[0] / 2).all()
 
@@ -195,7 +199,7 @@ def limb() -> Images:
 
 
 CORRELATION = CorrelationSettings(radius=8, step=5)
-SEARCH = Search(radius=57.0, reach=20.0, incidence=65.0)
+SEARCH = DepthSearch(radius=57.0, reach=20.0, incidence=65.0)
 
 
 def measured(images: Images, **more):
@@ -243,8 +247,10 @@ def test_points_rest_on_whole_pixels_of_their_reference_camera(shape) -> None:
     assert (np.isfinite(shape.px[..., 0]).sum(axis=0) >= 2).all()
 
 
-def test_the_motion_of_the_limb_from_three_cameras(limb: Images, shape, figures) -> None:
-    motion = measure_motion(limb.cameras, shape, limb, 2, {}, CORRELATION, Tracking(), 0.1)
+def test_the_motion_of_the_limb_from_three_cameras(
+    limb: Images, shape, motion_of_shape: Callable[..., Motion], figures
+) -> None:
+    motion = motion_of_shape(limb.cameras, shape, limb, 2, CORRELATION, 0.1)
     theta, z, _ = Limb().material_coordinates(shape.xyz)
     speckled = (z > 5) & (z < 245)
     true = [Limb().position(theta, z, step) for step in (0, STEP)]
@@ -260,26 +266,35 @@ def test_the_motion_of_the_limb_from_three_cameras(limb: Images, shape, figures)
     assert np.nanstd((found.lambda2 - exact.lambda2)[whole]) < 3e-3
     # A camera that drops out does not move the points: they are labels that all cameras share.
     without = Images(limb.cameras, {key: grey for key, grey in limb.grey.items() if key != (limb.cameras[2].id, 1)})
-    fewer = measure_motion(limb.cameras, shape, without, 2, {}, CORRELATION, Tracking(), 0.1)
+    fewer = motion_of_shape(limb.cameras, shape, without, 2, CORRELATION, 0.1)
     both = np.isfinite(fewer.xyz[1, :, 0]) & np.isfinite(motion.xyz[1, :, 0]) & speckled
     assert 0.3 < both.mean() < 0.9
     assert np.abs(np.median((fewer.xyz - motion.xyz)[1, both], axis=0)).max() < 1e-3
 
 
-def test_two_cameras_are_enough_and_a_third_that_sees_nothing_is_named(limb: Images, tmp_path) -> None:
+def test_two_cameras_are_enough_and_a_third_that_sees_nothing_is_named(limb: Images, tmp_path: Path) -> None:
     ids = [camera.id for camera in limb.cameras]
-    grey = {(id_, 0): limb.grey[id_, 0] for id_ in ids[:2]}
-    grey[ids[2], 0] = np.full_like(grey[ids[0], 0], 128)
+    grey = {id_: limb.grey[id_, 0] for id_ in ids[:2]}
+    grey[ids[2]] = np.full_like(grey[ids[0]], 128)
+    images = {id_: tmp_path / f"{id_}.png" for id_ in ids}
+    for id_, path in images.items():
+        assert cv2.imwrite(str(path), grey[id_])
     settings = BEST.model_copy(update={"correlation": CorrelationGroup(radius_px=8, step_px=5)})
+    correlation = CorrelationSettings(**settings.correlation.keywords)
     pairs = [(ids[0], ids[1]), (ids[1], ids[2])]
-    found = ring_surface("ring", limb.cameras, pairs, Images(limb.cameras, grey), {}, ["reference"], SEARCH, settings)
-    results = found.results
-    assert [sentence for sentence in found.warnings if ids[2] in sentence]
-    assert len(found.warnings) == 1
-    assert set(found.drift) == set(ids[:2])
+    numbers, how = tuple(pair_indices(limb.cameras, pairs)), shape_settings(settings)
+    arguments = (tuple(limb.cameras), numbers, SEARCH, correlation, how, images, {})
+    job = MultiviewJob(tuple(limb.cameras), Task("shape", "shape", shape_task, arguments, tmp_path), ((), (), ()))
+    process_memory.clear()
+    LocalExecutor(1).run(job.tasks, lambda *_: None)
+    surface = surface_of_tracks("ring", limb.cameras, pairs, ["reference"], *job.outputs(), settings)
+    results = surface.results
+    assert [sentence for sentence in surface.warnings if ids[2] in sentence]
+    assert len(surface.warnings) == 1
+    assert set(surface.drift) == set(ids[:2])
     assert set(results.pair) == {0}
     assert len(results.vertices_ref) > 1000
-    assert found.agreement["views"] == 2.0
+    assert surface.agreement["views"] == 2.0
     _, z, distance = Limb().material_coordinates(results.vertices_ref)
     speckled = (z > 5) & (z < 245)
     assert np.abs(distance[speckled]).max() < 0.5

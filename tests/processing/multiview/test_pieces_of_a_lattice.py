@@ -16,7 +16,7 @@ def cubic(a, b):
 
 
 def test_a_cubic_is_found_exactly_inside_and_a_quadratic_up_to_the_rim() -> None:
-    theta, z = LATTICE.places
+    theta, z = LATTICE.coordinates
     a, b = LATTICE.arc(theta, np.array(ANGLE)), z - HEIGHT
     near = np.hypot(a, b) < 30
     value, by_a, by_b = cubic(a, b)
@@ -44,7 +44,7 @@ def test_a_piece_is_evaluated_with_its_derivatives() -> None:
 
 
 def test_the_lattice_closes_round_the_axis() -> None:
-    theta, z = LATTICE.places
+    theta, z = LATTICE.coordinates
     radius = 50 + 2 * np.cos(theta + 0.3) + 0.01 * z
     turned = np.roll(radius, 37, axis=0)
     first, second = fit_pieces(LATTICE, radius, 10.0).coefficients, fit_pieces(LATTICE, turned, 10.0).coefficients
@@ -56,7 +56,7 @@ def test_the_lattice_closes_round_the_axis() -> None:
 
 
 def test_normals_are_those_of_a_cylinder_whose_axis_lies_off() -> None:
-    theta, _ = LATTICE.places
+    theta, _ = LATTICE.coordinates
     off = np.array([3.0, -2.0])
     along = off[0] * np.cos(theta) + off[1] * np.sin(theta)
     radius = along + np.sqrt(45.0**2 - off @ off + along**2)
@@ -67,7 +67,7 @@ def test_normals_are_those_of_a_cylinder_whose_axis_lies_off() -> None:
 
 
 def test_nodes_that_lie_off_are_left_out_and_no_other() -> None:
-    theta, z = LATTICE.places
+    theta, z = LATTICE.coordinates
     rng = np.random.default_rng(1)
     true = 50 + 3 * np.cos(2 * theta) * np.sin(z / 30)
     radius = true + 0.01 * rng.standard_normal(true.shape)

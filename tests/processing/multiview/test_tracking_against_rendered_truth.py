@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from ringdic.correlation import CorrelationSettings, Status
 from ringdic.geometry.camera import Camera, Intrinsics
-from ringdic.multiview.tracking import CameraTrack, Tracking, track
+from ringdic.multiview.tracking import CameraTrack, Tracking
 from ringdic.session.images import read_gray
 from ringdic_node.virtual_rig.render import render
 from ringdic_node.virtual_rig.rig import paper_rig
@@ -44,11 +44,11 @@ def limb(shared_data: Path):
 
 
 @pytest.fixture(scope="module")
-def followed(limb) -> dict[str, CameraTrack]:
+def followed(limb, track_camera: Callable[..., CameraTrack]) -> dict[str, CameraTrack]:
     images, px, _ = limb
     settings = CorrelationSettings(radius=20, step=13)
     ways = {"first order": ONE_PASS, "second order": SECOND, "two passes": TWO_PASS}
-    return {name: track(images[0], lambda k: images[k], 3, px[0], None, settings, way) for name, way in ways.items()}
+    return {name: track_camera(images, px[0], settings, way) for name, way in ways.items()}
 
 
 def test_two_passes_are_unbiased_and_as_quiet_as_the_noise_allows(limb, followed, figures: Callable) -> None:
@@ -102,14 +102,14 @@ def normals(surface, theta: np.ndarray, z: np.ndarray, step: int) -> np.ndarray:
     return n / np.linalg.norm(n, axis=1, keepdims=True)
 
 
-def test_a_rigid_step_costs_two_passes_no_noise(figures: Callable) -> None:
+def test_a_rigid_step_costs_two_passes_no_noise(track_camera: Callable[..., CameraTrack], figures: Callable) -> None:
     camera, surface = paper_rig(12, 0.25).cameras[0], Cylinder()
     images = [render(camera, Specimen(surface, k), seed=40 + k) for k in (0, 1)]
     theta, z = seen_by(camera, surface, 3.5, 20.0, 230.0)
     x0, truth = (camera.project(surface.position(theta, z, k)) for k in (0, 1))
     settings = CorrelationSettings(radius=14, step=8)
     e = {
-        name: errors(track(images[0], lambda _: images[1], 2, x0, None, settings, way), 1, truth, slice(None))
+        name: errors(track_camera(images, x0, settings, way), 1, truth, slice(None))
         for name, way in (("one pass", ONE_PASS), ("two passes", TWO_PASS), ("second order", SECOND))
     }
     std = {name: float(np.sqrt((each.std(axis=0) ** 2).mean())) for name, each in e.items()}
@@ -134,12 +134,14 @@ def damage(step: int) -> Damage:
     )
 
 
-def test_what_is_worn_hidden_or_glares_is_lost_and_never_wrong(figures: Callable) -> None:
+def test_what_is_worn_hidden_or_glares_is_lost_and_never_wrong(
+    track_camera: Callable[..., CameraTrack], figures: Callable
+) -> None:
     camera, surface = paper_rig(12, 0.3).cameras[0], Limb()
     images = [render(camera, Specimen(surface, k, 0, damage(k)), seed=10 + k) for k in range(3)]
     theta, z = seen_by(camera, surface, 3.0, 8.0, 242.0)
     x0 = camera.project(surface.position(theta, z, 0))
-    result = track(images[0], lambda k: images[k], 3, x0, None, CorrelationSettings(radius=14, step=8))
+    result = track_camera(images, x0, CorrelationSettings(radius=14, step=8))
     for step in (1, 2):
         xyz = surface.position(theta, z, step)
         normal = normals(surface, theta, z, step)

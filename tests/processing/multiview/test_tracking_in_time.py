@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from ringdic.correlation import CorrelationSettings, Status
 from ringdic.errors import InputError
-from ringdic.multiview.tracking import CameraTrack, Tracking, TrackState, at_reference, track, track_block
+from ringdic.multiview.tracking import CameraTrack, Tracking, TrackState, at_reference, track_block
 
 SIZE = 260
 SETTINGS = CorrelationSettings(radius=12, step=10)
@@ -67,20 +67,24 @@ def rest(x, y):
     return np.zeros_like(x), np.zeros_like(y)
 
 
-def follow_all(images, x0, settings=SETTINGS, options=None, mask=None) -> CameraTrack:
-    return track(images[0], lambda k: images[k], len(images), x0, mask, settings, options or Tracking())
+@pytest.fixture
+def track_all(track_camera):
+    def track(images, x0, options=None) -> CameraTrack:
+        return track_camera(images, x0, SETTINGS, options)
+
+    return track
 
 
 def errors(result, step, truth):
     return np.hypot(*(result.px[step] - truth).T)
 
 
-def test_a_bending_field_is_followed_exactly_by_two_passes_and_not_by_one():
+def test_a_bending_field_is_followed_exactly_by_two_passes_and_not_by_one(track_all):
     back = back_of(SIZE / 2, 3.4, -2.3, 3e-4)
     images, x0 = series([rest, back]), points()
     truth = forward(back, x0)
-    two = follow_all(images, x0)
-    one = follow_all(images, x0, options=Tracking(two_pass=False))
+    two = track_all(images, x0)
+    one = track_all(images, x0, options=Tracking(two_pass=False))
     assert (two.status == Status.GOOD).all()
     assert (one.status == Status.GOOD).all()
     inner = (np.abs(x0 - SIZE / 2) < 60).all(axis=1)  # whole neighbourhoods
@@ -88,10 +92,10 @@ def test_a_bending_field_is_followed_exactly_by_two_passes_and_not_by_one():
     assert np.median(errors(two, 1, truth)[inner]) < 1e-3  # the field's third derivatives are left
 
 
-def test_the_reference_is_the_points_themselves():
+def test_the_reference_is_the_points_themselves(track_all):
     x0 = points()
     x0[3], x0[4] = np.nan, (-4.0, 50.0)
-    result = follow_all(series([rest, rest]), x0)
+    result = track_all(series([rest, rest]), x0)
     expected = x0.copy()
     expected[4] = np.nan
     np.testing.assert_array_equal(result.px[0], expected)
@@ -102,10 +106,10 @@ def test_the_reference_is_the_points_themselves():
     assert np.abs(result.px[1, kept] - x0[kept]).max() < 1e-4  # nothing moved, between the pixels either
 
 
-def test_motions_of_tens_of_pixels_between_steps_are_followed():
+def test_motions_of_tens_of_pixels_between_steps_are_followed(track_all):
     ways = [rest, back_of(SIZE / 2, 9.0, 4.0, 0.0), back_of(SIZE / 2, 31.0, -14.0, 0.0)]
     images, x0 = series(ways), points()
-    result = follow_all(images, x0)
+    result = track_all(images, x0)
     for step in (1, 2):
         truth = forward(ways[step], x0)
         stays = (np.abs(truth - SIZE / 2) < SIZE / 2 - 16).all(axis=1)
@@ -125,12 +129,12 @@ def worn(steps):
     return mixed
 
 
-def test_where_the_surface_has_changed_the_last_image_takes_the_references_place():
+def test_where_the_surface_has_changed_the_last_image_takes_the_references_place(track_all):
     ways = [rest, *(back_of(SIZE / 2, 2.0 * k, -1.0 * k, 0.0) for k in (1, 2, 3))]
     images, x0 = series(ways, [worn(k) for k in range(4)]), points()  # ZNCC with the reference to 0.84³ = 0.59
     x0 = x0[(np.abs(x0 - SIZE / 2) < 50).all(axis=1)]
-    alone = follow_all(images, x0, options=Tracking(update_reference=False))
-    result = follow_all(images, x0)
+    alone = track_all(images, x0, options=Tracking(update_reference=False))
+    result = track_all(images, x0)
     assert (alone.status[3] == Status.GOOD).mean() < 0.3
     assert (result.status[1:] == Status.GOOD).mean() > 0.97
     assert not result.updated[1].any()
@@ -144,11 +148,11 @@ def test_where_the_surface_has_changed_the_last_image_takes_the_references_place
     assert (result.c_ls[3, came] >= result.c_ls[2, came]).all()
 
 
-def test_what_is_covered_for_a_while_is_lost_and_found_again():
+def test_what_is_covered_for_a_while_is_lost_and_found_again(track_all):
     ways = [rest, *(back_of(SIZE / 2, 1.3 * k, 0.7 * k, 0.0) for k in (1, 2))]
     images, x0 = series(ways), points()
     images[1][100:150, 90:160] = 128.0 + 0.5 * (pattern(*pixels(), seed=9)[100:150, 90:160] - 128.0)
-    result = follow_all(images, x0)
+    result = track_all(images, x0)
     truth = forward(ways[1], x0)
     covered = (truth[:, 0] > 92) & (truth[:, 0] < 157) & (truth[:, 1] > 102) & (truth[:, 1] < 147)
     clear = (np.hypot(*np.maximum(np.abs(truth - (124.5, 124.5)) - (35.0, 25.0), 0).T)) > 13
@@ -162,25 +166,25 @@ def test_what_is_covered_for_a_while_is_lost_and_found_again():
     assert errors(result, 2, forward(ways[2], x0)).max() < 1e-3
 
 
-def test_a_step_without_an_image_loses_that_step_alone():
+def test_a_step_without_an_image_loses_that_step_alone(track_all):
     ways = [rest, rest, back_of(SIZE / 2, 1.5, 0.5, 0.0)]
     images, x0 = series(ways), points()
     images[1] = None
-    result = track(images[0], lambda k: images[k], 3, x0, None, SETTINGS)
+    result = track_all(images, x0)
     assert np.isnan(result.px[1]).all()
     assert (result.status[1] == Status.NOT_REACHED).all()
     assert errors(result, 2, forward(ways[2], x0)).max() < 1e-3
 
 
-def test_images_of_two_sizes_are_refused_with_the_step():
+def test_images_of_two_sizes_are_refused_with_the_step(track_all):
     images = series([rest, rest])
     images[1] = images[1][:-4]
     with pytest.raises(InputError, match=r"step 1: the image is 260 x 256 px .* 260 x 260 px"):
-        follow_all(images, points())
+        track_all(images, points())
 
 
-def test_a_camera_that_sees_no_point_gives_none():
-    result = follow_all(series([rest, rest]), np.full((3, 2), np.nan))
+def test_a_camera_that_sees_no_point_gives_none(track_all):
+    result = track_all(series([rest, rest]), np.full((3, 2), np.nan))
     assert result.px.shape == (2, 3, 2)
     assert np.isnan(result.px).all()
 
@@ -192,11 +196,11 @@ def test_options_that_contradict_are_refused():
         Tracking(window=0.0)
 
 
-def test_blocks_of_steps_continue_as_one_series():
+def test_blocks_of_steps_continue_as_one_series(track_all):
     ways = [rest, *(back_of(SIZE / 2, 1.2 * k, -0.8 * k, 2e-5 * k) for k in (1, 2, 3))]
     images, x0 = series(ways), points()
     images[2][100:150, 90:160] = 128.0 + 0.5 * (pattern(*pixels(), seed=9)[100:150, 90:160] - 128.0)
-    whole = follow_all(images, x0)
+    whole = track_all(images, x0)
 
     def block(steps, state=None):
         return track_block(images[0], lambda k: images[k], steps, x0, None, SETTINGS, state=state)

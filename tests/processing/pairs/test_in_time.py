@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from ringdic.correlation import CorrelationSettings, Status, prepare_reference
-from ringdic.correlation.lattice_field import between_corners
+from ringdic.correlation.lattice_field import interpolate_lattice
 from ringdic.pairs.tracking import CameraMatches, camera_grid, match_camera, places
 
 STEP = 10
@@ -25,7 +25,7 @@ def field(xy: np.ndarray, bent: float = 1.0) -> np.ndarray:
 
 def test_between_four_corners_a_quadratic_field_is_met_exactly() -> None:
     points = RNG.uniform(0, [110, 80], (200, 2))
-    told, weight = between_corners(lattice(), field(lattice()), STEP, points)
+    told, weight = interpolate_lattice(lattice(), field(lattice()), STEP, points)
     np.testing.assert_allclose(told, field(points), atol=1e-12)
     np.testing.assert_allclose(weight, 1.0)
 
@@ -33,12 +33,12 @@ def test_between_four_corners_a_quadratic_field_is_met_exactly() -> None:
 def test_without_a_corner_an_affine_field_is_met_and_at_a_corner_its_own_value() -> None:
     known = lattice()[RNG.permutation(len(lattice()))[:60]]
     points = RNG.uniform(-5, [125, 95], (400, 2))
-    told, weight = between_corners(known, field(known, 0.0), STEP, points)
+    told, weight = interpolate_lattice(known, field(known, 0.0), STEP, points)
     inside = weight > 0
     assert 0.2 < inside.mean() < 1.0
     np.testing.assert_allclose(told[inside, :6], field(points[inside], 0.0)[:, :6], atol=1e-12)
     assert np.isnan(told[~inside]).all()
-    own, weight = between_corners(known, field(known), STEP, known.astype(float))
+    own, weight = interpolate_lattice(known, field(known), STEP, known.astype(float))
     np.testing.assert_array_equal(own, field(known))
     np.testing.assert_array_equal(weight, 1.0)
 

@@ -17,7 +17,7 @@ from ringdic.results.reader import read_results
 from ringdic.results.results import Results
 from ringdic.session.folder import open_session
 from ringdic.settings import Settings, load_settings
-from ringdic.sweep.sweep import Search
+from ringdic.sweep.sweep import DepthSearch
 from ringdic.tasks import LocalExecutor, OnTaskEnd, Task, TaskReport, process_memory
 
 SCALE, STEPS = 0.2, 3  # of the session
@@ -49,7 +49,7 @@ def jobs(session: Path, settings: Settings = SETTINGS, steps: slice = slice(None
     read = open_session(session)
     ring = calibrate_rig(read, settings.calibration)
     cameras = {id_: changed.get(id_, each.camera) for id_, each in ring.cameras.items()}
-    search = Search(radius=57.0, reach=settings.surface.reach_mm, incidence=settings.surface.incidence_deg)
+    search = DepthSearch(radius=57.0, reach=settings.surface.reach_mm, incidence=settings.surface.incidence_deg)
     correlation = CorrelationSettings(**settings.correlation.keywords)
     return pair_jobs(read, cameras, read.rig.pairs, read.of_kind("specimen")[steps], search, correlation)
 

@@ -276,10 +276,13 @@ def test_what_cannot_be_read_is_said(written: Path, tmp_path: Path) -> None:
         read_mesh(tmp_path / "other.h5")
 
 
-def test_a_file_of_a_newer_schema_is_refused_by_every_reader(written: Path) -> None:
+@pytest.mark.parametrize(
+    ("schema", "remedy"), [(SCHEMA + 1, "update RingDIC"), (SCHEMA - 1, "process the session again")]
+)
+def test_a_file_of_another_schema_is_refused_by_every_reader(written: Path, schema: int, remedy: str) -> None:
     with h5py.File(written, "a") as file:
-        file["ringdic"].attrs["schema"] = SCHEMA + 1
-    sentence = rf"results\.h5: results of schema {SCHEMA + 1}, written by a newer ringdic.* Install the newer ringdic"
+        file["ringdic"].attrs["schema"] = schema
+    sentence = rf"results\.h5: results of schema {schema}, but this version reads schema {SCHEMA}; {remedy}"
     for read in (
         read_results, read_summary, read_mesh, lambda path: read_positions(path, 0),
         lambda path: read_field(path, "lambda1", 0),

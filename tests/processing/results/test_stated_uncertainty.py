@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 from ringdic.correlation import CorrelationSettings, prepare_reference
 from ringdic.geometry.camera import Camera, Intrinsics
-from ringdic.multiview.motion import Motion, measure_motion
+from ringdic.multiview.motion import Motion
 from ringdic.multiview.shape import ReferenceShape, reference_shape
-from ringdic.multiview.tracking import Tracking
 from ringdic.multiview.uncertainty import SurfaceUncertainty, surface_uncertainty
 from ringdic.pairs import tracking as in_time
 from ringdic.pairs.matching import Grid, StepMatches, Stereo, at_step, match_reference
@@ -29,7 +28,7 @@ from ringdic.results.series import StepCache, join_steps
 from ringdic.results.uncertainty import add_uncertainty
 from ringdic.settings import Settings
 from ringdic.strain.deformation import deformation
-from ringdic.sweep.sweep import Search
+from ringdic.sweep.sweep import DepthSearch
 from ringdic_node.virtual_rig.lens import VirtualCamera
 from ringdic_node.virtual_rig.render import radiance
 from ringdic_node.virtual_rig.rig import paper_rig
@@ -123,7 +122,7 @@ def cropped(camera: VirtualCamera, xyz: np.ndarray) -> VirtualCamera:
 
 
 @pytest.fixture(scope="module")
-def runs() -> list[Run]:
+def runs(motion_of_shape: Callable[..., Motion]) -> list[Run]:
     limb, rig = Limb(), paper_rig(12, 1.0)
     reach = HALF / 9.3  # mm: so many px a mm there
     theta, z = np.meshgrid(np.linspace(-reach, reach, 5) / 55.0, 120.0 + np.linspace(-reach, reach, 5))
@@ -131,7 +130,8 @@ def runs() -> list[Run]:
     views = [cropped(rig.cameras[k], patch) for k in (11, 0, 1)]
     light = {(v.id, step): radiance(v, Specimen(limb, step)) for v in views for step in (0, 1)}
     light |= {(v.id, 2): light[v.id, 1] for v in views}
-    return [measure([real(v) for v in views], exposed(light, repeat)) for repeat in range(REPEATS)]
+    cameras = [real(v) for v in views]
+    return [measure(cameras, exposed(light, repeat), motion_of_shape) for repeat in range(REPEATS)]
 
 
 def exposed(light: dict, repeat: int) -> Callable[[str, int], np.ndarray]:
@@ -140,10 +140,12 @@ def exposed(light: dict, repeat: int) -> Callable[[str, int], np.ndarray]:
     return lambda id_, step: grey[id_, step]
 
 
-def measure(cameras: list[Camera], image: Callable[[str, int], np.ndarray]) -> Run:
-    search = Search(radius=55.0, reach=6.0, incidence=65.0)
+def measure(
+    cameras: list[Camera], image: Callable[[str, int], np.ndarray], motion_of_shape: Callable[..., Motion]
+) -> Run:
+    search = DepthSearch(radius=55.0, reach=6.0, incidence=65.0)
     shape = reference_shape(cameras, lambda id_: image(id_, 0), {}, [(0, 1), (1, 2)], search, CORRELATION)
-    motion = measure_motion(cameras, shape, image, STEPS, {}, CORRELATION, Tracking(), 0.05)
+    motion = motion_of_shape(cameras, shape, image, STEPS, CORRELATION, 0.05)
     return Run(
         shape,
         motion,
@@ -152,7 +154,7 @@ def measure(cameras: list[Camera], image: Callable[[str, int], np.ndarray]) -> R
     )
 
 
-def by_pair(cameras: list[Camera], image: Callable[[str, int], np.ndarray], search: Search) -> Results:
+def by_pair(cameras: list[Camera], image: Callable[[str, int], np.ndarray], search: DepthSearch) -> Results:
     pair = (cameras[0], cameras[1])
     grid, steps = matched(Stereo(pair, search, CORRELATION), image)
     shape = pair_shape(pair, grid.xy, grid.faces, steps[0], CORRELATION.step, 0.05)

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 from ringdic.geometry.camera import Camera
-from ringdic.sweep.proxies import on_cylinder, stereo_hypotheses, sweep_radii
+from ringdic.sweep.proxies import cylinder_intersections, stereo_hypotheses, sweep_radii
 from ringdic.sweep.region import (
     ImageLattice,
-    coherent,
+    coherent_depths,
     contrast,
     image_lattice,
     lattice_normals,
     lattice_region,
-    well_seen,
+    within_incidence,
 )
 
 
@@ -37,7 +37,7 @@ def surface(radius: float) -> tuple[np.ndarray, np.ndarray]:
 
 def test_the_nearer_intersection_is_found() -> None:
     xyz, px = surface(57.0)
-    np.testing.assert_allclose(on_cylinder(FIRST, px, np.array([57.0]))[:, 0], xyz, atol=1e-9)
+    np.testing.assert_allclose(cylinder_intersections(FIRST, px, np.array([57.0]))[:, 0], xyz, atol=1e-9)
 
 
 def test_the_hypothesis_of_the_true_radius_is_the_true_match() -> None:
@@ -78,16 +78,16 @@ def test_a_lattice_keeps_its_margin_and_its_multiples() -> None:
 def test_a_lonely_depth_is_not_coherent_and_the_smaller_piece_is_dropped() -> None:
     radius = np.full((12, 12), 57.0)
     radius[4, 4] = 49.0
-    convincing = np.ones((12, 12), bool)
-    convincing[:, 8:10] = False  # columns 10 and 11 are cut off
-    good = coherent(radius, convincing, 2.0)
+    unambiguous_matches = np.ones((12, 12), bool)
+    unambiguous_matches[:, 8:10] = False  # columns 10 and 11 are cut off
+    good = coherent_depths(radius, unambiguous_matches, 2.0)
     assert not good[4, 4]
     assert good[:, :8].sum() == 12 * 8 - 1
     assert not good[:, 10:].any()
-    both = coherent(radius, convincing, 2.0, least=20)
+    both = coherent_depths(radius, unambiguous_matches, 2.0, min_positions=20)
     assert both[:, 10:].all()
     assert not both[4, 4]
-    assert (coherent(radius, convincing, 2.0, least=30) == good).all()
+    assert (coherent_depths(radius, unambiguous_matches, 2.0, min_positions=30) == good).all()
 
 
 def test_normals_of_a_cylinder_point_along_its_radii() -> None:
@@ -101,7 +101,7 @@ def test_normals_of_a_cylinder_point_along_its_radii() -> None:
 def test_what_is_seen_too_steeply_is_left_out() -> None:
     theta, z = np.meshgrid(np.radians(np.arange(-80.0, 110, 5)), np.linspace(100, 140, 5))
     xyz = np.stack([57 * np.cos(theta), 57 * np.sin(theta), z], axis=-1)
-    seen = well_seen(xyz, (FIRST, SECOND), 60.0)[2]
+    seen = within_incidence(xyz, (FIRST, SECOND), 60.0)[2]
     angles = np.degrees(theta[2])
     # A camera at 350 mm sees the cylinder's point at angle a under a + asin(57 sin a / distance).
     assert not seen[np.abs(angles + 35) < 1].any()

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from ringdic.correlation import CorrelationSettings, prepare_current
 from ringdic.geometry.camera import Camera
-from ringdic.sweep.proxies import on_cylinder
-from ringdic.sweep.sweep import Search, Sweep, radii_of, sweep
+from ringdic.sweep.proxies import cylinder_intersections
+from ringdic.sweep.sweep import DepthSearch, DepthSweep, search_radii, sweep_depths
 
 WIDTH, HEIGHT, RADIUS = 400, 480, 60.0
 SETTINGS = CorrelationSettings(radius=10, step=10)
-SEARCH = Search(57.0, 20.0, 65.0)
+SEARCH = DepthSearch(57.0, 20.0, 65.0)
 SPACING = 20  # of the lattice that these settings lead to, px
 
 
@@ -45,7 +45,7 @@ def views(covered: np.ndarray | None = None) -> list[np.ndarray]:
     px = np.stack(np.meshgrid(np.arange(float(WIDTH)), np.arange(float(HEIGHT))), axis=-1)
     seen = []
     for each in CAMERAS:
-        xyz = on_cylinder(each, px.reshape(-1, 2), np.array([RADIUS])).reshape(HEIGHT, WIDTH, 3)
+        xyz = cylinder_intersections(each, px.reshape(-1, 2), np.array([RADIUS])).reshape(HEIGHT, WIDTH, 3)
         at = (np.arctan2(xyz[..., 1], xyz[..., 0]) + np.pi) * RADIUS / 0.2, xyz[..., 2] / 0.2
         grey = cv2.remap(texture, *(np.nan_to_num(axis, nan=-9.0).astype(np.float32) for axis in at), cv2.INTER_LINEAR)
         grey[np.isnan(xyz[..., 0])] = 90.0
@@ -57,33 +57,33 @@ def views(covered: np.ndarray | None = None) -> list[np.ndarray]:
     return seen
 
 
-def found(images: list[np.ndarray], mask: np.ndarray | None = None, least: int = 0) -> Sweep:
-    radii = radii_of(CAMERAS, SEARCH)
-    return sweep(CAMERAS, images[0], prepare_current(images[1]), mask, radii, SEARCH, SETTINGS, least)
+def sweep_result(images: list[np.ndarray], mask: np.ndarray | None = None, min_positions: int = 0) -> DepthSweep:
+    radii = search_radii(CAMERAS, SEARCH)
+    return sweep_depths(CAMERAS, images[0], prepare_current(images[1]), mask, radii, SEARCH, SETTINGS, min_positions)
 
 
-def face_on(result: Sweep, limit_deg: float) -> np.ndarray:
+def face_on(result: DepthSweep, limit_deg: float) -> np.ndarray:
     """Positions of the lattice where both cameras see the cylinder under less than this angle."""
-    xyz = on_cylinder(CAMERAS[0], result.px, np.array([RADIUS]))[:, 0]
+    xyz = cylinder_intersections(CAMERAS[0], result.px, np.array([RADIUS]))[:, 0]
     normal = xyz * [1.0, 1.0, 0.0] / RADIUS
     steep = [each.incidence_cosine(xyz, normal) > np.cos(np.radians(limit_deg)) for each in CAMERAS]
     return np.logical_and(*steep).reshape(result.good.shape)
 
 
 def test_the_cylinder_is_found_wherever_both_see_it_at_its_radius() -> None:
-    result = found(views())
+    result = sweep_result(views())
     inner = face_on(result, 50.0)
     assert inner.sum() > 100
     assert result.good[inner].all()
     assert not result.good[
-        np.isnan(on_cylinder(CAMERAS[0], result.px, np.array([RADIUS]))[:, 0, 0]).reshape(inner.shape)
+        np.isnan(cylinder_intersections(CAMERAS[0], result.px, np.array([RADIUS]))[:, 0, 0]).reshape(inner.shape)
     ].any()
     xyz = result.xyz[result.good & inner]
     assert np.abs(np.hypot(xyz[:, 0], xyz[:, 1]) - RADIUS).max() < 1.5  # the radii of the sweep lie so far apart
     at = result.px.reshape(*inner.shape, 2)[result.good & inner]
     np.testing.assert_allclose(CAMERAS[0].project(xyz), at, atol=1e-6)
     match = at + result.warps.reshape(*inner.shape, 6)[result.good & inner, :2]
-    truth = CAMERAS[1].project(on_cylinder(CAMERAS[0], at, np.array([RADIUS]))[:, 0])
+    truth = CAMERAS[1].project(cylinder_intersections(CAMERAS[0], at, np.array([RADIUS]))[:, 0])
     assert np.hypot(*(match - truth).T).max() < 1.5
     assert np.isnan(result.xyz[~result.good]).all()
 
@@ -96,7 +96,7 @@ def test_a_small_piece_is_found_wherever_it_lies_on_the_lattice(corner: tuple[in
     for down in (0, 120):
         covered[y + down - 12 : y + down + SPACING + 13, x - 12 : x + SPACING + 13] = True
         pieces[y + down : y + down + SPACING + 1, x : x + SPACING + 1] = True  # two positions each way
-    result = found(views(covered), least=4)
+    result = sweep_result(views(covered), min_positions=4)
     column, row = result.px.astype(int).T
     wanted = pieces[row, column].reshape(result.good.shape)
     assert wanted.sum() == 8
@@ -108,7 +108,7 @@ def test_a_small_piece_is_found_wherever_it_lies_on_the_lattice(corner: tuple[in
 def test_inside_a_mask_nothing_else_is_looked_for() -> None:
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[100:300, 170:230] = True
-    result = found(views(), mask)
+    result = sweep_result(views(), mask)
     column, row = result.px.astype(int).T
     inside = mask[row, column].reshape(result.good.shape)
     np.testing.assert_array_equal(result.good, inside)

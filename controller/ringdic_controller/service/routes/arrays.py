@@ -1,4 +1,4 @@
-"""Arrays of a results file as plain little-endian numbers with tags: triangles, positions, fields."""
+"""Routes to the arrays of a results file, sent as little-endian numbers: triangles, positions, fields."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from numpy.typing import NDArray
 from ringdic.results.reader import read_field, read_mesh, read_positions
 
-from ringdic_controller.service.routes.etag import forever, unchanged
+from ringdic_controller.service.routes.etag import cache_headers, client_has
 
 _BINARY: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
 Version = Annotated[str | None, Query(description="The header's version; with it the answer may be kept for ever")]
@@ -17,12 +17,20 @@ Removed = Annotated[bool, Query(description="After the rigid motion of the whole
 
 
 def add_arrays(router: APIRouter, prefix: str, locate: Callable[..., Path]) -> None:
-    """Serve the arrays of the results file that ``locate`` finds by the parameters of the path, under ``prefix``."""
+    """Add the routes to a router.
+
+    Parameters
+    ----------
+    prefix
+        Beginning of their paths.
+    locate
+        Dependency that gives the results file from the parameters in the path.
+    """
 
     def faces(path: Annotated[Path, Depends(locate)], request: Request, v: Version = None) -> Response:
-        """Vertex indices; normals point outwards."""
+        """Vertex indices of the triangles, whose normals point outwards."""
         headers = _tagged(path, "faces", v)
-        if unchanged(request, headers):
+        if client_has(request, headers):
             return Response(status_code=304, headers=headers)
         return _binary(read_mesh(path).faces.astype("<u4"), headers)
 
@@ -33,9 +41,9 @@ def add_arrays(router: APIRouter, prefix: str, locate: Callable[..., Path]) -> N
         rigid_motion_removed: Removed = False,
         v: Version = None,
     ) -> Response:
-        """World frame of the target; NaN where not measured. Step 0 is the reference."""
+        """Vertex positions in the target's world frame; NaN where not measured. Step 0 is the reference."""
         headers = _tagged(path, f"positions-{step}-{rigid_motion_removed:d}", v)
-        if unchanged(request, headers):
+        if client_has(request, headers):
             return Response(status_code=304, headers=headers)
         return _binary(read_positions(path, step, rigid_motion_removed).astype("<f4"), headers)
 
@@ -47,10 +55,10 @@ def add_arrays(router: APIRouter, prefix: str, locate: Callable[..., Path]) -> N
         rigid_motion_removed: Removed = False,
         v: Version = None,
     ) -> Response:
-        """NaN where not measured; the header's table of fields tells unit and location."""
+        """Values of a field, NaN where not measured; the header's table of fields tells unit and location."""
         values, location = read_field(path, name, step, rigid_motion_removed)
         headers = _tagged(path, f"{name}-{step}-{rigid_motion_removed:d}", v) | {"X-Location": location}
-        if unchanged(request, headers):
+        if client_has(request, headers):
             return Response(status_code=304, headers=headers)
         return _binary(values.astype("<f4"), headers)
 
@@ -63,14 +71,15 @@ def add_arrays(router: APIRouter, prefix: str, locate: Callable[..., Path]) -> N
 
 
 def version_of(path: Path) -> str:
-    """Changes only if other results are put in a file's place."""
-    found = path.stat()
-    return f"{found.st_mtime_ns:x}-{found.st_size:x}"
+    """Text that changes only if other results are put in a file's place."""
+    status = path.stat()
+    return f"{status.st_mtime_ns:x}-{status.st_size:x}"
 
 
-def _tagged(path: Path, name: str, asked: str | None) -> dict[str, str]:
+def _tagged(path: Path, name: str, requested: str | None) -> dict[str, str]:
+    """Headers of an array; the client may keep it for ever if it asked for the version that it gets."""
     version = version_of(path)
-    return forever(f"{version}-{name}", revalidate=asked != version)
+    return cache_headers(f"{version}-{name}", revalidate=requested != version)
 
 
 def _binary(array: NDArray[Any], headers: dict[str, str]) -> Response:

@@ -6,19 +6,22 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Query, Request, Response, status
 from fastapi.responses import FileResponse
 from pydantic import BaseModel
+from ringdic_node.wire import CAPTURE_KINDS
 
-from ringdic_controller.rig.preview import preview_jpeg
-from ringdic_controller.service.desk import Desk, NotFoundError, Round
+from ringdic_controller.service.desk import Desk
+from ringdic_controller.service.preview import preview_jpeg
+from ringdic_controller.service.refusals import NotFoundError
+from ringdic_controller.service.rounds import Round
 from ringdic_controller.service.routes.desk import TheDesk
-from ringdic_controller.service.routes.etag import forever, unchanged
+from ringdic_controller.service.routes.etag import cache_headers, client_has
 
 router = APIRouter(tags=["captures"])
 
 
 class NewCapture(BaseModel):
-    """``override``: fire although cameras are missing or not armed; those end as failed."""
+    """Kind of a capture to begin; with ``override`` cameras that are missing or not armed are left out as failed."""
 
-    kind: Literal["board", "target", "specimen", "static"]
+    kind: Literal[CAPTURE_KINDS]  # type: ignore[valid-type]
     override: bool = False
 
 
@@ -28,27 +31,27 @@ class NewCapture(BaseModel):
     status_code=status.HTTP_202_ACCEPTED,
     summary="Begin a capture in the current session",
 )
-def begin(new: NewCapture, desk: TheDesk) -> dict[str, Any]:
-    """Answers at once; ``/rounds/{id}`` and the live events tell how it goes. 409 says why it cannot be taken."""
-    return asdict(desk.capture(new.kind, override=new.override))
+def begin_capture(new: NewCapture, desk: TheDesk) -> dict[str, Any]:
+    """The round that has begun; ``/rounds/{id}`` and the live events tell how it goes. 409 says why none can."""
+    return asdict(desk.rounds.begin(new.kind, override=new.override))
 
 
 @router.get("/rounds/{round_id}", response_model=Round, summary="How a begun capture stands")
-def one_round(round_id: str, desk: TheDesk) -> dict[str, Any]:
-    """``state`` is arming, open, closed or refused; ``capture_id`` names the record once there is one."""
-    return asdict(desk.round(round_id))
+def read_round(round_id: str, desk: TheDesk) -> dict[str, Any]:
+    """The round: ``state`` is arming, open, closed or refused; ``capture_id`` names the record once there is one."""
+    return asdict(desk.rounds.get(round_id))
 
 
 @router.get("/sessions/{session}/captures", summary="The capture records of a session, in order")
-def captures(session: str, desk: TheDesk) -> list[dict[str, Any]]:
-    """Per camera: status, reason, SHA-256, size, measured time, exposure, metadata."""
-    desk.session(session)
+def list_captures(session: str, desk: TheDesk) -> list[dict[str, Any]]:
+    """Records with, for each camera, status, reason, SHA-256, size, measured time, exposure, metadata."""
+    desk.sessions.summary(session)
     return desk.catalogue.captures(session)
 
 
 @router.get("/sessions/{session}/captures/{capture_id}", summary="One capture record")
-def capture(session: str, capture_id: str, desk: TheDesk) -> dict[str, Any]:
-    """404 if there is none."""
+def read_capture(session: str, capture_id: str, desk: TheDesk) -> dict[str, Any]:
+    """The record of a capture; 404 if there is none."""
     try:
         return desk.catalogue.capture(session, capture_id)
     except KeyError as error:
@@ -60,8 +63,8 @@ def capture(session: str, capture_id: str, desk: TheDesk) -> dict[str, Any]:
     response_class=FileResponse,
     summary="One image, byte for byte as archived",
 )
-def image(session: str, capture_id: str, camera: str, desk: TheDesk) -> FileResponse:
-    """The file's SHA-256 is the one of the record."""
+def send_image(session: str, capture_id: str, camera: str, desk: TheDesk) -> FileResponse:
+    """The image file; its SHA-256 is the one in the capture's record."""
     file, sha256 = _image(desk, session, capture_id, camera)
     path = desk.catalogue.path(session) / "captures" / capture_id / file
     if not path.is_file():
@@ -75,7 +78,7 @@ def image(session: str, capture_id: str, camera: str, desk: TheDesk) -> FileResp
     responses={200: {"content": {"image/jpeg": {}}}},
     summary="One image made small",
 )
-def preview(
+def send_preview(
     session: str,
     capture_id: str,
     camera: str,
@@ -83,18 +86,18 @@ def preview(
     request: Request,
     width: Annotated[int, Query(ge=16, le=2048)] = 320,
 ) -> Response:
-    """A JPEG of at most ``width`` px."""
+    """The image as a JPEG, at most ``width`` px wide."""
     file, sha256 = _image(desk, session, capture_id, camera)
-    headers = forever(f"{sha256[:32]}-{width}")
-    if unchanged(request, headers):
+    headers = cache_headers(f"{sha256[:32]}-{width}")
+    if client_has(request, headers):
         return Response(status_code=304, headers=headers)
     path = desk.catalogue.path(session) / "captures" / capture_id / file
     return Response(preview_jpeg(path, width), media_type="image/jpeg", headers=headers)
 
 
 def _image(desk: Desk, session: str, capture_id: str, camera: str) -> tuple[str, str]:
-    """File name and checksum of an archived image; only what the record names can be had."""
-    entry = capture(session, capture_id, desk).get("cameras", {}).get(camera)
+    """File name and checksum of an archived image, from the capture's record: no other file can be asked for."""
+    entry = read_capture(session, capture_id, desk).get("cameras", {}).get(camera)
     if entry is None or not entry.get("file"):
         raise NotFoundError(f"Capture '{capture_id}' has no image of camera '{camera}'.")
     file = str(entry["file"])

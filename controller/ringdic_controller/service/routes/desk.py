@@ -1,4 +1,4 @@
-"""How a route gets at the operator's desk."""
+"""The operator's desk as a parameter of the routes."""
 
 from typing import Annotated
 

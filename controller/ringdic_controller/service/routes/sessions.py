@@ -1,4 +1,4 @@
-"""Sessions: list, make, select."""
+"""Sessions: list, create, select."""
 
 from typing import Annotated
 
@@ -10,8 +10,8 @@ from ringdic_controller.service.routes.desk import TheDesk
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
 
-class Session(BaseModel):
-    """One session: captures of each kind and processing runs are counted."""
+class SessionBody(BaseModel):
+    """One session, with the number of its captures of each kind and of its processing runs."""
 
     name: str
     rig: str | None
@@ -24,42 +24,44 @@ class Session(BaseModel):
 class SessionList(BaseModel):
     """All sessions, newest first, and the one that captures go to."""
 
-    sessions: list[Session]
+    sessions: list[SessionBody]
     current: str | None
 
 
 class NewSession(BaseModel):
-    """Without a name the session is called by the time."""
+    """Name of a session to create; without one it is named by the time."""
 
     name: Annotated[str | None, Field(max_length=100)] = None
 
 
 class Selection(BaseModel):
-    """The session to select."""
+    """Name of the session to select."""
 
     name: str
 
 
 @router.get("", response_model=SessionList, summary="All sessions")
-def sessions(desk: TheDesk) -> dict[str, object]:
-    """The folders are looked at anew."""
-    return {"sessions": desk.sessions(), "current": desk.current()}
+def list_sessions(desk: TheDesk) -> dict[str, object]:
+    """All sessions after new and changed folders have been read, and the one that captures go to."""
+    return {"sessions": desk.sessions.summaries(), "current": desk.sessions.current()}
 
 
-@router.post("", response_model=Session, status_code=status.HTTP_201_CREATED, summary="Make a session and select it")
-def create(new: NewSession, desk: TheDesk) -> dict[str, object]:
-    """409 if the name is taken or there is no rig, 422 if it is unusable."""
+@router.post(
+    "", response_model=SessionBody, status_code=status.HTTP_201_CREATED, summary="Make a session and select it"
+)
+def create_session(new: NewSession, desk: TheDesk) -> dict[str, object]:
+    """The new session; 409 if the name is taken, there is no rig or a capture is under way, 422 if it is unusable."""
     return desk.create_session(new.name)
 
 
-@router.put("/current", response_model=Session, summary="Select the session that captures go to")
-def select(selection: Selection, desk: TheDesk) -> dict[str, object]:
-    """404 if there is no such session, 409 while a capture is under way in another."""
+@router.put("/current", response_model=SessionBody, summary="Select the session that captures go to")
+def select_session(selection: Selection, desk: TheDesk) -> dict[str, object]:
+    """The selected session; 404 if there is no such session, 409 while a capture is under way in another."""
     return desk.select_session(selection.name)
 
 
-@router.get("/{name}", response_model=Session, summary="One session")
-def session(name: str, desk: TheDesk) -> dict[str, object]:
-    """404 if there is no such session."""
-    desk.sessions()
-    return desk.session(name)
+@router.get("/{name}", response_model=SessionBody, summary="One session")
+def read_session(name: str, desk: TheDesk) -> dict[str, object]:
+    """One session after new and changed folders have been read; 404 if there is no such session."""
+    desk.catalogue.sync()
+    return desk.sessions.summary(name)

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from ringdic.cli.console import print_json, say
 from ringdic.errors import InputError
-from ringdic.settings import load_settings
 
 Ratios = Callable[[dict[str, Any], dict[str, Any]], list[dict[str, Any]]]
 
 _FOLDER = Path("ringdic-bench")
 
 
-def bench(
+def bench_command(
     data: Annotated[Path | None, typer.Option(help="Folder of the MultiDIC rig; else synthetic.")] = None,
     repeats: Annotated[int, typer.Option(min=1, help="Runs of which the best counts.")] = 5,
     interpolation: Annotated[str, typer.Option(help="cubic or quintic.")] = "cubic",
@@ -43,26 +42,28 @@ def bench(
     counts = _counts(steps)
     result: dict[str, Any] = {}
     if all_ or not (job or capture or live):
-        result["correlation"] = bench_correlation(data, repeats=repeats, interpolation=interpolation, say=_say)
+        result["correlation"] = bench_correlation(data, repeats=repeats, interpolation=interpolation, say=say)
     if all_ or job:
         from ringdic_controller.studies.bench.job import bench_job
 
-        result["job"] = bench_job(out, counts, scale=scale, cameras=cameras, settings=set_ or [], say=_say)
+        result["job"] = bench_job(out, counts, scale=scale, cameras=cameras, settings=set_ or [], say=say)
     if all_ or capture:
         from ringdic_controller.studies.bench.capture import bench_capture
 
-        result["capture"] = bench_capture(say=_say)
+        result["capture"] = bench_capture(say=say)
     if all_ or live:
+        from ringdic.settings import load_settings
+
         from ringdic_controller.studies.bench.live import bench_live
 
         chosen = load_settings(None, set_ or []).to_toml()
-        result["live"] = bench_live(out / "live", cameras=cameras, scale=scale, settings=chosen, say=_say)
+        result["live"] = bench_live(out / "live", cameras=cameras, scale=scale, settings=chosen, say=say)
     if before is not None:
         result["ratios"] = compared(result, before)
         for row in result["ratios"]:
-            _say("  ".join(f"{name} {value:.3g}" if name != "part" else value for name, value in row.items()))
+            say("  ".join(f"{name} {value:.3g}" if name != "part" else value for name, value in row.items()))
     if as_json:
-        typer.echo(json.dumps(result, ensure_ascii=False, default=float))
+        print_json(result)
 
 
 def compared(new: dict[str, Any], old: dict[str, Any]) -> list[dict[str, Any]]:
@@ -93,7 +94,3 @@ def _counts(text: str) -> list[int]:
         return [int(word) for word in text.split(",")]
     except ValueError:
         raise InputError(f"--steps {text}: give whole numbers with commas between, such as 2,5,10,20") from None
-
-
-def _say(line: str) -> None:
-    typer.echo(line, err=True)

@@ -71,7 +71,7 @@ def bench_job(
     settings: Sequence[str] = (),
     say: Say = lambda _: None,
 ) -> dict[str, Any]:
-    """The figures of jobs over so many images of the specimen a camera, the reference included.
+    """Figures of whole jobs, one for each number of images of the specimen a camera (the reference included).
 
     folder : of the images and sessions, kept for the next time. scale : 1 is 2464 x 3280 px. settings :
     ``group.name=value`` to process with. say : is told a line about every job.

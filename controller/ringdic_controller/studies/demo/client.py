@@ -1,4 +1,4 @@
-"""An operator in a few lines: everything the page does is an HTTP call, so a script can do it too."""
+"""A client of the controller's HTTP interface that does what an operator does on the page."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Client:
         return self._call("PUT", path, body)
 
     def wait_for_nodes(self, ids: list[str], timeout: float, alive: Callable[[], None]) -> None:
-        """Until every node is there. ``alive`` may raise if waiting has become pointless."""
+        """Wait until every node is connected. ``alive`` may raise if waiting has become pointless."""
         deadline = time.monotonic() + timeout
         while time.monotonic() < deadline:
             alive()
@@ -72,7 +72,7 @@ class Client:
     def wait_for_step(
         self, session: str, capture_id: str, timeout: float, meanwhile: Callable[[], None] = lambda: None
     ) -> None:
-        """Wait until a step has been processed at once, or a newer one in its place; ``meanwhile`` is called often."""
+        """Wait until the live result of a step, or of a newer one, is there; ``meanwhile`` is called often."""
         deadline = time.monotonic() + timeout
         while time.monotonic() < deadline:
             meanwhile()

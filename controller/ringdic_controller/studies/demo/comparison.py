@@ -1,4 +1,4 @@
-"""What was measured against what is true: shape, displacement, stretch."""
+"""The demo's results compared with the truth of the virtual rig: shape, displacement, stretch."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ringdic.arrays import Floats
 from ringdic.results.reader import read_results
 from ringdic_node.virtual_rig.scenes import Limb
 
-from ringdic_controller.studies.truth import errors, face_middles
+from ringdic_controller.studies.truth import errors, face_centroids
 
 
 @dataclass(frozen=True)
@@ -47,13 +47,13 @@ class TruthFigure:
 
 
 def compare_with_truth(results_file: Path, limb: Limb) -> list[TruthFigure]:
-    """Every step of the results against the limb's formulas; step k of the results is step k of the limb."""
+    """Errors of every step of the results by the limb's formulas; step k of the results is step k of the limb."""
     results = read_results(results_file)
     found = errors(results, limb)
     reference = limb.position(found.theta, found.z, 0)
     radii = _span(np.hypot(*reference.T[:2]), "mm")
     figures = [_figure("distance from the surface", "reference", radii, found.distance, "mm")]
-    middles = face_middles(found.theta, found.z, results.faces)
+    middles = face_centroids(found.theta, found.z, results.faces)
     for step, name in list(enumerate(results.steps))[1:]:
         length = np.linalg.norm(limb.position(found.theta, found.z, step) - reference, axis=1)
         error = np.linalg.norm(found.displacement[step], axis=1)

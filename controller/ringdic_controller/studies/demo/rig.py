@@ -22,7 +22,7 @@ _END = 10.0  # seconds for a process to end by itself
 
 @dataclass(frozen=True)
 class Setting:
-    """What the simulated rig is: cameras, image scale, seed, and the folder of everything it writes."""
+    """The simulated rig: number of cameras, image scale, seed, and the folder that everything is written to."""
 
     folder: Path
     cameras: int
@@ -42,7 +42,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Running:
-    """A controller at work: its page's address, its Zenoh endpoint, its process id."""
+    """A running controller: the address of its page, its Zenoh endpoint, its process id."""
 
     address: str
     endpoint: str
@@ -63,7 +63,7 @@ def running_controller(folder: Path, rig_toml: str, settings_toml: str) -> Itera
     )
     with (folder / "controller.log").open("w", encoding="utf-8") as log:
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "ringdic_controller", "controller", "--config", str(config)],
+            [sys.executable, "-P", "-m", "ringdic", "controller", "--config", str(config)],
             stdout=subprocess.PIPE,
             stderr=log,
             text=True,

@@ -1,4 +1,4 @@
-"""The straight line of the demo: start, capture, process, compare, serve."""
+"""The demo step by step: start the rig, capture, process, compare with the truth, serve the page."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def _compare(setting: Setting, session: str, rig: VirtualRig, began: float) -> d
 
 
 def settings_for(scale: float) -> str:
-    """The paper's radius 20 and step 10 px at full scale; at a smaller one no fewer pixels than a subset needs."""
+    """Settings for a scale of the images: radius 20 and step 10 px at full scale, never smaller than a subset needs."""
     radius, step = max(10, round(20 * scale)), max(5, round(10 * scale))
     return f"[correlation]\nradius_px = {radius}\nstep_px = {step}\n"
 

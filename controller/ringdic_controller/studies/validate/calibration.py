@@ -41,7 +41,7 @@ _SIXTY_DEGREES = 0.5
 
 
 def true_camera(camera: VirtualCamera) -> Camera:
-    """The simulated camera as the processing knows cameras."""
+    """The true camera of the virtual rig as a camera of the library."""
     size = camera.width, camera.height
     lens = Intrinsics(camera.K, camera.distortion, size)
     P = lens.K_undistorted @ np.column_stack([camera.R, camera.t])
@@ -112,14 +112,17 @@ def figure_6(
 
 @dataclass(frozen=True)
 class ExactRays:
-    """Exact pixels of points on a perfect cylinder, in the pairs of cameras that see them under 60°."""
+    """Exact pixels of points on a perfect cylinder, in the pairs of cameras that see them under 60°.
+
+    pairs : P pairs of camera ids. px : of each pair (2, n, 2) px, distorted, in its first and second camera.
+    """
 
     pairs: tuple[tuple[str, str], ...]
     px: tuple[Floats, ...]
 
     @classmethod
     def of(cls, true: Mapping[str, Camera], pairs: tuple[tuple[str, str], ...], radius: float = 57.0) -> ExactRays:
-        """Of points every three degrees and twenty millimetres."""
+        """Exact pixels of points every three degrees and twenty millimetres, by the true cameras."""
         angle, z = (a.ravel() for a in np.meshgrid(np.arange(0, 2 * np.pi, np.pi / 60), np.linspace(15, 235, 12)))
         normals = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
         xyz = radius * normals + np.outer(z, [0, 0, 1])
@@ -130,7 +133,7 @@ class ExactRays:
         return cls(pairs, tuple(seen))
 
     def diameter_bias(self, cameras: Mapping[str, Camera]) -> float:
-        """Fitted diameter of what a calibration makes of them, minus the true one. mm."""
+        """Diameter of the cylinder fitted to these points triangulated with a calibration, minus the true one, mm."""
         points = [triangulate([cameras[id_] for id_ in pair], px) for pair, px in zip(self.pairs, self.px, strict=True)]
         return fitted_cylinder(np.concatenate(points)).diameter - 114.0
 

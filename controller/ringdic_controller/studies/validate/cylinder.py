@@ -24,7 +24,7 @@ ALL, PAIRS = "all views", "pairs"
 
 @dataclass(frozen=True)
 class Run:
-    """One way's run over the cylinder. cameras : as it calibrated them."""
+    """A run of one way of processing over the images of the cylinder. cameras : as this way calibrated them, by id."""
 
     results: Results
     cameras: Mapping[str, Camera]
@@ -32,16 +32,19 @@ class Run:
 
     @classmethod
     def of(cls, results: Results) -> Run:
-        """Of results as they were read."""
+        """The run whose results these are."""
         return cls(results, {camera.id: camera for camera in results.cameras}, Tracks.of(results))
 
     def cloud(self, pairs: tuple[tuple[str, str], ...], step: int | None = None) -> Floats:
-        """What every pair alone has, one after the other. (P, N, 3) mm. step : see ``Tracks.of_pair``."""
+        """Points triangulated by each camera pair alone, (P, N, 3) mm, NaN where the pair has no match.
+
+        step : of the tracking in time; None for the reference as matched between the cameras.
+        """
         return np.stack([self.tracks.of_pair(self.cameras, pair, step) for pair in pairs])
 
 
 def diameter(runs: Mapping[str, Run], pairs: tuple[tuple[str, str], ...]) -> Findings:
-    """Diameter of the fitted cylinder and the standard deviation of the points' own."""
+    """Figures of the fitted cylinder: its diameter, and the standard deviation of twice the points' radii."""
     fits = {way: fitted_cylinder(run.results.vertices_ref) for way, run in runs.items()}
     single = {way: fitted_cylinder(np.concatenate(run.cloud(pairs))) for way, run in runs.items()}
     bias = {way: fit.diameter - TRUE for way, fit in fits.items()}
@@ -55,7 +58,7 @@ def diameter(runs: Mapping[str, Run], pairs: tuple[tuple[str, str], ...]) -> Fin
 
 
 def figure_7a(runs: Mapping[str, Run], pairs: tuple[tuple[str, str], ...]) -> Findings:
-    """The same points from two pairs that share a camera."""
+    """Merging mismatch: the distance between points measured by two pairs that share a camera (Fig. 7a)."""
     found = {way: mismatch(run.tracks, run.cameras, pairs) for way, run in runs.items()}
     mean = {way: float(each.mean()) for way, each in found.items() if len(each)}
     spread = {way: float(each.std()) for way, each in found.items() if len(each)}
@@ -76,7 +79,7 @@ class _Steps:
 
 
 def figure_7b(runs: Mapping[str, Run], surface: Cylinder, pairs: tuple[tuple[str, str], ...]) -> Findings:
-    """Every step of 0.1 mm against the reference: displacement by component, and strain, which should be none."""
+    """Displacement and strain of each rigid step of 0.1 mm against the reference; true strain is zero (Fig. 7b)."""
     every = {way: _all_views(run, surface) for way, run in runs.items()}
     single = {way: _from_pairs(run, surface, pairs) for way, run in runs.items()}
     figures: list[Figure] = []
@@ -104,7 +107,7 @@ def figure_7b(runs: Mapping[str, Run], surface: Cylinder, pairs: tuple[tuple[str
 def apart(
     runs: Mapping[str, Run], rays: ExactRays, true: Mapping[str, Camera], uncorrected: Mapping[str, Camera]
 ) -> Findings:
-    """The two systematic errors apart: the calibration's on exact lines of sight, the matching's in true cameras.
+    """The two systematic errors separated: the calibration on exact pixels, the matching with the true cameras.
 
     uncorrected : the paper's cameras without correction of distortion.
     """
@@ -134,7 +137,7 @@ def apart(
 
 
 def print_errors(runs: Mapping[str, Run]) -> Findings:
-    """The diameter where the dots of the target are printed off their places."""
+    """Diameter after a calibration on a target whose dots are printed off their places."""
     bias = {way: fitted_cylinder(run.results.vertices_ref).diameter - TRUE for way, run in runs.items()}
     return Findings((Figure("print errors 0.03 mm", "diameter bias", "mm", bias, "", 0.005),))
 
@@ -154,7 +157,7 @@ def _all_views(run: Run, surface: Cylinder) -> _Steps:
 
 
 def _from_pairs(run: Run, surface: Cylinder, pairs: tuple[tuple[str, str], ...]) -> _Steps:
-    """The same with every pair on its own."""
+    """Errors of each step when every camera pair triangulates on its own."""
     mean, std = [], []
     before = run.cloud(pairs, 0)
     for step in range(1, len(run.results.steps)):

@@ -1,4 +1,4 @@
-"""Images of the simulated rig, rendered once and kept."""
+"""A cache of rendered images of the simulated rig."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 @dataclass(frozen=True)
 class RenderedShot:
-    """One image to take. seed : of the sensor's noise. jpeg : its quality, or None for an image without loss."""
+    """An image to be rendered. seed : of the sensor's noise. jpeg : its quality, or None for an image without loss."""
 
     camera: VirtualCamera
     scene: Scene
@@ -28,12 +28,12 @@ class RenderedShot:
 
     @property
     def key(self) -> str:
-        """The same for the same image: of camera, scene, noise, coding and renderer."""
+        """Key of everything the image depends on: camera, scene, noise, coding and the renderer's code. 16 digits."""
         camera = self.camera
         view = (camera.id, camera.width, camera.height)
         exact = [values.tobytes() for values in (camera.lens, camera.R, camera.t)]
-        told = f"{STAMP} {view} {exact} {self.scene!r} {self.seed} {self.jpeg}"
-        return hashlib.sha256(told.encode()).hexdigest()[:16]
+        described = f"{STAMP} {view} {exact} {self.scene!r} {self.seed} {self.jpeg}"
+        return hashlib.sha256(described.encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class Darkroom:
     folder: Path
 
     def path(self, shot: RenderedShot) -> Path:
-        """Where an image lies once it is developed."""
+        """File of an image, whether it has been rendered or not."""
         return self.folder / f"{shot.camera.id}-{shot.key}.{'png' if shot.jpeg is None else 'jpg'}"
 
     def develop(self, shots: Sequence[RenderedShot], progress: Callable[[float], None] = lambda _: None) -> list[Path]:
-        """Render what is not there yet, on all cores, and tell where each image lies."""
+        """Render the images that are missing, on all cores; the file of each image, in the order given."""
         self.folder.mkdir(parents=True, exist_ok=True)
         paths = {self.path(shot): shot for shot in shots}
         missing = [shot for path, shot in paths.items() if not path.is_file()]

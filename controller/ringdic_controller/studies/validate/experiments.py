@@ -23,7 +23,7 @@ from ringdic_controller.studies.validate.cylinder import Run, apart, diameter, f
 from ringdic_controller.studies.validate.darkroom import Darkroom, RenderedShot
 from ringdic_controller.studies.validate.figures import PAPER, Figure, Findings
 from ringdic_controller.studies.validate.folders import make_session
-from ringdic_controller.studies.validate.limb import LimbRun, figure_9, spoilt
+from ringdic_controller.studies.validate.limb import LimbRun, compare_spoilt, figure_9
 from ringdic_controller.studies.validate.scenery import Scenery
 
 #: Kinds of capture of the scenes of an experiment.
@@ -81,7 +81,7 @@ class Validation:
         return found
 
     def render(self, experiments: Sequence[str] = EXPERIMENTS) -> None:
-        """Every image that is not there yet."""
+        """Render the images of these experiments that are missing."""
         for name in dict.fromkeys(("moved", *(name for each in experiments for name in _SCENES[each]))):
             self._develop(name)
 
@@ -115,7 +115,7 @@ class Validation:
         if with_spoilt:
             scenes = _specimens(self.scenery, "spoilt")
             runs = {way: LimbRun.of(results, scenes) for way, results in self._process("spoilt").items()}
-            found["spoilt"] = spoilt(runs, clean, scenes, cameras)
+            found["spoilt"] = compare_spoilt(runs, clean, scenes, cameras)
         return found
 
     def _rings(self) -> dict[str, CalibratedRig]:

@@ -36,7 +36,7 @@ class Figure:
         return value >= self.limit if self.least else abs(value) <= self.limit
 
     def text(self, value: float | None) -> str:
-        """A value as it stands in tables."""
+        """A value as text, with its unit's number of digits."""
         if value is None:
             return ""
         return "–" if value != value else f"{value:.{self.digits}f}"

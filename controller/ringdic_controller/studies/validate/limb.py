@@ -1,4 +1,4 @@
-"""The deforming limb of Fig. 9 against its formulas, and the same limb in spoilt images."""
+"""The deforming limb of Fig. 9 compared with its formulas, in clean and in spoilt images."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _HOLE = 5.0  # mm²
 
 @dataclass(frozen=True)
 class LimbRun:
-    """One way's run over the limb. steps : of the scenes, one for each step of the results."""
+    """A run of one way of processing over the images of the limb. steps : the scene at each step of the run."""
 
     results: Results
     steps: tuple[int, ...]
@@ -33,23 +33,23 @@ class LimbRun:
 
     @classmethod
     def of(cls, results: Results, scenes: Sequence[Specimen]) -> LimbRun:
-        """Of results as they were read; scenes : the limb at each of their steps."""
+        """The run whose results these are. scenes : the limb at each step of the results."""
         steps = tuple(scene.step for scene in scenes)
         return cls(results, steps, errors(results, scenes[0].surface, steps))
 
     @property
     def displacement(self) -> Floats:
-        """Length of the error of every displacement. (F, N) mm, NaN where lost."""
+        """Length of the error of every point's displacement, (F, N) mm, NaN where lost."""
         return np.asarray(np.linalg.norm(self.errors.displacement, axis=2))
 
     @property
     def wrong(self) -> int:
-        """Points off the surface, or displaced wrongly, by more than a millimetre."""
+        """Number of points that lie off the surface, or whose displacement is off, by more than a millimetre."""
         off = np.abs(self.errors.distance) > _WRONG
         return int((off | (self.displacement > _WRONG).any(axis=0)).sum())
 
     def covered(self, grid: SurfaceGrid, step: int) -> Mask:
-        """Cells of the grid under triangles measured at a step."""
+        """Which cells of the grid lie under triangles measured at a step, (rows, columns) bool."""
         measured = np.isfinite(self.results.vertices[step]).all(axis=1)
         faces = self.results.faces
         return grid.covered(self.errors.theta, self.errors.z, faces[measured[faces].all(axis=1)])
@@ -92,16 +92,17 @@ def figure_9(runs: Mapping[str, LimbRun], scenes: Sequence[Specimen], cameras: S
     return Findings(figures, curves)
 
 
-def spoilt(
+def compare_spoilt(
     runs: Mapping[str, LimbRun],
     clean: Mapping[str, LimbRun],
     scenes: Sequence[Specimen],
     cameras: Sequence[VirtualCamera],
 ) -> Findings:
-    """The limb with worn speckles, reflections, bars and JPEG beside the clean one: what is wrong, what is lost.
+    """Figures of the limb with worn speckles, reflections, bars and JPEG beside the clean one: wrong and lost points.
 
-    Spoilt is what a bar, a reflection or a worn patch hides in an image that sees it under 60°, at the reference or at
-    the step; blind is what then fewer than two cameras see unspoilt at both. Lost is what the clean run covers.
+    An area is spoilt where a bar, a reflection or a worn patch hides it in an image that sees it under 60°, at the
+    reference or at the step. It is blind where fewer than two cameras see it unspoilt at both. It is lost where the
+    clean run covers it and this one does not.
     """
     grids = [SurfaceGrid.of(scene) for scene in scenes]
     views = [grid.views(cameras) for grid in grids]

@@ -1,4 +1,4 @@
-"""What stands in the ring for each experiment, and the images it takes.
+"""The scenes of each experiment, and the images that are taken of them.
 
 ``boards``     the checkerboard, for every session
 ``target``     the calibration cylinder; ``moved`` 5 mm along x (Fig. 6); ``printed`` with errors of the print
@@ -61,7 +61,7 @@ class Scenery:
 
     @property
     def rig(self) -> VirtualRig:
-        """The cameras."""
+        """The simulated cameras."""
         return paper_rig(self.cameras, self.scale, self.seed)
 
     def scenes(self, name: str) -> list[Scene]:

@@ -11,7 +11,9 @@ from scipy.optimize import least_squares
 
 @dataclass(frozen=True)
 class FittedCylinder:
-    """diameter : mm. spread : standard deviation of the points' own diameters, mm. radial : (n,) distances, mm."""
+    """A cylinder fitted to points.
+
+    diameter : mm. spread : standard deviation of the points' own diameters, mm. radial : (n,) distances, mm."""
 
     diameter: float
     spread: float

@@ -1,4 +1,4 @@
-"""The pixels that a run's points rest on, camera by camera, whichever way it went."""
+"""The pixels from which the points of a run were triangulated, camera by camera, for every way of processing."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 @dataclass(frozen=True)
 class Tracks:
-    """Pixels of the measured points, those too that the merging of pairs takes out.
+    """Pixels of all measured points, including those that the merging of the pairs removes.
 
     cameras : C ids. px : (F, C, N, 2), NaN where a camera did not measure a point. reference : (C, N, 2), where each
     was matched between the cameras; tracking in time sets out from the place that all views together give.
@@ -28,7 +28,7 @@ class Tracks:
 
     @classmethod
     def of(cls, results: Results) -> Tracks:
-        """From the matches that the results keep."""
+        """The pixels of the matches that are stored with the results."""
         ids = tuple(camera.id for camera in results.cameras)
         alone = all(len(matches.cameras) == 1 for matches in results.matches)
         count = len(results.vertices_ref) if alone else sum(len(matches.xy) for matches in results.matches)
@@ -47,20 +47,20 @@ class Tracks:
         return cls(ids, px, reference)
 
     def reconstruct(self, cameras: Mapping[str, Camera]) -> Floats:
-        """The reference as other cameras would have it, from all views alike. (N, 3) mm."""
+        """Reference points triangulated with other cameras, all views weighted alike, (N, 3) mm."""
         return triangulate([cameras[id_] for id_ in self.cameras], self.reference)
 
     def of_pair(self, cameras: Mapping[str, Camera], pair: tuple[str, str], step: int | None = None) -> Floats:
-        """The points as a pair alone has them. (N, 3) mm, NaN where one of its cameras has no view.
+        """Points triangulated by one camera pair alone, (N, 3) mm, NaN where one of its cameras has no match.
 
-        step : as tracked in time; None is the reference as matched between the cameras.
+        step : of the tracking in time; None for the reference as matched between the cameras.
         """
         chosen = [self.cameras.index(id_) for id_ in pair]
         px = self.reference[chosen] if step is None else self.px[step, chosen]
         return triangulate([cameras[id_] for id_ in pair], px)
 
     def neighbours(self, pairs: tuple[tuple[str, str], ...]) -> Iterator[tuple[tuple[str, str], tuple[str, str]]]:
-        """Pairs of a ring that share a camera, each with the next."""
+        """Camera pairs that share a camera: each pair with the next one round the ring."""
         following = {first: (first, second) for first, second in pairs}
         for pair in pairs:
             if pair[1] in following:

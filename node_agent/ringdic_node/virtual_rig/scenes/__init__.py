@@ -1,4 +1,4 @@
-"""What stands in the ring, each scene with its exact truth."""
+"""The scenes of the virtual rig, each with its exact truth: checkerboard, calibration target, specimens."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ _PLASTIC = np.array([0.7548776662466927, 0.5698402909980532])  # 1/p and 1/p² o
 
 @dataclass(frozen=True)
 class BoardScene:
-    """View number ``index`` of the board; the pose also depends on the camera and the seed."""
+    """The board in its view number ``index``; the pose also depends on the camera and the seed."""
 
     index: int
     seed: int = 0
@@ -64,7 +64,7 @@ class BoardScene:
         return np.array(points + [(x, y, 0.0) for x in (-out, w + out) for y in along])
 
     def corners(self, camera: VirtualCamera) -> Floats:
-        """True inner corners in the image, (266, 2) px, across first."""
+        """Exact pixels of the 14 x 19 inner corners in a camera's image, (266, 2) px, row by row across the board."""
         y, x = np.mgrid[1 : SQUARES[1], 1 : SQUARES[0]] * SQUARE
         R, t = self.pose(camera)
         xyz = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)

@@ -1,4 +1,4 @@
-"""What spoils the images of a specimen: speckles worn off, reflections of lamps, bars before the body.
+"""What spoils the images of a specimen: worn speckles, reflections of lamps, bars in front of the body.
 
 Positions are in the world, mm; worn patches lie on the body, in its material coordinates.
 """
@@ -58,7 +58,7 @@ class Damage:
         )
 
     def worn(self, theta: Floats, z: Floats) -> Mask:
-        """Which material points (n,) have lost their speckles."""
+        """Which material points have lost their speckles. theta : (n,) rad. z : (n,) mm. (n,) bool."""
         off = np.zeros(np.shape(theta), dtype=bool)
         for patch in self.patches:
             arc = (np.asarray(theta) - patch.theta + np.pi) % (2 * np.pi) - np.pi
@@ -66,7 +66,7 @@ class Damage:
         return off
 
     def spoilt(self, centre: Floats, xyz: Floats, normals: Floats) -> Mask:
-        """Which points a camera sees behind a bar or in a reflection.
+        """Which points of the surface a camera sees behind a bar or in a lamp's reflection, (n,) bool.
 
         centre : (3,) of the camera; xyz : (n, 3) points of the surface, mm; normals : (n, 3) of unit length, outwards.
         """

@@ -17,11 +17,11 @@ from ringdic_node.virtual_rig.texture import RADIUS
 
 
 class _Surface(ABC):
-    """What every body of material points can be asked. theta in rad, z in mm, of any one shape."""
+    """A body of material points: positions, tangents and stretches at a step. theta in rad, z in mm, of one shape."""
 
     @abstractmethod
     def parameters(self, step: int) -> Floats:
-        """Parameters of the surface at a step."""
+        """Parameters of the surface at a step, (6,), as `ringdic_node.virtual_rig.body` defines them; mm."""
 
     def position(self, theta: Floats, z: Floats, step: int) -> Floats:
         """Positions (..., 3) mm of material points at a step."""
@@ -62,6 +62,7 @@ class Cylinder(_Surface):
     per_step: tuple[float, float, float] = (0.1, 0.0, 0.0)
 
     def parameters(self, step: int) -> Floats:
+        """Parameters (6,) of the cylinder moved to its place at a step, mm."""
         return np.array([body.CYLINDER, RADIUS, *(step * np.array(self.per_step)), 0.0])
 
 
@@ -72,6 +73,7 @@ class Limb(_Surface):
     load_per_step: float = 0.2
 
     def parameters(self, step: int) -> Floats:
+        """Parameters (6,) of the limb under the load of a step; the load has no unit."""
         return np.array([body.LIMB, RADIUS, 0.0, 0.0, 0.0, step * self.load_per_step])
 
 
@@ -90,5 +92,5 @@ class Specimen:
         return (5.0, 245.0) if isinstance(self.surface, Limb) else (12.0, 238.0)
 
     def body(self) -> Floats:
-        """Parameters of the surface."""
+        """Parameters (6,) of the surface at this step, as `ringdic_node.virtual_rig.body` defines them; mm."""
         return self.surface.parameters(self.step)

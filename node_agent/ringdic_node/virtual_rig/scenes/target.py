@@ -31,7 +31,7 @@ class TargetScene:
             raise ValueError(f"a print error must lie between 0 and 0.2 mm, not {self.print_error}")
 
     def body(self) -> Floats:
-        """Parameters of the surface."""
+        """Parameters (6,) of the surface, as `ringdic_node.virtual_rig.body` defines them; mm."""
         return np.array([CYLINDER, RADIUS, *self.offset, 0.0])
 
     def prints(self) -> Floats:

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Indices, Mask
 from ringdic.mesh.mesh import Mesh, half_edges
+from ringdic.mesh.polygon import triangulate_polygon
 from ringdic.mesh.topology import Border, Kind, borders
 
 _LONGEST = 150  # vertices of a border that is filled
@@ -40,9 +41,9 @@ def fill(mesh: Mesh, area: float, bridge: float, seam: Mask, seam_area: float) -
             if size == 0 or size > limit or normals[outline].mean(axis=0) @ vector < _FACING * size:
                 continue
             barred = _forbidden(outline, known)
-            triangles = polygon(points, vector / size, bridge, barred, _THIN)
+            triangles = triangulate_polygon(points, vector / size, bridge, barred, _THIN)
             if triangles is None:
-                triangles = polygon(points, vector / size, bridge, barred)
+                triangles = triangulate_polygon(points, vector / size, bridge, barred)
             if triangles is not None:
                 found.append(outline[triangles])
                 known.update(_edges_of(found[-1]))
@@ -86,41 +87,3 @@ def _forbidden(outline: Indices, known: set[tuple[int, int]]) -> Mask:
             if (i, j) != (0, n - 1):
                 barred[i, j] = (min(names[i], names[j]), max(names[i], names[j])) in known
     return barred
-
-
-def polygon(points: Floats, normal: Floats, bridge: float, barred: Mask, thinnest: float = 0.0) -> Indices | None:
-    """Triangles (n - 2, 3) of a polygon (n, 3) mm counter-clockwise about a normal, or None.
-
-    thinnest : least height of a triangle over its longest edge.
-
-    Of all triangulations whose triangles face the normal and whose edges are no longer than ``bridge`` and not
-    ``barred`` (n, n), the one with the smallest sum of squared edges (dynamic programming, Klincsek 1980).
-    """
-    n = len(points)
-    apart = np.linalg.norm(points[:, None] - points, axis=2)
-    side = np.where(barred | (apart > bridge), np.inf, apart**2)
-    rim = np.arange(n - 1)
-    side[rim, rim + 1] = side[0, n - 1] = 0.0
-    cost = np.full((n, n), np.inf)
-    cost[rim, rim + 1] = 0.0
-    choice = np.zeros((n, n), np.int64)
-    for width in range(2, n):
-        for i in range(n - width):
-            j = i + width
-            between = slice(i + 1, j)
-            twice_area = np.cross(points[between] - points[i], points[j] - points[i]) @ normal
-            longest = np.maximum(np.maximum(apart[i, between], apart[between, j]), apart[i, j])
-            facing = twice_area > thinnest * longest**2
-            total = np.where(facing, cost[i, between] + cost[between, j], np.inf) + side[i, j]
-            best = int(np.argmin(total))
-            cost[i, j], choice[i, j] = total[best], i + 1 + best
-    if not np.isfinite(cost[0, n - 1]):
-        return None
-    triangles, open_ = [], [(0, n - 1)]
-    while open_:
-        i, j = open_.pop()
-        if j - i > 1:
-            k = int(choice[i, j])
-            triangles.append((i, k, j))
-            open_ += [(i, k), (k, j)]
-    return np.array(triangles, np.int64)

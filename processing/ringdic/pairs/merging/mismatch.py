@@ -13,7 +13,7 @@ import numba as nb
 import numpy as np
 
 from ringdic.arrays import Floats, Indices, Mask
-from ringdic.mesh.adjacency import alike
+from ringdic.mesh.adjacency import shared_edges
 from ringdic.mesh.mesh import Mesh, half_edges
 from ringdic.mesh.projection import Projector
 
@@ -69,7 +69,7 @@ class Curved:
 
     def __init__(self, mesh: Mesh, reach: float) -> None:
         half = half_edges(mesh.faces)
-        before, alone = alike(half)
+        before, alone = shared_edges(half)
         self.mesh = mesh
         self.used = np.unique(mesh.faces)
         self.normals = _averaged(np.nan_to_num(mesh.vertex_normals), half, before)
@@ -127,7 +127,7 @@ def _above(points, directions, corners, weights, height, vertices, normals):  # 
 def _averaged(normals, half, before):  # type: ignore[no-untyped-def]
     """Unit normals (N, 3) averaged with those of the neighbours: measured slopes are noisy.
 
-    half, before : directed edges (3M, 2) and what ``alike`` tells of them.
+    half, before : directed edges (3M, 2) and what ``shared_edges`` tells of them.
     """
     total = normals.copy()
     for h in range(len(half)):

@@ -17,8 +17,8 @@ import scipy
 
 from ringdic.arrays import Floats, Indices, Mask
 from ringdic.mesh.mesh import Mesh
-from ringdic.mesh.nearest import among_alike, cubes
-from ringdic.mesh.projection import Projector, sized
+from ringdic.mesh.nearest import away_from_other_labels, cubes
+from ringdic.mesh.projection import Projector, triangle_spheres
 from ringdic.pairs.merging import kernels
 
 #: What the combination weighs, each relative to its median over the overlaps.
@@ -75,13 +75,13 @@ def closer_than(mesh: Mesh, owner: Indices, gap: float, reach: float) -> Indices
     Seen along the mean of the two normals; ``reach`` mm is how far apart along it two layers may lie.
     """
     corners = mesh.vertices[mesh.faces]
-    centroids, normals, radius = sized(corners)
+    centroids, normals, radius = triangle_spheres(corners)
     if not len(radius):
         return np.zeros((0, 2), np.int64)
     usual = 1.5 * float(np.median(radius))
     common = float(np.hypot(2 * usual + gap, reach))
     middles = cubes(centroids, common / 2)
-    inside = among_alike(middles, owner, common)
+    inside = away_from_other_labels(middles, owner, common)
 
     def pairs(first: int, last: int) -> Indices:
         found = kernels.closer(

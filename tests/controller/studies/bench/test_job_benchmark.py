@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from ringdic.errors import InputError
 from ringdic_controller.studies.bench import job
-from ringdic_controller.studies.bench.command import bench, compared
+from ringdic_controller.studies.bench.command import bench_command, compared
 from ringdic_controller.studies.bench.job import job_ratios
 
 SMALL = ["correlation.radius_px=12", "correlation.step_px=10"]
@@ -23,7 +23,7 @@ def few_images(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def measured(folder: Path, capsys: pytest.CaptureFixture[str], **changed: Any) -> dict[str, Any]:
     arguments = {"job": True, "steps": "2,3", "scale": 0.2, "cameras": 6, "set_": SMALL, "out": folder, "as_json": True}
-    bench(data=None, repeats=1, interpolation="cubic", capture=False, live=False, all_=False, compare=None,
+    bench_command(data=None, repeats=1, interpolation="cubic", capture=False, live=False, all_=False, compare=None,
           **{**arguments, **changed})  # fmt: skip
     result: dict[str, Any] = json.loads(capsys.readouterr().out)
     return result

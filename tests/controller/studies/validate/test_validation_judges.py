@@ -7,7 +7,7 @@ from ringdic.results.results import Matches, Results
 from ringdic_controller.studies.validate.calibration import ExactRays, true_camera
 from ringdic_controller.studies.validate.cylinder import Run, apart, diameter, figure_7a, figure_7b
 from ringdic_controller.studies.validate.figures import BETTER, PAPER, Figure
-from ringdic_controller.studies.validate.limb import LimbRun, figure_9, spoilt
+from ringdic_controller.studies.validate.limb import LimbRun, compare_spoilt, figure_9
 from ringdic_controller.studies.validate.report import blindness
 from ringdic_controller.studies.validate.scenery import Scenery
 from ringdic_controller.studies.validate.shapes import fitted_cylinder
@@ -180,7 +180,7 @@ def test_what_a_run_loses_is_compared_with_what_was_spoilt() -> None:
     clean = LimbRun.of(exact(Limb(), steps), [Specimen(Limb(), step) for step in steps])
     nothing_lost = LimbRun.of(exact(Limb(), steps), scenes)
     worn_lost = LimbRun.of(exact(Limb(), steps, ~worn[faces].any(axis=1)), scenes)
-    found = spoilt({PAPER: nothing_lost, BETTER: worn_lost}, {PAPER: clean, BETTER: clean}, scenes, RIG.cameras)
+    found = compare_spoilt({PAPER: nothing_lost, BETTER: worn_lost}, {PAPER: clean, BETTER: clean}, scenes, RIG.cameras)
     none, some = values(found.figures, PAPER), values(found.figures, BETTER)
     assert none["lost area"] == 0.0
     patches = sum(np.pi * patch.half_arc * patch.half_height for patch in scenes[-1].damage.patches) / 100

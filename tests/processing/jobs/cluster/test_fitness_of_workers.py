@@ -86,7 +86,8 @@ def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_who_asks_for_no_cluster_loads_no_dask():
-    loaded = """import sys, ringdic_controller.cli.app, ringdic.jobs.pipeline, ringdic.jobs.cluster
+    loaded = """import sys, ringdic.cli.app, ringdic.jobs.pipeline, ringdic.jobs.cluster
+ringdic.cli.app.application()
 print("dask" in sys.modules)"""
     done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.strip() == "False"

@@ -1,47 +1,11 @@
-"""Holes closed over the vertices round them."""
+"""Holes of a surface closed over the vertices round them."""
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from ringdic.mesh.mesh import Mesh
-from ringdic.pairs.merging.fill import fill, polygon, simple_loops
+from ringdic.pairs.merging.fill import fill, simple_loops
 
 UP = np.array([0.0, 0.0, 1.0])
-
-
-def area(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    a, b, c = np.moveaxis(points[triangles], 1, 0)
-    return 0.5 * np.cross(b - a, c - a) @ UP
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.integers(4, 14), st.integers(0, 10_000))
-def test_a_star_shaped_polygon_is_covered_once(n: int, seed: int) -> None:
-    """Triangles that all face upwards and add up to the polygon's area cannot overlap."""
-    random = np.random.default_rng(seed)
-    angle = np.sort((np.arange(n) + random.uniform(-0.3, 0.3, n)) * 2 * np.pi / n)
-    radius = random.uniform(0.4, 1.0, n)
-    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.05 * random.standard_normal(n)], axis=1)
-    triangles = polygon(points, UP, bridge=10.0, barred=np.zeros((n, n), bool))
-    assert triangles is not None
-    assert len(triangles) == n - 2
-    areas = area(points, triangles)
-    x, y = points[:, 0], points[:, 1]
-    assert (areas > 0).all()
-    assert areas.sum() == pytest.approx(0.5 * (x @ np.roll(y, -1) - y @ np.roll(x, -1)))
-
-
-def test_the_shorter_diagonal_is_taken_unless_it_is_barred() -> None:
-    points = np.array([[0, 0, 0], [2, -0.5, 0], [4, 0, 0], [2, 0.5, 0]], float)
-    free = np.zeros((4, 4), bool)
-    triangles = polygon(points, UP, 10.0, free)
-    assert {1, 3} in [set(row) & {1, 3} for row in triangles.tolist()]
-    assert all({1, 3} <= set(row) for row in triangles.tolist())
-    barred = free.copy()
-    barred[1, 3] = True
-    assert all({0, 2} <= set(row) for row in polygon(points, UP, 10.0, barred).tolist())
-    assert polygon(points, UP, 3.0, barred) is None
 
 
 def test_a_loop_is_split_where_it_passes_a_vertex_twice() -> None:

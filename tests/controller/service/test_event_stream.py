@@ -1,23 +1,23 @@
-"""Live state: whoever follows gets a snapshot and then every event; whoever falls behind gets a new snapshot."""
+"""The stream of events: a follower gets a snapshot and then every event; one that falls behind, a new snapshot."""
 
 from __future__ import annotations
 
 import asyncio
 import threading
 
-from ringdic_controller.service.events import BACKLOG, Live
+from ringdic_controller.service.events import BACKLOG, EventStream
 
 
 def test_a_follower_gets_the_snapshot_and_then_the_events_of_other_threads() -> None:
     async def story() -> list:
-        live = Live(lambda: {"nodes": 12})
-        events = live.follow()
+        stream = EventStream(lambda: {"nodes": 12})
+        events = stream.follow()
         seen = [await anext(events)]
-        threading.Thread(target=lambda: [live.publish("job", {"done": k}) for k in range(5)]).start()
+        threading.Thread(target=lambda: [stream.publish("job", {"done": k}) for k in range(5)]).start()
         for _ in range(5):
             seen.append(await asyncio.wait_for(anext(events), 5))
         await events.aclose()
-        live.publish("job", {"done": 9})  # nobody follows any more
+        stream.publish("job", {"done": 9})  # nobody follows any more
         return seen
 
     assert asyncio.run(story()) == [("snapshot", {"nodes": 12}), *(("job", {"done": k}) for k in range(5))]
@@ -26,12 +26,12 @@ def test_a_follower_gets_the_snapshot_and_then_the_events_of_other_threads() -> 
 def test_a_follower_far_behind_gets_a_snapshot_in_place_of_what_it_missed() -> None:
     async def story() -> list:
         state = {"count": 0}
-        live = Live(lambda: dict(state))
-        events = live.follow()
+        stream = EventStream(lambda: dict(state))
+        events = stream.follow()
         await anext(events)
         for k in range(BACKLOG + 10):
             state["count"] = k
-            live.publish("tick", {"k": k})
+            stream.publish("tick", {"k": k})
         await asyncio.sleep(0)
         return [await asyncio.wait_for(anext(events), 5) for _ in range(3)]
 
@@ -41,16 +41,16 @@ def test_a_follower_far_behind_gets_a_snapshot_in_place_of_what_it_missed() -> N
 
 
 def test_publishing_after_the_loop_has_ended_is_harmless() -> None:
-    live = Live(dict)
+    stream = EventStream(dict)
 
     async def begin() -> object:
-        events = live.follow()
+        events = stream.follow()
         await anext(events)
         return events
 
-    kept = asyncio.run(begin())
-    live.publish("job", {})
-    assert kept is not None
+    events = asyncio.run(begin())  # held until the end, so that the follower is not removed
+    stream.publish("job", {})
+    assert events is not None
 
 
 def test_an_event_that_happens_while_a_snapshot_is_taken_is_told_after_it() -> None:
@@ -59,17 +59,17 @@ def test_an_event_that_happens_while_a_snapshot_is_taken_is_told_after_it() -> N
         busy = False
 
         def snapshot() -> dict:
-            taken = dict(state)
+            copy = dict(state)
             if busy and state["round"] == "open":
                 state["round"] = "closed"
-                live.publish("round", {"round": "closed"})
-            return taken
+                stream.publish("round", {"round": "closed"})
+            return copy
 
-        live = Live(snapshot)
-        events = live.follow()
+        stream = EventStream(snapshot)
+        events = stream.follow()
         await anext(events)
         busy = True
-        live.publish_snapshot()
+        stream.publish_snapshot()
         return [await asyncio.wait_for(anext(events), 5) for _ in range(2)]
 
     assert asyncio.run(story()) == [("snapshot", {"round": "open"}), ("round", {"round": "closed"})]

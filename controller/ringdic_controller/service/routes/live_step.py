@@ -1,4 +1,4 @@
-"""The newest step as it is shown while the capturing goes on: its header and arrays."""
+"""The newest live step, a capture that was processed alone as soon as it was archived: its header and arrays."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -7,43 +7,48 @@ from fastapi import APIRouter, Depends
 from fastapi.responses import FileResponse
 from ringdic.results.reader import read_summary
 
-from ringdic_controller.service.desk import NotFoundError
+from ringdic_controller.service.refusals import NotFoundError
 from ringdic_controller.service.routes.arrays import add_arrays, version_of
 from ringdic_controller.service.routes.desk import TheDesk
 
 router = APIRouter(prefix="/sessions/{session}/live", tags=["live"])
 
 
-def _file(session: str, capture_id: str, desk: TheDesk) -> Path:
-    for folder in desk.catalogue.live(session):
+def _locate(session: str, capture_id: str, desk: TheDesk) -> Path:
+    """The results file of a live step."""
+    for folder in desk.catalogue.live_steps(session):
         if folder.name == capture_id and (folder / "results.h5").is_file():
             return folder / "results.h5"
     raise NotFoundError(f"Session '{session}' has no live results of capture '{capture_id}'; newer ones replace them.")
 
 
-File = Annotated[Path, Depends(_file)]
+StepFile = Annotated[Path, Depends(_locate)]
 
 
 @router.get("", summary="The newest step that was processed at once")
-def newest(session: str, desk: TheDesk) -> dict[str, Any]:
-    """As of a run, for the reference and that step; and how long after its last image it was ready. 404 if none."""
-    desk.session(session)
-    notice = desk.newest_step(session)
-    if notice is None:
+def read_newest_step(session: str, desk: TheDesk) -> dict[str, Any]:
+    """Header of the newest step's results, and how many seconds after its last image they were ready; 404 if none.
+
+    The results hold two steps, the reference and this one.
+    """
+    desk.sessions.summary(session)
+    newest = desk.sessions.newest_step(session)
+    if newest is None:
         raise NotFoundError(f"Session '{session}' has no live results; they come with the captures of its specimen.")
-    return notice | header(session, notice["capture_id"], _file(session, notice["capture_id"], desk), desk)
+    path = _locate(session, newest["capture_id"], desk)
+    return newest | read_live_step(session, newest["capture_id"], path)
 
 
 @router.get("/{capture_id}", summary="One of the newest steps; the others have been replaced")
-def header(session: str, capture_id: str, path: File, desk: TheDesk) -> dict[str, Any]:
+def read_live_step(session: str, capture_id: str, path: StepFile) -> dict[str, Any]:
     """Counts, steps, and the table of fields with their ranges."""
     return {"session": session, "capture_id": capture_id, "version": version_of(path), **read_summary(path)}
 
 
 @router.get("/{capture_id}/file", response_class=FileResponse, summary="The results file (HDF5)")
-def file(session: str, capture_id: str, path: File) -> FileResponse:
-    """VTKHDF form: opens in ParaView."""
+def send_step_file(session: str, capture_id: str, path: StepFile) -> FileResponse:
+    """The results in VTKHDF form, which opens in ParaView."""
     return FileResponse(path, filename=f"{session}-{capture_id}.h5")
 
 
-add_arrays(router, "/{capture_id}", _file)
+add_arrays(router, "/{capture_id}", _locate)

@@ -1,4 +1,4 @@
-"""Small pictures of archived images, for the page."""
+"""Small pictures of archived images for the page."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from ringdic.session.images import read_gray
 
 
 def preview_jpeg(path: Path, width: int = 320) -> bytes:
-    """A JPEG of an image file, at most ``width`` px wide; 16-bit images are stretched to their own range.
+    """A JPEG (as bytes) of the image in a file, at most ``width`` px wide.
 
-    Raises ringdic.errors.InputError if the file is missing or no image.
+    The grey levels of 16-bit images are mapped linearly from their 0.5 % and 99.5 % quantiles to 0 … 255. Raises
+    InputError if the file is missing or is not an image.
     """
     image = read_gray(path)
     if image.shape[1] > width:

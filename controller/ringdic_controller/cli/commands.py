@@ -1,0 +1,77 @@
+"""The commands ``demo``, ``controller``, ``validate`` and ``bench``, added to ``ringdic`` through its entry points.
+
+Importing this module needs no package of the extra ``controller``, so that ``ringdic --help`` lists the commands
+wherever the library is installed; a command whose packages are missing says which extra to install.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from ringdic.cli.console import print_json
+from ringdic.cli.options import AsJson
+
+from ringdic_controller.studies.bench.command import bench_command
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add the controller's commands to the application ``ringdic``."""
+    app.command("demo")(demo_command)
+    app.command("controller")(controller_command)
+    app.command("validate")(validate_command)
+    app.command("bench")(bench_command)
+
+
+def demo_command(
+    cameras: Annotated[int, typer.Option(min=6, max=30, help="Cameras; neighbours must share a view.")] = 12,
+    scale: Annotated[float, typer.Option(min=0.1, max=1.0, help="Size of the images; 1 is 2464 x 3280 px.")] = 0.25,
+    steps: Annotated[int, typer.Option(min=1, max=20, help="Deformed steps after the reference.")] = 3,
+    no_serve: Annotated[bool, typer.Option("--no-serve", help="End after the table.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder for everything the demo writes.")] = Path("ringdic-demo"),
+    as_json: AsJson = False,
+) -> None:
+    """Capture, process and show a simulated rig: every node a process, every image over Zenoh."""
+    _need_controller()
+    from ringdic_controller.studies.demo import run_demo
+
+    comparison = run_demo(out, cameras=cameras, scale=scale, steps=steps, serve=not no_serve)
+    if as_json:
+        print_json(comparison)
+
+
+def controller_command(
+    config: Annotated[Path | None, typer.Option(help="The controller's configuration (TOML).")] = None,
+) -> None:
+    """Run the controller: router, archive, jobs and the page."""
+    _need_controller()
+    from ringdic_controller.service.config import read_controller_config
+    from ringdic_controller.service.service import run_controller
+
+    run_controller(read_controller_config(config), on_ready=typer.echo)
+
+
+def validate_command(
+    scale: Annotated[float, typer.Option(min=0.1, max=1.0, help="Size of the images; 1 is 2464 x 3280 px.")] = 1.0,
+    out: Annotated[Path, typer.Option(help="Folder for images, sessions and tables; kept for the next run.")] = Path(
+        "ringdic-validate"
+    ),
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer board views and steps.")] = False,
+    only: Annotated[list[str] | None, typer.Option(metavar="EXPERIMENT", help="One experiment; repeatable.")] = None,
+    images_only: Annotated[bool, typer.Option("--images-only", help="Render the images and stop.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """The paper's experiments on the virtual rig, beside the paper's figures."""
+    from ringdic_controller.studies.validate import run_validation
+
+    findings = run_validation(out, scale=scale, quick=quick, only=only or (), images_only=images_only)
+    if as_json:
+        print_json(findings)
+
+
+def _need_controller() -> None:
+    """Fail at once, rather than in a child process, where the packages of the extra ``controller`` are missing."""
+    for package in ("fastapi", "uvicorn"):
+        import_module(package)

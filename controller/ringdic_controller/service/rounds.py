@@ -1,0 +1,174 @@
+"""Capture rounds as the operator sees them: one press of the capture button, from arming to the close."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from threading import Lock, Thread
+from typing import Any
+
+from ringdic.errors import InputError
+from ringdic_node.wire import CAPTURE_KINDS
+
+from ringdic_controller.archive.catalogue import Catalogue
+from ringdic_controller.service.refusals import NotFoundError, RefusedError
+from ringdic_controller.service.roster import NodeRoster
+from ringdic_controller.service.sessions import Sessions
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Round:
+    """One capture round: ``state`` is arming, open (the capture's record exists), closed or refused."""
+
+    id: str
+    session: str
+    kind: str
+    override: bool
+    state: str = "arming"
+    capture_id: str | None = None
+    error: str | None = None
+
+    @property
+    def ended(self) -> bool:
+        """Whether the round has reached a final state."""
+        return self.state in ("closed", "refused")
+
+
+class Rounds:
+    """All capture rounds since the controller started, of which at most the newest is under way.
+
+    Safe to use from several threads. Both callbacks are called with no lock held.
+
+    Parameters
+    ----------
+    sessions, catalogue, roster
+        Where captures go to, which there are, and the cameras that take them.
+    on_change
+        Called with the round after each of its changes, from several threads.
+    on_archived
+        Called with the round and the capture's id once the capture has closed, before the round does.
+    """
+
+    def __init__(
+        self,
+        sessions: Sessions,
+        catalogue: Catalogue,
+        roster: NodeRoster,
+        on_change: Callable[[Round], None],
+        on_archived: Callable[[Round, str], None],
+    ) -> None:
+        self._sessions = sessions
+        self._catalogue = catalogue
+        self._roster = roster
+        self._on_change = on_change
+        self._on_archived = on_archived
+        self._lock = Lock()  # guards the rounds
+        self._rounds: dict[str, Round] = {}  # oldest first
+
+    def get(self, round_id: str) -> Round:
+        """The round of this id. Raises NotFoundError."""
+        with self._lock:
+            if round_id not in self._rounds:
+                raise NotFoundError(f"There is no capture round '{round_id}'.")
+            return self._rounds[round_id]
+
+    def newest(self) -> Round | None:
+        """The round that began last, ended or not; None before the first."""
+        with self._lock:
+            return self._newest()
+
+    def running(self) -> Round | None:
+        """The round that is under way, if there is one."""
+        with self._lock:
+            return self._running()
+
+    def refusal(self) -> str | None:
+        """Why a capture would be refused now, in a sentence; None if it would not."""
+        if self._roster.nodes is None or self._roster.rig is None:
+            return "The controller runs without a rig: it shows sessions but cannot capture."
+        if self.running() is not None:
+            return "A capture is under way; wait until it has closed."
+        if self._sessions.current() is None:
+            return "There is no session yet; create one first."
+        return None
+
+    def begin(self, kind: str, *, override: bool = False) -> Round:
+        """Begin a capture in the current session; it goes on in a thread of its own.
+
+        Parameters
+        ----------
+        kind
+            One of `CAPTURE_KINDS`.
+        override
+            Capture although nodes are missing or cameras not armed.
+
+        Raises RefusedError if nothing can be captured now, InputError for an unknown kind.
+        """
+        if kind not in CAPTURE_KINDS:
+            raise InputError(f"'{kind}' is no kind of capture; use {', '.join(CAPTURE_KINDS)}")
+        refusal = self.refusal()
+        if refusal:
+            raise RefusedError(refusal)
+        missing = self._roster.missing()
+        if missing and not override:
+            verb = "is" if len(missing) == 1 else "are"
+            raise RefusedError(f"Camera {', '.join(missing)} {verb} not there; start the node, or capture without it.")
+        session = self._sessions.current()
+        assert session is not None
+        with self._lock:
+            if self._running() is not None:
+                raise RefusedError("A capture is under way; wait until it has closed.")
+            new = Round(f"r{1 + len(self._rounds)}", session, kind, override)
+            self._rounds[new.id] = new
+        self._on_change(new)
+        Thread(target=self._capture, args=(new,), name=f"capture-{new.id}", daemon=True).start()
+        return new
+
+    def note_record(self, session: str, capture_id: str) -> None:
+        """Note that a capture's record exists or has changed: a new one is the capture of the running round."""
+        running = self.running()
+        if running is None or running.capture_id is not None or session != running.session:
+            return
+        earlier = {record["capture_id"] for record in self._catalogue.captures(session)}
+        if capture_id not in earlier:  # else it is a late image of an earlier capture
+            self._change(running.id, state="open", capture_id=capture_id)
+
+    def _capture(self, new: Round) -> None:
+        """Take the capture of a new round, to the round's end."""
+        assert self._roster.nodes is not None
+        assert self._sessions.archive is not None
+        try:
+            writer = self._sessions.archive.open(new.session)
+            record = self._roster.nodes.capture(writer, new.kind, override=new.override)
+        except (RuntimeError, ValueError, OSError) as error:
+            logger.warning("capture %s was not taken: %s", new.id, error)
+            self._change(new.id, state="refused", error=str(error))
+            return
+        except BaseException as error:
+            sentence = f"The capture failed: {error!r}; see the controller's log."
+            self._change(new.id, state="refused", error=sentence)
+            raise
+        try:
+            self._on_archived(new, record["capture_id"])
+        finally:  # whatever became of its processing, the capture has closed
+            self._change(new.id, state="closed", capture_id=record["capture_id"])
+
+    def _change(self, round_id: str, **changes: Any) -> None:
+        """Change a round, unless it has ended."""
+        with self._lock:
+            if self._rounds[round_id].ended:
+                return
+            changed = self._rounds[round_id] = replace(self._rounds[round_id], **changes)
+        self._on_change(changed)
+
+    # With the lock held
+
+    def _newest(self) -> Round | None:
+        return next(reversed(self._rounds.values()), None)
+
+    def _running(self) -> Round | None:
+        newest = self._newest()
+        return None if newest is None or newest.ended else newest

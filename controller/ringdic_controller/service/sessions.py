@@ -1,0 +1,102 @@
+"""Sessions as the operator sees them: the list, the one that captures go to, creation, the newest live step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from threading import Lock
+from typing import Any, Protocol
+
+from ringdic_controller.archive.catalogue import Catalogue
+from ringdic_controller.service.refusals import NotFoundError, RefusedError
+
+
+class SessionArchive(Protocol):
+    """Where sessions are created and written: `ringdic_controller.archive.writer.Archive`."""
+
+    def create_session(self, name: str, rig_toml: str) -> Any:
+        """Create a session folder and return its writer. Raises InputError if the name is unusable or taken."""
+
+    def open(self, name: str) -> Any:
+        """The writer of an existing session. Raises InputError if there is none."""
+
+
+class Sessions:
+    """Sessions of the catalogue, and the selection among them; safe to use from several threads.
+
+    Parameters
+    ----------
+    catalogue
+        Lists the session folders.
+    rig_toml
+        Rig of new sessions as TOML text; without it none can be created.
+    clock
+        The present time, which names a session that is given no name.
+    """
+
+    def __init__(self, catalogue: Catalogue, rig_toml: str | None, clock: Callable[[], datetime]) -> None:
+        self._catalogue = catalogue
+        self._rig_toml = rig_toml
+        self._clock = clock
+        self._lock = Lock()  # guards the selection
+        self._selection: str | None = None
+        self.archive: SessionArchive | None = None  # replaced as a whole when it is connected: needs no lock
+
+    def summaries(self) -> list[dict[str, Any]]:
+        """One dictionary for each session, newest first, after new and changed folders have been read."""
+        self._catalogue.sync()
+        return self._catalogue.sessions()
+
+    def summary(self, name: str) -> dict[str, Any]:
+        """The dictionary of one session in the catalogue. Raises NotFoundError."""
+        try:
+            return self._catalogue.session(name)
+        except KeyError as error:
+            raise NotFoundError(f"There is no session '{name}'.") from error
+
+    def current(self) -> str | None:
+        """Name of the session that captures go to: the selected one, or else the newest; None without any."""
+        with self._lock:
+            selection = self._selection
+        names = [session["name"] for session in self._catalogue.sessions()]
+        return selection if selection in names else (names[0] if names else None)
+
+    def select(self, name: str) -> None:
+        """Send captures to this session from now on, for as long as it exists."""
+        with self._lock:
+            self._selection = name
+
+    def create(self, name: str | None) -> str:
+        """Create a session and return its name, which is the time if none is given.
+
+        Raises RefusedError if the name is taken or the controller has no rig, InputError if the name is unusable.
+        """
+        if self.archive is None or self._rig_toml is None:
+            raise RefusedError("The controller runs without a rig.toml: it cannot make a session.")
+        name = name or self._clock().strftime("%Y-%m-%d-%H%M%S")
+        if name in [session["name"] for session in self.summaries()]:
+            raise RefusedError(f"There is a session '{name}' already; choose another name.")
+        self.archive.create_session(name, self._rig_toml)
+        self._catalogue.refresh(name)
+        return name
+
+    def newest_step(self, session: str) -> dict[str, Any] | None:
+        """The newest live step of a session: capture_id, archived_at, ready_at and the seconds between; None without.
+
+        A live step is a specimen capture that was processed alone as soon as its images were archived.
+        """
+        for folder in reversed(self._catalogue.live_steps(session)):
+            try:
+                ready = datetime.fromtimestamp((folder / "results.h5").stat().st_mtime, UTC)
+                archived_at = self._catalogue.capture(session, folder.name).get("closed_at")
+            except (FileNotFoundError, KeyError):  # it is being replaced, or its capture was taken away
+                continue
+            seconds = (ready - datetime.fromisoformat(archived_at)).total_seconds() if archived_at else None
+            return {
+                "session": session,
+                "capture_id": folder.name,
+                "archived_at": archived_at,
+                "ready_at": ready.isoformat(timespec="milliseconds"),
+                "seconds": None if seconds is None else round(seconds, 3),
+            }
+        return None

@@ -1,0 +1,167 @@
+"""The table of commands of ``ringdic``: each is a thin call of the library's public functions.
+
+Commands of other packages are added through the entry-point group ``ringdic.commands``: each entry names a function
+that is called with the :class:`typer.Typer` application and adds its commands to it. This is how ``demo``,
+``controller``, ``validate`` and ``bench`` get here without the library knowing the controller.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import ringdic
+from ringdic.cli.console import narrated, print_json, say, show_table
+from ringdic.cli.measuring import measure_app, strain_command
+from ringdic.cli.options import AsJson, Reference, Run, Session, SethHill, Window, WithoutRigidMotion
+from ringdic.cli.reporting import animate_command, overlay_command, report_command
+from ringdic.progress import Progress
+
+PLUGINS = "ringdic.commands"
+
+Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="GROUP.NAME=VALUE", help="Repeatable.")]
+SettingsFile = Annotated[Path | None, typer.Option("--settings", help="Settings as a TOML file.")]
+
+
+def run() -> None:
+    """Read the command line and carry out its command."""
+    application()()
+
+
+@cache
+def application() -> typer.Typer:
+    """The application with the library's commands and those of the entry points ``ringdic.commands``."""
+    app = typer.Typer(
+        name="ringdic",
+        help="Multi-view 3D digital image correlation, from trigger to strain map.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+    )
+    app.callback()(_common_options)
+    app.command("import")(import_command)
+    app.command("process")(process_command)
+    app.command("correlate")(correlate_command)
+    app.command("export")(export_command)
+    app.command("report")(report_command)
+    app.command("overlay")(overlay_command)
+    app.command("animate")(animate_command)
+    app.add_typer(measure_app)
+    app.command("strain")(strain_command)
+    for entry in entry_points(group=PLUGINS):
+        entry.load()(app)
+    return app
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"ringdic {ringdic.__version__}")
+        raise typer.Exit
+
+
+def _common_options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and end.")
+    ] = False,
+) -> None:
+    """Multi-view 3D digital image correlation, from trigger to strain map."""
+
+
+def import_command(
+    source: Annotated[Path, typer.Argument(help="A folder with rig.toml, board, target and specimen.")],
+    session: Annotated[Path, typer.Argument(help="The session folder to make.")],
+    as_json: AsJson = False,
+) -> None:
+    """Make a session of a folder of images."""
+    from ringdic.session.importing import import_folder
+
+    import_folder(source, session)
+    if as_json:
+        print_json({"session": str(session)})
+    else:
+        say(f"imported {source} as session {session}")
+
+
+def process_command(
+    session: Session,
+    settings: SettingsFile = None,
+    set_: Overrides = None,
+    cluster: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a dask cluster.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Calibrate, correlate, triangulate and compute strain, with nothing to click."""
+    from ringdic.session.folder import open_session
+    from ringdic.settings import load_settings
+
+    chosen = load_settings(settings, set_ or [])
+    from ringdic.jobs.pipeline import process_session  # takes a while: what was typed is checked first
+
+    executor = None
+    if cluster is not None:
+        from ringdic.jobs.cluster import ClusterExecutor
+
+        executor = ClusterExecutor(cluster)
+        session = open_session(session.resolve()).path  # the workers' working folders are others
+    with narrated() as report:
+        if executor is not None:
+            report(Progress("prepare", 0.0, f"asking the workers of {cluster}"))
+            executor.check(session)
+        run = process_session(session, chosen, report, executor)
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    if as_json:
+        print_json({"run": str(run), **summary})
+    else:
+        show_table(f"{session}: results in {run}", summary["table"])
+
+
+def correlate_command(
+    ref: Annotated[Path, typer.Argument(metavar="REF", help="Reference image.")],
+    cur: Annotated[Path, typer.Argument(metavar="CUR", help="Current image.")],
+    out: Annotated[Path, typer.Option(help="Where the points go (npz).")],
+    mask: Annotated[Path | None, typer.Option(help="Region of interest: an image, not 0 inside.")] = None,
+    radius: Annotated[int, typer.Option(min=2, max=500, help="Subset radius, px.")] = 20,
+    step: Annotated[int, typer.Option(min=1, help="Grid step, px.")] = 10,
+    order: Annotated[int, typer.Option(min=1, max=2, help="Order of the shape function.")] = 1,
+    subset: Annotated[str, typer.Option(help="circle or square.")] = "circle",
+    threads: Annotated[int | None, typer.Option(min=1, help="Threads; all cores unless given.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """2D correlation of one pair of images."""
+    from ringdic.correlation.command import correlate_files
+    from ringdic.correlation.settings import CorrelationSettings
+
+    settings = CorrelationSettings(radius=radius, step=step, order=order, subset=subset)
+    summary = correlate_files(ref, cur, out, settings, mask=mask, threads=threads)
+    if as_json:
+        print_json(summary)
+    else:
+        say(f"{summary['good']} of {summary['points']} points matched, written to {out}")
+
+
+def export_command(
+    session: Session,
+    format_: Annotated[str, typer.Option("--format", help="npz, vtkhdf, vtp, mat, csv, ply or glb.")] = "npz",
+    out: Annotated[Path | None, typer.Option(help="Where to; beside the results unless given.")] = None,
+    reference: Reference = "first",
+    without_rigid_motion: WithoutRigidMotion = False,
+    window: Window = None,
+    seth_hill: SethHill = None,
+    colour: Annotated[str | None, typer.Option(help="Field that ply and glb are coloured by.")] = None,
+    run: Run = None,
+    as_json: AsJson = False,
+) -> None:
+    """Results in another program's form, evaluated anew from their positions."""
+    from ringdic.export import export as export_session
+    from ringdic.results.evaluation import Evaluation
+
+    how = Evaluation.of(reference, without_rigid_motion, window, seth_hill)
+    written = export_session(session, format_, out, how, colour, run)
+    if as_json:
+        print_json({"written": str(written)})
+    else:
+        say(f"written {written}")

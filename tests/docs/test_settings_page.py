@@ -1,0 +1,20 @@
+"""The settings page has every setting with its default, and no other."""
+
+import re
+import tomllib
+from collections.abc import Callable
+
+from ringdic.settings import Settings
+
+
+def test_the_table_is_that_of_the_program(table: Callable[[str, str], list[list[str]]]) -> None:
+    shown: dict[str, object] = {}
+    for names, default, _ in table("settings.md", "Settings of the processing"):
+        keys = re.findall(r"`([\w.]+)`", names)
+        group = keys[0].partition(".")[0]
+        values = [tomllib.loads(f"x = {value.strip('`')}")["x"] for value in default.split(", ")]
+        values *= len(keys) if len(values) == 1 else 1
+        for key, value in zip(keys, values, strict=True):
+            shown[key if "." in key else f"{group}.{key}"] = value
+    defaults = Settings().model_dump()
+    assert shown == {f"{group}.{name}": value for group, values in defaults.items() for name, value in values.items()}
