@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ringdic_controller.rig import capture as round_
-from ringdic_controller.rig.capture import MS, SECOND, CaptureRound, Timing, judge
+from ringdic_controller.rig.capture import MS, SECOND, CaptureRound, Timing
+from ringdic_controller.rig.judgement import judge
 from ringdic_node import agent as node_
 from ringdic_node.agent import Agent
 from ringdic_node.clock import Instant
