@@ -204,7 +204,7 @@ class CameraOutcome:
         if self.status not in ("pending", "ok", "failed"):
             raise ValueError(f"no such outcome: {self.status!r}")
         if self.status == "failed" and not self.reason:
-            raise ValueError("a failed outcome must tell the reason")
+            raise ValueError("a failed outcome must have a reason")
 
 
 class CaptureRound:
