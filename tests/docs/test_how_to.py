@@ -7,9 +7,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from ringdic.results.evaluation import evaluated
+from ringdic.session.images import read_gray
 
 
 def python(page: Path) -> list[str]:
@@ -53,7 +55,7 @@ def workplace(tutorial: Any, tmp_path: Path) -> Path:
     shutil.copytree(tutorial.session, tmp_path / "sessions" / "first")
     for name, step in (("reference", "00"), ("current", "01")):
         image = tutorial.folder / "images" / "specimen" / "cam_02" / f"{step}.pgm"
-        shutil.copyfile(image, tmp_path / f"{name}.png")  # images are told apart by their contents
+        assert cv2.imwrite(str(tmp_path / f"{name}.png"), read_gray(image))
     return tmp_path
 
 
