@@ -43,13 +43,13 @@ from ringdic.correlation.interpolation import (
 from ringdic.correlation.lanes import (
     BITS,
     LANES,
+    blend,
     floor,
     lane_sum,
     load,
     mask_from_bits,
     pointer,
     ramp,
-    select,
     store,
     store_integers,
 )
@@ -115,13 +115,13 @@ def _locate_vectors(fx, fy, p, corner, n, place, cell):  # type: ignore[no-untyp
         x_far, y_far = far * (sx + far * qx) + x, far * (sy + far * qy) + y
         j, i = floor(_minimum(x, x_far) - bend_x), floor(_minimum(y, y_far) - bend_y)
         wide, high = floor(maximum(x, x_far) + bend_x) - j, floor(maximum(y, y_far) + bend_y) - i
-        window = select(
+        window = blend(
             maximum(x, x_far + far) + bend_x - j >= kind(REACH_OF_WINDOW), kind(SCATTERED), high + kind(WIDE)
         )
         store_integers(number, v, j + dx)
         store_integers(number, v + step, i + dy)
         near = wide * kind(ACROSS_X) + high * kind(ACROSS_Y)
-        store_integers(number, v + step + step, select(maximum(wide, high) >= one + one, window, near))
+        store_integers(number, v + step + step, blend(maximum(wide, high) >= one + one, window, near))
         store(shape, v, x - j)
         store(shape, v + step, sx)
         store(shape, v + step + step, y - i)
@@ -131,7 +131,7 @@ def _locate_vectors(fx, fy, p, corner, n, place, cell):  # type: ignore[no-untyp
 @nb.njit(forceinline=True, fastmath=FAST)
 def _minimum(one, other):  # type: ignore[no-untyped-def]
     """The smaller of two vectors, lane by lane."""
-    return select(one >= other, other, one)
+    return blend(one >= other, other, one)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -203,7 +203,7 @@ def _make_pass(quintic: bool, second: bool) -> Any:
                 p = _U(origin + np.int64(cell[1, v]) * np.int64(stride) + np.int64(cell[0, v]))
                 tx, sx, ty, sy = place[0, v], place[1, v], place[2, v], place[3, v]
                 g = interpolate(c, p, stride, cell[2, v], tx, sx, qx, ty, sy, qy, spare)
-                g = select(mask_from_bits(bits[v]), g - level, _F(0))
+                g = blend(mask_from_bits(bits[v]), g - level, _F(0))
                 sg += g
                 sgg += g * g
                 sfg += g * load(ref, at)

@@ -22,6 +22,7 @@ from ringdic.correlation.lanes import (
     BITS,
     LANES,
     bit_count,
+    blend,
     lane_sum,
     load,
     load_one,
@@ -29,7 +30,6 @@ from ringdic.correlation.lanes import (
     nonzero_bits,
     pointer,
     ramp,
-    select,
     store,
     store_one,
 )
@@ -119,9 +119,9 @@ def pack(  # type: ignore[no-untyped-def]
             here_f, here_x, here_y = value_and_gradient(c, first, stride, tx, ty, quintic)
         else:
             here_f, here_x, here_y = load(f, at), load(fx, at), load(fy, at)
-        store(f, at, select(w, here_f - level, _F(0)))
-        store(fx, at, select(w, here_x, _F(0)))
-        store(fy, at, select(w, here_y, _F(0)))
+        store(f, at, blend(w, here_f - level, _F(0)))
+        store(fx, at, blend(w, here_x, _F(0)))
+        store(fy, at, blend(w, here_y, _F(0)))
 
 
 @nb.njit(fastmath=FAST, nogil=True, cache=True)
@@ -137,9 +137,9 @@ def pack_interior(image, gx, gy, mask, at_centre, offset, level, uncut, px, bits
         at, begin = v * _L, _U(at_centre + offset[v])
         inside_bits = uncut[v] & nonzero_bits(region, begin)
         bits[v], w = inside_bits, mask_from_bits(inside_bits)
-        store(f, at, select(w, load(source, begin) - level, _F(0)))
-        store(fx, at, select(w, load(slope_x, begin), _F(0)))
-        store(fy, at, select(w, load(slope_y, begin), _F(0)))
+        store(f, at, blend(w, load(source, begin) - level, _F(0)))
+        store(fx, at, blend(w, load(slope_x, begin), _F(0)))
+        store(fy, at, blend(w, load(slope_y, begin), _F(0)))
 
 
 @nb.njit(forceinline=True)
@@ -261,8 +261,8 @@ def _make_moments(second: bool, direct: bool) -> Any:
                     begin = _U(at_centre + offset[v])
                     inside_bits = uncut[v] & nonzero_bits(region, begin)
                     bits[v], w = inside_bits, mask_from_bits(inside_bits)
-                    f, fx = select(w, load(source, begin) - level, _F(0)), select(w, load(slope_x, begin), _F(0))
-                    fy = select(w, load(slope_y, begin), _F(0))
+                    f, fx = blend(w, load(source, begin) - level, _F(0)), blend(w, load(slope_x, begin), _F(0))
+                    fy = blend(w, load(slope_y, begin), _F(0))
                     store(ref, at, f)
                     store(ref_x, at, fx)
                     store(ref_y, at, fy)

@@ -11,14 +11,14 @@ from ringdic.correlation.lanes import (
     WINDOW,
     absolute,
     bit_count,
+    blend,
     floor,
-    gather,
     lane_sum,
     load,
+    lookup,
     mask_from_bits,
     nonzero_bits,
     pointer,
-    select,
     store,
 )
 from ringdic.correlation.spline import PAD, coefficients
@@ -84,14 +84,14 @@ def test_levels_are_those_of_the_spline_for_any_slope(degree):
 def _arithmetic(a, b, bits, out):
     x, y, at = load(pointer(a), _U(0)), load(pointer(b), _U(0)), pointer(out)
     store(at, _U(0), 2.0 * x - y * x + 1.0)
-    store(at, _U(LANES), select(x >= y, floor(x), absolute(y)))
-    store(at, _U(2 * LANES), select(mask_from_bits(bits), x, 0.0))
+    store(at, _U(LANES), blend(x >= y, floor(x), absolute(y)))
+    store(at, _U(2 * LANES), blend(mask_from_bits(bits), x, 0.0))
     return lane_sum(x)
 
 
 @nb.njit
 def _pick(a, which, out):
-    store(pointer(out), _U(0), gather(pointer(a), _U(3), load(pointer(which), _U(0))))
+    store(pointer(out), _U(0), lookup(pointer(a), _U(3), load(pointer(which), _U(0))))
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
