@@ -18,7 +18,7 @@ Precision. With float32 images, fractions of pixels resolve 1e-7 px; f and g are
 lanes are summed in single precision over a strip of the subset, everything after that in double. With float64 images
 all of it is double.
 
-The page ``docs/correlation_kernels.md`` says why it is built so and what each part gains.
+The page ``docs/pages/kernels.md`` says why it is built so and what each part gains.
 """
 
 # Numba's cache follows the file of the compiled function alone: after a change in what it imports, remove __pycache__.
