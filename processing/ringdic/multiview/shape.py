@@ -97,7 +97,10 @@ class ReferenceShape:
     match_count: int
 
     def arrays(self) -> dict[str, NDArray]:
-        """Arrays of the shape by name, of any shape and unit as listed for the class, as a task's output holds them."""
+        """Arrays of the shape by name, as a task's output holds them.
+
+        Shapes and units are those of the class: (n, ...) mm or px for the points, (M, 3) indices for the faces.
+        """
         lattice = self.pieces.lattice
         parts = {
             "lattice": np.array([lattice.radius, lattice.columns, *lattice.z]),
@@ -111,7 +114,10 @@ class ReferenceShape:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray]) -> ReferenceShape:
-        """Shape from the arrays, (...) of any unit, that :meth:`arrays` gave."""
+        """Shape from its arrays by name.
+
+        arrays : as from :meth:`arrays`, (n, ...) mm or px for the points, (M, 3) indices for the faces.
+        """
         radius, columns, *z = arrays["lattice"].tolist()
         lattice = SurfaceLattice(radius, int(columns), np.array(z))
         textures = tuple(

@@ -92,9 +92,10 @@ def match_tracked_points(
     ----------
     reference, current : the two images, filtered.
     points : n points of the reference image.
-    start : (n, 12) float64, warps at the points, NaN rows where unknown; None: start values are sought in the images.
+    start : (n, 12) float64, warps at the points in px and its powers, NaN rows where unknown; None: start values are
+        sought in the images.
     settings : of the correlation; order 2 with ``two_pass`` False leaves the second derivatives to each subset.
-    two_pass : second derivatives of the neighbours' displacement are held fixed in a second, first-order pass.
+    two_pass : whether second derivatives of the neighbours' displacement are held fixed in a second, first-order pass.
     search : whether start values are sought in the images where too few of those given hold.
     """
     start_at_pixels = None if start is None else shift_warps(start, points.shift)

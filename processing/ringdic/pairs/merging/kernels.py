@@ -1,4 +1,4 @@
-"""The loops of the overlap's removal that go from triangle to triangle, compiled."""
+"""Loops of the overlap's removal that go from triangle to triangle, compiled."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from ringdic.mesh.nearest import near
 
 @nb.njit(cache=True, nogil=True)
 def peel_triangles(start, rival, beside, living, bad):  # type: ignore[no-untyped-def]
-    """Take border triangles with living rivals away, the worst first, until none is left that a border reaches.
+    """Remove border triangles that have living rivals, the worst first, until the border reaches no more of them.
 
-    start (M + 1,), rival : the competitors of each triangle in one row. beside : (M, 3), -1 at a border.
-    living : (M,) bool, changed in place. bad : (M,).
+    start : (M + 1,), where the rivals of each triangle begin in ``rival``. rival : (R,), triangles. beside : (M, 3),
+    the neighbours of each triangle, -1 at a border. living : (M,) bool, changed in place. bad : (M,), the worse the
+    larger.
     """
     left = np.zeros(len(living), np.int64)
     queue = [(0.0, 0) for _ in range(0)]
@@ -47,9 +48,12 @@ def peel_triangles(start, rival, beside, living, bad):  # type: ignore[no-untype
 
 @nb.njit(cache=True, nogil=True)
 def regrow_triangles(start, rival, beside, living, wanted, bad):  # type: ignore[no-untyped-def]
-    """Put wanted triangles (M,) without living rivals back beside living ones; most neighbours first, then the best.
+    """Put wanted triangles without living rivals back beside living ones; those with most neighbours first, then the
+    best.
 
-    The other arguments are those of ``peel``.
+    start : (M + 1,), where the rivals of each triangle begin in ``rival``. rival : (R,), triangles. beside : (M, 3),
+    the neighbours of each triangle, -1 at a border. living : (M,) bool, changed in place. wanted : (M,) bool. bad :
+    (M,), the worse the larger.
     """
     queue = [(0, 0.0, 0) for _ in range(0)]
     for f in range(len(living)):
@@ -74,7 +78,7 @@ def regrow_triangles(start, rival, beside, living, wanted, bad):  # type: ignore
 
 @nb.njit(cache=True, nogil=True)
 def _count(beside, living, f):  # type: ignore[no-untyped-def]
-    """Living neighbours of a triangle."""
+    """Number of living neighbours of triangle f."""
     count = 0
     for g in beside[f]:
         if g >= 0 and living[g]:
@@ -84,11 +88,13 @@ def _count(beside, living, f):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def closer(middles, inside, owner, normals, corners, radius, usual, gap, reach, same_side, first, last):  # type: ignore[no-untyped-def]
-    """Pairs (P, 2) of triangles of different surfaces that lie over one another or within ``gap`` mm beside.
+    """Pairs (P, 2) of triangles of different surfaces that lie over one another or within a gap beside one another.
 
-    middles : centroids (M, 3) in cubes. inside : (M,) triangles of usual size that have no other surface near. radius :
-    (M,) mm, from centroid to farthest corner; usual : mm, of most. first, last : of which triangles in the order of the
-    cubes pairs are sought.
+    middles : centroids (M, 3) mm sorted into cubes. inside : (M,) bool, triangles of usual size that have no other
+    surface near. owner : (M,), surface of each triangle. normals : (M, 3). corners : (M, 3, 3) mm. radius : (M,) mm,
+    from centroid to farthest corner; usual : mm, that of most triangles at the most. gap : mm, beside. reach : mm,
+    along the normal. same_side : least cosine between the normals of two layers of one surface. first, last : range
+    of the triangles, in the order of the cubes, whose rivals are sought.
     """
     M, widest = len(radius), radius.max()
     found, apart = np.empty(M, np.int64), np.empty(M)
@@ -117,7 +123,7 @@ def closer(middles, inside, owner, normals, corners, radius, usual, gap, reach, 
 
 @nb.njit(cache=True, nogil=True)
 def _close(a, b, at_a, at_b, normals, corners, radius, gap, reach, same_side):  # type: ignore[no-untyped-def]
-    """Whether two triangles lie over one another or within ``gap`` beside. at_a, at_b : (3,) mm, their middles."""
+    """Whether two triangles lie over one another or within ``gap`` beside. at_a, at_b : (3,) mm, their centroids."""
     cosine = normals[a, 0] * normals[b, 0] + normals[a, 1] * normals[b, 1] + normals[a, 2] * normals[b, 2]
     if not cosine > same_side:
         return False
@@ -134,7 +140,7 @@ def _close(a, b, at_a, at_b, normals, corners, radius, gap, reach, same_side):  
 
 @nb.njit(cache=True, nogil=True)
 def _separation(one, two, nx, ny, nz):  # type: ignore[no-untyped-def]
-    """Widest gap of triangle two (3, 3) beyond the edges of triangle one, seen along a normal."""
+    """Widest gap of triangle two (3, 3) beyond the edges of triangle one (3, 3), mm, seen along a normal."""
     widest = -np.inf
     for k in range(3):
         m = (k + 1) % 3
@@ -151,7 +157,10 @@ def _separation(one, two, nx, ny, nz):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def rivals(M, competing):  # type: ignore[no-untyped-def]
-    """For each of M triangles, where its competitors begin (M + 1) in a row of all of them. competing : (P, 2)."""
+    """Lists of the rivals of each triangle in one row.
+
+    M : number of triangles. competing : (P, 2), pairs of rivals. Returns where each list begins (M + 1,), and the row.
+    """
     start = np.zeros(M + 1, np.int64)
     for first, second in competing:
         start[first + 1] += 1
@@ -168,7 +177,11 @@ def rivals(M, competing):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def smoothed(values, known, beside, rounds):  # type: ignore[no-untyped-def]
-    """Values (M,) averaged with those of the neighbours that are known, round by round; 0 where nothing is."""
+    """Average values over neighbouring triangles, several rounds.
+
+    values : (M,). known : (M,) bool, triangles whose value counts. beside : (M, 3), the neighbours of each triangle,
+    -1 at a border. rounds : how often. Returns (M,), 0 where no value is near.
+    """
     total, weight = np.where(known, values, 0.0), known.astype(np.float64)
     for _ in range(rounds):
         old_total, old_weight = total.copy(), weight.copy()
