@@ -81,12 +81,12 @@ class StepMatches:
 
 
 def match_reference(stereo: Stereo, first: Image, second: Image, mask: Mask | None) -> tuple[PairGrid, StepMatches]:
-    """Determine the region of interest of a pair, lay the grid over it, and match the grid's points between the
-    cameras.
+    """Determine a pair's region of interest, lay the grid over it, and match its points between the cameras.
 
     first, second : (height, width) grey levels, the cameras' reference images. mask : (height, width) bool, a region
-    drawn by the user; None: the region is determined by a sweep. Raises ComputationError where the cameras share no
-    textured surface.
+    drawn by the user; None: the region is determined by a sweep.
+
+    Raises ComputationError where the cameras share no textured surface.
     """
     settings = stereo.settings
     current = prepare_current(second, settings=settings)

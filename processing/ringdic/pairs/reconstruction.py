@@ -59,8 +59,7 @@ class PairStep:
 
 @dataclass(frozen=True)
 class PairShape:
-    """Surface of a pair at the reference, and what its later steps are computed from: n matches, N vertices, M
-    triangles.
+    """Surface of a pair at the reference: n matches, N vertices, M triangles, and what later steps are computed from.
 
     xy : (n, 2) px, the grid. rows : (N,) int, the matches that are vertices. faces : (M, 3) int, normals outwards.
     reference : the step of the reference. neighbours : (n, 4, 2) int, of the matches on the grid, from
@@ -95,13 +94,13 @@ class PairShape:
         # The second camera's pixel rests on the match between the cameras and on that in time. The noise of its
         # reference image enters both with opposite signs and cancels, so the larger deviation of the two holds.
         scatter = np.fmax(self.scatter, matches.sigma)
-        xyz, sigma, status, drift = _triangulated(self.cameras, matches, scatter, self.sigma_max_px)
+        xyz, sigma, status, drift = _triangulate_step(self.cameras, matches, scatter, self.sigma_max_px)
         _drop(surface_outliers(self.neighbours, xyz - self.xyz), xyz, status)
         # A point without a reference cannot be tracked.
         unknown = np.isnan(self.xyz).any(axis=1) & (status == 0)
         status[unknown] = self.reference.status[unknown]
         xyz[unknown] = np.nan
-        return _of_rows(self.rows, xyz, sigma, status, matches, drift)
+        return _step_of_rows(self.rows, xyz, sigma, status, matches, drift)
 
 
 def pair_shape(
@@ -112,11 +111,11 @@ def pair_shape(
     step_px: int,
     sigma_max_px: float,
 ) -> PairShape:
-    """Triangulate a pair's reference matches, drop those that cannot be right in space, and lay triangles between the
-    rest.
+    """Triangulate a pair's reference matches, drop those that cannot be right in space, and lay triangles between them.
 
     Parameters
     ----------
+    cameras : of the pair.
     xy : (n, 2) float64, px, the grid in the first camera's image.
     faces : (m, 3) int, triangles over the grid.
     matches : at the reference.
@@ -124,17 +123,17 @@ def pair_shape(
     sigma_max_px : greatest standard deviation of a match that is believed.
     """
     neighbours = grid_neighbours(xy, step_px)
-    xyz, sigma, status, drift = _triangulated(cameras, matches, matches.sigma, sigma_max_px)
+    xyz, sigma, status, drift = _triangulate_step(cameras, matches, matches.sigma, sigma_max_px)
     _drop(surface_outliers(neighbours, xyz), xyz, status)
-    whole = _whole_faces(xyz, faces, cameras)
+    whole = _faces_without_steps(xyz, faces, cameras)
     rows = np.unique(whole)
-    reference = _of_rows(rows, xyz, sigma, status, matches, drift)
+    reference = _step_of_rows(rows, xyz, sigma, status, matches, drift)
     return PairShape(
         cameras, xy, rows, np.searchsorted(rows, whole), reference, neighbours, xyz, matches.sigma, sigma_max_px
     )
 
 
-def _triangulated(
+def _triangulate_step(
     cameras: tuple[Camera, Camera], matches: PairMatches, scatter: NDArray[Any], sigma_max_px: float
 ) -> tuple[Floats, Floats, NDArray[np.int8], float]:
     """Triangulate the matches of a step.
@@ -162,7 +161,7 @@ def _drop(lost: Mask, xyz: Points, status: NDArray[np.int8], why: LostPoint = Lo
     xyz[lost] = np.nan
 
 
-def _of_rows(
+def _step_of_rows(
     rows: Indices, xyz: Points, sigma: Floats, status: NDArray[np.int8], matches: PairMatches, drift: float
 ) -> PairStep:
     """Step of a pair's surface, whose vertices are the rows (N,) of the matches."""
@@ -172,7 +171,7 @@ def _of_rows(
     return PairStep(xyz[rows], correlation, scatter, status, drift)
 
 
-def _whole_faces(xyz: Points, faces: NDArray[np.int32], cameras: Sequence[Camera]) -> Indices:
+def _faces_without_steps(xyz: Points, faces: NDArray[np.int32], cameras: Sequence[Camera]) -> Indices:
     """Triangles (M, 3) between measured points, turned towards the cameras, without those across a step in depth.
 
     A triangle whose longest edge is far longer than is usual on the grid joins two surfaces.

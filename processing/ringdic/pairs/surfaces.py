@@ -109,7 +109,7 @@ def pairs_surface(
         return series, {"heuristic": heuristic, **_agreement(beside, distances)}
     merged = merging(pairs, heuristic)
     figures = {"heuristic": heuristic, "removed": len(merged.removed), "added": merged.added}
-    series = PairsSeries(names, _of_merged(beside, merged), tuple(pairs), merged.vertex)
+    series = PairsSeries(names, _over_merged_vertices(beside, merged), tuple(pairs), merged.vertex)
     return series, {**figures, **_agreement(beside, merged.mismatch)}
 
 
@@ -215,7 +215,7 @@ def _at_reference(pair: PairSurface, offset: int) -> Matches:
     )
 
 
-def _of_merged(results: Results, merged: MergedSurface) -> Results:
+def _over_merged_vertices(results: Results, merged: MergedSurface) -> Results:
     """Results over the vertices of the merged surface alone; a match whose point was taken out has no vertex."""
     used = merged.vertex
     number = np.full(len(results.vertices_ref) + 1, -1, dtype=np.int64)  # the last one for what has no vertex

@@ -167,13 +167,13 @@ def camera_task(
     is_first : whether it is the first camera of each pair whose output is in ``inputs``. reference, image : files.
     Returns the arrays of the matches, and "points", the number of points.
     """
-    grid, prepared = _prepared(camera, settings, is_first, reference, inputs)
+    grid, prepared = _grid_and_reference(camera, settings, is_first, reference, inputs)
     matches = match_camera(prepared, step_image(image, camera), grid, settings)
     arrays = {name: getattr(matches, name) for name in _MATCHES}
     return {**arrays, "step": np.array(matches.step), "points": np.array(len(grid.xy))}
 
 
-def _prepared(
+def _grid_and_reference(
     camera: Camera, settings: CorrelationSettings, is_first: tuple[bool, ...], image: Path, pairs: tuple[Path, ...]
 ) -> tuple[CameraGrid, Reference]:
     """Grid of a camera and its prepared reference image, kept in memory for all its steps."""

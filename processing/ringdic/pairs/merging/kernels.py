@@ -13,11 +13,11 @@ from ringdic.mesh.nearest import near
 
 @nb.njit(cache=True, nogil=True)
 def peel_triangles(start, rival, beside, living, bad):  # type: ignore[no-untyped-def]
-    """Remove border triangles that have living rivals, the worst first, until the border reaches no more of them.
+    """Remove border triangles that compete with remaining ones, the worst first, as long as the border reaches any.
 
-    start : (M + 1,), where the rivals of each triangle begin in ``rival``. rival : (R,), triangles. beside : (M, 3),
-    the neighbours of each triangle, -1 at a border. living : (M,) bool, changed in place. bad : (M,), the worse the
-    larger.
+    start : (M + 1,), where the rivals of each triangle, those it competes with, begin in ``rival``. rival : (R,),
+    triangles. beside : (M, 3), the neighbours of each triangle, -1 at a border. living : (M,) bool, triangles that
+    remain, changed in place. bad : (M,), the larger the worse.
     """
     left = np.zeros(len(living), np.int64)
     queue = [(0.0, 0) for _ in range(0)]
@@ -48,12 +48,12 @@ def peel_triangles(start, rival, beside, living, bad):  # type: ignore[no-untype
 
 @nb.njit(cache=True, nogil=True)
 def regrow_triangles(start, rival, beside, living, wanted, bad):  # type: ignore[no-untyped-def]
-    """Put wanted triangles without living rivals back beside living ones; those with most neighbours first, then the
-    best.
+    """Put removed triangles back where none that they compete with remains, beside remaining ones of their surface.
 
-    start : (M + 1,), where the rivals of each triangle begin in ``rival``. rival : (R,), triangles. beside : (M, 3),
-    the neighbours of each triangle, -1 at a border. living : (M,) bool, changed in place. wanted : (M,) bool. bad :
-    (M,), the worse the larger.
+    Those with most remaining neighbours come first, of these the best. start : (M + 1,), where the rivals of each
+    triangle, those it competes with, begin in ``rival``. rival : (R,), triangles. beside : (M, 3), the neighbours of
+    each triangle, -1 at a border. living : (M,) bool, triangles that remain, changed in place. wanted : (M,) bool,
+    triangles that may come back. bad : (M,), the larger the worse.
     """
     queue = [(0, 0.0, 0) for _ in range(0)]
     for f in range(len(living)):
@@ -78,7 +78,7 @@ def regrow_triangles(start, rival, beside, living, wanted, bad):  # type: ignore
 
 @nb.njit(cache=True, nogil=True)
 def _count(beside, living, f):  # type: ignore[no-untyped-def]
-    """Number of living neighbours of triangle f."""
+    """Number of remaining neighbours of triangle f."""
     count = 0
     for g in beside[f]:
         if g >= 0 and living[g]:
@@ -90,14 +90,14 @@ def _count(beside, living, f):  # type: ignore[no-untyped-def]
 def closer(middles, inside, owner, normals, corners, radius, usual, gap, reach, same_side, first, last):  # type: ignore[no-untyped-def]
     """Pairs (P, 2) of triangles of different surfaces that lie over one another or within a gap beside one another.
 
-    middles : centroids (M, 3) mm sorted into cubes. inside : (M,) bool, triangles of usual size that have no other
+    middles : centroids (M, 3) mm sorted into cubes. inside : (M,) bool, triangles that are not large and have no other
     surface near. owner : (M,), surface of each triangle. normals : (M, 3). corners : (M, 3, 3) mm. radius : (M,) mm,
-    from centroid to farthest corner; usual : mm, that of most triangles at the most. gap : mm, beside. reach : mm,
-    along the normal. same_side : least cosine between the normals of two layers of one surface. first, last : range
-    of the triangles, in the order of the cubes, whose rivals are sought.
+    from centroid to farthest corner. usual : mm, radius beyond which a triangle is large. gap : mm, beside. reach :
+    mm, along the normal. same_side : least cosine between the normals of two layers of one surface. first, last :
+    range of the triangles, in the order of the cubes, whose rivals are sought.
     """
     M, widest = len(radius), radius.max()
-    found, apart = np.empty(M, np.int64), np.empty(M)
+    nearby, distance = np.empty(M, np.int64), np.empty(M)
     pairs, count = np.empty((last - first + 1, 2), np.int64), 0
     common = math.hypot(2 * usual + gap, reach)
     for k in range(first, last):
@@ -106,13 +106,13 @@ def closer(middles, inside, owner, normals, corners, radius, usual, gap, reach, 
         if inside[a] and not large:
             continue
         within = math.hypot(radius[a] + widest + gap, reach) if large else common
-        for m in range(near(middles, x[0], x[1], x[2], within, found, apart)):
-            b = middles.order[found[m]]
+        for m in range(near(middles, x[0], x[1], x[2], within, nearby, distance)):
+            b = middles.order[nearby[m]]
             if owner[a] == owner[b]:
                 continue
             if b < a if (radius[b] > usual) == large else not large:  # every pair once, from the larger triangle
                 continue
-            if not _close(a, b, middles.at[k], middles.at[found[m]], normals, corners, radius, gap, reach, same_side):
+            if not _close(a, b, middles.at[k], middles.at[nearby[m]], normals, corners, radius, gap, reach, same_side):
                 continue
             if count == len(pairs):
                 pairs = np.concatenate((pairs, np.empty_like(pairs)))
@@ -157,9 +157,10 @@ def _separation(one, two, nx, ny, nz):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def rivals(M, competing):  # type: ignore[no-untyped-def]
-    """Lists of the rivals of each triangle in one row.
+    """Collect for each triangle those it competes with, list after list in one array.
 
-    M : number of triangles. competing : (P, 2), pairs of rivals. Returns where each list begins (M + 1,), and the row.
+    M : number of triangles. competing : (P, 2), pairs of triangles. Returns where each list begins (M + 1,), and the
+    array.
     """
     start = np.zeros(M + 1, np.int64)
     for first, second in competing:
@@ -176,11 +177,11 @@ def rivals(M, competing):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def smoothed(values, known, beside, rounds):  # type: ignore[no-untyped-def]
-    """Average values over neighbouring triangles, several rounds.
+def smooth_over_neighbours(values, known, beside, rounds):  # type: ignore[no-untyped-def]
+    """Average values over neighbouring triangles, in several rounds.
 
     values : (M,). known : (M,) bool, triangles whose value counts. beside : (M, 3), the neighbours of each triangle,
-    -1 at a border. rounds : how often. Returns (M,), 0 where no value is near.
+    -1 at a border. rounds : their number. Returns (M,), 0 where no value is near.
     """
     total, weight = np.where(known, values, 0.0), known.astype(np.float64)
     for _ in range(rounds):

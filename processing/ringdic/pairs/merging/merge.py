@@ -1,6 +1,4 @@
-"""Merging of several surfaces into one: overlaps removed, gaps stitched, small holes filled, no vertex
-added or moved.
-"""
+"""Merging of several surfaces into one without new vertices: overlaps removed, gaps stitched, small holes filled."""
 
 from __future__ import annotations
 
@@ -115,7 +113,7 @@ def merge(
     chosen = HEURISTICS[heuristic] if weights is None else weights
     if unknown := set(chosen) - set(MEASURES):
         raise ValueError(f"no measure '{unknown.pop()}'; there are {', '.join(MEASURES)}")
-    mesh, owner, correlation = _concatenated(parts)
+    mesh, owner, correlation = _concatenate(parts)
     if not len(mesh.faces):
         return MergedSurface(mesh.faces, owner, np.zeros(0, np.int64), np.zeros(0, np.int64), 0, ())
     edge = Seam.mean_edge(parts)
@@ -123,12 +121,14 @@ def merge(
     with ThreadPoolExecutor(1) as pool:  # the mismatches while the rest runs
         distances = pool.submit(mismatches, parts, seam.layers * edge)
         living = _without_overlap(mesh, owner, overlap, seam.gap * edge, seam.layers * edge)
-        faces, pair, added = _with_gaps_closed(mesh, mesh.faces[living], owner, parts, seam, edge)
+        faces, pair, added = _close_gaps(mesh, mesh.faces[living], owner, parts, seam, edge)
         return MergedSurface(faces, pair, np.unique(faces), np.flatnonzero(~living), added, distances.result())
 
 
-def _concatenated(parts: Sequence[SurfacePart]) -> tuple[Mesh, Indices, Floats]:
-    """All parts as one mesh, each triangle's part (M,) and its largest correlation coefficient (M,), NaN if lost."""
+def _concatenate(parts: Sequence[SurfacePart]) -> tuple[Mesh, Indices, Floats]:
+    """All parts as one mesh, with the part and the largest correlation coefficient, NaN if lost, of each
+    triangle (M,).
+    """
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=False)]
     mesh = Mesh(
@@ -207,7 +207,7 @@ def _tidy(mesh: Mesh, living: Mask) -> Mask:
         at = at[left]
 
 
-def _with_gaps_closed(
+def _close_gaps(
     mesh: Mesh, triangles: Indices, owner: Indices, parts: Sequence[SurfacePart], seam: Seam, edge: float
 ) -> tuple[Indices, Indices, int]:
     """Stitch the gaps between the parts and fill the holes.

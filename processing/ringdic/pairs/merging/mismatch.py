@@ -68,9 +68,9 @@ def mismatches(surfaces: Sequence[Surface], reach: float, fewest: int = 20) -> t
 
 
 class CurvedSurface:
-    """A surface that is curved between its vertices as their normals say: exactly for one of the second degree.
+    """A mesh whose triangles are curved according to the vertex normals, exact for a surface of the second degree.
 
-    The centre of a flat triangle lies below a convex body by edge²/8R, which is no mismatch of two surfaces. The
+    The middle of a flat triangle lies below a convex body by edge²/8R, which is no mismatch of two surfaces. The
     curvature added is half of that of Phong tessellation (Boubekeur and Alexa 2008). reach : mm, greatest distance
     of a point.
     """
@@ -80,7 +80,7 @@ class CurvedSurface:
         before, alone = shared_edges(half)
         self.mesh = mesh
         self.used = np.unique(mesh.faces)
-        self.normals = _averaged(np.nan_to_num(mesh.vertex_normals), half, before)
+        self.normals = _average_normals(np.nan_to_num(mesh.vertex_normals), half, before)
         self._projector = Projector(mesh, reach)
         on_border = np.zeros(len(mesh.vertices), bool)
         on_border[half[alone]] = True
@@ -133,7 +133,7 @@ def _above(points, directions, corners, weights, height, vertices, normals):  # 
 
 
 @nb.njit(cache=True, nogil=True)
-def _averaged(normals, half, before):  # type: ignore[no-untyped-def]
+def _average_normals(normals, half, before):  # type: ignore[no-untyped-def]
     """Unit normals (N, 3) averaged with those of the neighbours, since measured slopes are noisy.
 
     half, before : directed edges (3M, 2) and what ``shared_edges`` gives for them.

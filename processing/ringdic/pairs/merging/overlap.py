@@ -24,7 +24,7 @@ from ringdic.pairs.merging import kernels
 #: Measures of how bad a triangle is, each relative to its median over the overlaps.
 MEASURES = ("correlation", "distance", "orientation", "margin")
 
-_SMOOTHING = 6  # rounds of averaging over neighbouring triangles: a single triangle's noise does not decide
+_SMOOTHING = 6  # rounds of averaging over neighbouring triangles, so that no single triangle's noise decides
 _PARTS = 16  # into which the triangles are divided among the cores
 _SAME_SIDE = 0.2  # least cosine between the normals of two layers of one surface
 
@@ -73,11 +73,10 @@ def cover(mesh: Mesh, owner: Indices, reach: float) -> Cover:
 
 
 def close_pairs(mesh: Mesh, owner: Indices, gap: float, reach: float) -> Indices:
-    """Pairs of triangles of different surfaces that lie over one another or closer than a gap beside, seen along the
-    normals.
+    """Pairs of triangles of different surfaces that lie over one another or closer than a gap beside one another.
 
-    owner : (M,) int, surface of each triangle. gap : mm, beside. reach : mm, greatest distance of two layers along
-    the mean of the two normals. Returns (P, 2) indices.
+    Both are judged along the mean of the two normals. owner : (M,) int, surface of each triangle. gap : mm, beside.
+    reach : mm, greatest distance of two layers along that mean. Returns (P, 2) indices.
     """
     corners = mesh.vertices[mesh.faces]
     centroids, normals, radius = triangle_spheres(corners)
@@ -102,14 +101,24 @@ def close_pairs(mesh: Mesh, owner: Indices, gap: float, reach: float) -> Indices
 def badness(
     mesh: Mesh, beside: Indices, owner: Indices, covered: Cover, correlation: Floats, weights: Mapping[str, float]
 ) -> Floats:
-    """Weighted sum of the measures of how bad each triangle is, in medians over the overlaps.
+    """Badness of each triangle: weighted sum of measures, each divided by its median over the overlaps.
 
-    The measures are ``correlation``, ``distance`` to the other surfaces, ``orientation``, the angle to the other
-    surfaces' normals, and ``margin``, how near the triangle lies to the border of its own surface, where the cameras
-    saw it at the steepest angles.
+    The measures are ``correlation``, the coefficient C_LS; ``distance`` to the other surfaces; ``orientation``, the
+    angle to the other surfaces' normals; and ``margin``, how near the triangle lies to the border of its own
+    surface, where the cameras saw it at the steepest angles.
 
-    beside : (M, 3) indices of the neighbours of each triangle. owner : (M,) int, its surface. covered : the overlaps.
-    correlation : (M,) C_LS. weights : of the measures. Returns (M,) without unit, the larger the worse.
+    Parameters
+    ----------
+    mesh : all surfaces as one mesh.
+    beside : (M, 3) indices of the neighbours of each triangle.
+    owner : (M,) int, its surface.
+    covered : the overlaps.
+    correlation : (M,) C_LS.
+    weights : of the measures, by name.
+
+    Returns
+    -------
+    (M,) without unit, the larger the worse.
     """
     M = len(mesh.faces)
     hits = np.bincount(covered.own, minlength=M)
@@ -123,13 +132,15 @@ def badness(
     total = np.zeros(M)
     for name, values in measures.items():
         if weights.get(name, 0.0):
-            smooth = kernels.smoothed(values, everywhere if name == "correlation" else hidden, beside, _SMOOTHING)
-            usual = float(np.median(smooth[hidden])) if hidden.any() else 0.0
-            total += weights[name] * smooth / (usual or 1.0)
+            smooth = kernels.smooth_over_neighbours(
+                values, everywhere if name == "correlation" else hidden, beside, _SMOOTHING
+            )
+            median = float(np.median(smooth[hidden])) if hidden.any() else 0.0
+            total += weights[name] * smooth / (median or 1.0)
     if weights.get("margin", 0.0):
         depth = _from_border(mesh, owner)
-        usual = float(np.median(depth[hidden])) if hidden.any() else 0.0
-        total -= weights["margin"] * depth / (usual or 1.0)
+        median = float(np.median(depth[hidden])) if hidden.any() else 0.0
+        total -= weights["margin"] * depth / (median or 1.0)
     return total
 
 
@@ -149,10 +160,10 @@ def _from_border(mesh: Mesh, owner: Indices) -> Floats:
 
 
 def peel(beside: Indices, alive: Mask, competing: Indices, bad: Floats) -> Mask:
-    """Remove border triangles that compete with others left, the worst first.
+    """Remove border triangles that compete with remaining ones, the worst first, until no two compete.
 
     beside : (M, 3) indices of the neighbours of each triangle. alive : (M,) bool, to begin with. competing : (P, 2)
-    indices. bad : (M,), the larger the worse. Returns the triangles left, (M,) bool.
+    indices. bad : (M,), the larger the worse. Returns the triangles that remain, (M,) bool.
     """
     competing = competing[alive[competing].all(axis=1)]
     start, rival = kernels.rivals(len(beside), competing)
@@ -165,12 +176,12 @@ def peel(beside: Indices, alive: Mask, competing: Indices, bad: Floats) -> Mask:
 
 
 def regrow(beside: Indices, alive: Mask, candidate: Mask, competing: Indices, bad: Floats) -> Mask:
-    """Put triangles that compete with none left back beside what is left of their surface.
+    """Put removed triangles that compete with none of the remaining ones back beside those of their own surface.
 
     Those with most neighbours come first, of these the best. beside : (M, 3) indices of the neighbours of each
-    triangle. alive : (M,) bool. candidate : (M,) bool, triangles that may come back. competing : (P, 2) indices,
-    among those alive and the candidates. bad : (M,), the larger the worse. Returns the triangles there then, (M,)
-    bool.
+    triangle. alive : (M,) bool, triangles that remain. candidate : (M,) bool, triangles that may come back.
+    competing : (P, 2) indices, among those alive and the candidates. bad : (M,), the larger the worse. Returns the
+    triangles there then, (M,) bool.
     """
     start, rival = kernels.rivals(len(beside), competing)
     living = alive.copy()

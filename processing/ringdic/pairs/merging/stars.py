@@ -24,45 +24,45 @@ def stars(middles, vertices, at, normals, group, start, onward, back, bridge, sa
     its longest edge. Returns (K, 3), counter-clockwise seen against the normal, the smallest index first.
     """
     N = len(at)
-    found, apart = np.empty(N, np.int64), np.empty(N)
+    nearby, distance = np.empty(N, np.int64), np.empty(N)
     flat, inverse = np.empty((N, 2)), np.empty((N, 2))
-    place = np.full(N, -1)  # in the neighbourhood
+    position = np.full(N, -1)  # in the list of nearby vertices
     result, count = np.empty((2 * len(vertices) + 16, 3), np.int64), 0
     for v in vertices:
         if start[v + 1] - start[v] != 1 or back[v] < 0:
             continue
-        some = near(middles, at[v, 0], at[v, 1], at[v, 2], bridge, found, apart)
-        names, meeting = _facing(v, found[:some], middles.order, normals, group, same_side)
+        count_nearby = near(middles, at[v, 0], at[v, 1], at[v, 2], bridge, nearby, distance)
+        names, meeting = _facing(v, nearby[:count_nearby], middles.order, normals, group, same_side)
         if not meeting or len(names) < 3:
             continue
         across = _tangents(names, normals)
         _spread(across, at, v, names, flat, inverse)
         begin, opening = _gap(across, at, v, back[v], onward[start[v]])
         for i in range(len(names)):
-            place[names[i]] = i
-        ring = delaunay_ring(inverse[: len(names)])
-        for k in range(len(ring)):
-            i, j = ring[k], ring[(k + 1) % len(ring)]
+            position[names[i]] = i
+        neighbours = delaunay_ring(inverse[: len(names)])
+        for k in range(len(neighbours)):
+            i, j = neighbours[k], neighbours[(k + 1) % len(neighbours)]
             b, c = names[i], names[j]
             if back[b] < 0 or back[c] < 0 or not _fits(flat[i], flat[j], begin, opening, thinnest):
                 continue
-            if _crossed(i, place[v], flat, names, place, start, onward):
+            if _crossed(i, position[v], flat, names, position, start, onward):
                 continue
-            if _crossed(j, place[v], flat, names, place, start, onward):
+            if _crossed(j, position[v], flat, names, position, start, onward):
                 continue
             if count == len(result):
                 result = np.concatenate((result, np.empty_like(result)))
             result[count, 0], result[count, 1], result[count, 2] = _from_smallest(v, b, c)
             count += 1
-        place[names] = -1
+        position[names] = -1
     return result[:count]
 
 
 @nb.njit(cache=True, nogil=True)
-def _facing(v, found, order, normals, group, same_side):  # type: ignore[no-untyped-def]
+def _facing(v, nearby, order, normals, group, same_side):  # type: ignore[no-untyped-def]
     """Vertices near v on its side of the body, sorted, and whether several groups meet there."""
-    names, count, meeting = np.empty(len(found), np.int64), 0, False
-    for k in found:
+    names, count, meeting = np.empty(len(nearby), np.int64), 0, False
+    for k in nearby:
         n = order[k]
         cosine = normals[n, 0] * normals[v, 0] + normals[n, 1] * normals[v, 1] + normals[n, 2] * normals[v, 2]
         if cosine > same_side:
@@ -76,8 +76,9 @@ def _facing(v, found, order, normals, group, same_side):  # type: ignore[no-unty
 
 @nb.njit(cache=True, nogil=True)
 def _tangents(names, normals):  # type: ignore[no-untyped-def]
-    """Two unit vectors (2, 3) across the mean normal of vertices, counter-clockwise seen against it (Duff
-    et al. 2017).
+    """Two unit vectors (2, 3) across the mean normal of vertices, counter-clockwise seen against it.
+
+    Without a case distinction but the sign (Duff et al. 2017).
     """
     x, y, z = 0.0, 0.0, 0.0
     for n in names:
@@ -114,10 +115,11 @@ def _spread(across, at, v, names, flat, inverse):  # type: ignore[no-untyped-def
 
 @nb.njit(cache=True, nogil=True)
 def delaunay_ring(inverse):  # type: ignore[no-untyped-def]
-    """Delaunay neighbours of the origin, counter-clockwise, as the convex hull of the other points' inversions.
+    """Delaunay neighbours of the origin, counter-clockwise, from the convex hull of the points' inversions.
 
-    A circle through the origin becomes a line, and is empty where all inversions lie on the origin's side of that
-    line. Of neighbours on one circle the two outermost are taken. inverse : (n, 2). Returns indices.
+    The points are inverted in the unit circle. A circle through the origin becomes a line, and is empty where all
+    inversions lie on the origin's side of that line. Of neighbours on one circle the two outermost are taken.
+    inverse : (n, 2). Returns indices.
     """
     n = len(inverse)
     first, farthest = -1, 0.0
@@ -125,9 +127,9 @@ def delaunay_ring(inverse):  # type: ignore[no-untyped-def]
         away = inverse[i, 0] ** 2 + inverse[i, 1] ** 2
         if away > farthest:
             first, farthest = i, away
-    ring, count, here = np.empty(n, np.int64), 0, first
+    neighbours, count, here = np.empty(n, np.int64), 0, first
     while here >= 0 and count < n:
-        ring[count] = here
+        neighbours[count] = here
         count += 1
         ahead, reach = -1, 0.0
         for j in range(n):
@@ -138,7 +140,7 @@ def delaunay_ring(inverse):  # type: ignore[no-untyped-def]
             if side < 0 or (side == 0 and step > reach):
                 ahead, reach = j, step
         here = -1 if ahead == first else ahead
-    return ring[:count]
+    return neighbours[:count]
 
 
 @nb.njit(cache=True, nogil=True)
@@ -172,12 +174,12 @@ def _fits(b, c, begin, opening, thinnest):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def _crossed(i, own, flat, names, place, start, onward):  # type: ignore[no-untyped-def]
+def _crossed(i, own, flat, names, position, start, onward):  # type: ignore[no-untyped-def]
     """Whether the segment from the origin to point i crosses a border edge that ends at neither."""
     tx, ty = flat[i, 0], flat[i, 1]
     for j in range(len(names)):
         for e in range(start[names[j]], start[names[j] + 1]):
-            k = place[onward[e]]
+            k = position[onward[e]]
             if k < 0 or own in (j, k) or i in (j, k):
                 continue
             px, py, qx, qy = flat[j, 0], flat[j, 1], flat[k, 0], flat[k, 1]
