@@ -19,7 +19,7 @@ from ringdic.uncertainty.position import (
     reference_covariance,
     step_covariance,
 )
-from ringdic.uncertainty.strain import corners_alike, stretch_sigma
+from ringdic.uncertainty.strain import corner_correlations, stretch_sigma
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def surface_uncertainty(
     position[0] = _sigma(reference_covariance(reference_gain, image_noise, reference, label))
     displacement[0], stretches[0] = 0.0, 0.0
     pixels = np.stack([camera.project(shape.xyz) for camera in cameras])
-    corner_correlation = corners_alike(pixels, shape.faces, radius, order)
+    corner_correlation = corner_correlations(pixels, shape.faces, radius, order)
     for step in range(1, steps):
         sigma, noise = _of_step(len(cameras), motion, step)
         gain = position_gain(cameras, motion.xyz[step], sigma)
