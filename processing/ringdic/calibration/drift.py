@@ -1,4 +1,4 @@
-"""Detection of cameras that moved, by the mean distance of matches from their epipolar lines, as operator's sentences.
+"""Detection of cameras that moved, by the mean distance of matches from their epipolar lines, step by step.
 
 Matches between cameras that stand still lie on their epipolar lines in the mean. A mean distance at the reference step
 shows a motion between calibration and reference; what is added at later steps shows a motion since.
