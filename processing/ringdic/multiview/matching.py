@@ -114,19 +114,18 @@ class ReferenceImages:
 class NodeMatches:
     """Matches of n nodes in C cameras.
 
-    px, sigma : (C, n, 2) px, NaN where a camera has none; in the reference camera of a node a whole pixel, with
-    sigma zero. noise, systematic : (C, n, 2) px, standard deviations by the noise of each image alone and by what is
-    not noise, also of the reference camera. c_ls : (C, n). status : (n,), 0 for a node with two views or more, else
-    the reason. count : number of matches that were computed.
+    px : (C, n, 2) px, NaN where a camera has none; in the reference camera of a node a whole pixel. noise, systematic :
+    (C, n, 2) px, standard deviations by the noise of each image alone and by what is not noise, also of the reference
+    camera. c_ls : (C, n). status : (n,), 0 for a node with two views or more, else the reason. count : number of
+    matches that were computed.
     """
 
     px: Pixels
-    sigma: Pixels
     noise: Pixels
     systematic: Pixels
     c_ls: Floats
     status: NDArray[np.int8]
-    count: int = 0
+    count: int
 
 
 def match_nodes(
@@ -150,11 +149,11 @@ def match_nodes(
     partners : (C, n) bool, cameras that each node is matched in.
     order : of the subsets, 1 or 2.
     curved : whether second derivatives are taken from the shape, as start values of the second order and as fixed
-    values of the first; otherwise they are zero.
+        values of the first; otherwise they are zero.
     """
     settings = _of_order(images.settings, order)
     count, n = len(images.cameras), len(reference)
-    px, sigma = np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan)
+    px = np.full((count, n, 2), np.nan)
     parts = _Parts(np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan), np.zeros(n))
     c_ls, status = np.full((count, n), np.nan), np.full(n, Status.NOT_REACHED, np.int8)
     computed = 0
@@ -172,7 +171,7 @@ def match_nodes(
                 pieces.lattice, pieces.coefficients[nodes][own], theta[own], z[own], images.cameras[a], at, reach
             )
             filtered = images.reference(a, at)
-            px[a, own], sigma[a, own], c_ls[a, own] = at, 0.0, 0.0
+            px[a, own], c_ls[a, own] = at, 0.0
         start = warps_to(images.cameras[b], at, stencil, reach)
         if not curved:
             start[:, 6:] = 0.0
@@ -182,11 +181,11 @@ def match_nodes(
         matches = correlate_independently(filtered, images.current(b), at[chosen], settings, start[chosen])
         computed += len(chosen)
         matched = own[chosen]
-        px[b, matched], sigma[b, matched], c_ls[b, matched] = at[chosen] + matches.uv, matches.sigma, matches.c_ls
+        px[b, matched], c_ls[b, matched] = at[chosen] + matches.uv, matches.c_ls
         parts.add(images, (a, b), matches, matched)
         status[matched] = np.where(status[matched] == Status.GOOD, Status.GOOD, matches.status)
     px[:, status != Status.GOOD] = np.nan
-    return NodeMatches(px, sigma, np.sqrt(parts.noise), np.sqrt(parts.systematic), c_ls, status, computed)
+    return NodeMatches(px, np.sqrt(parts.noise), np.sqrt(parts.systematic), c_ls, status, computed)
 
 
 @dataclass(frozen=True)

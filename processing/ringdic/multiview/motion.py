@@ -15,15 +15,14 @@ from ringdic.geometry.outliers import LostPoint, grid_neighbours, surface_outlie
 from ringdic.multiview.agreement import triangulate_agreeing
 from ringdic.multiview.shape import ReferenceShape
 from ringdic.multiview.tracking import CameraTrack
-from ringdic.multiview.weights import smooth_sigma
-from ringdic.uncertainty.matches import match_uncertainty
+from ringdic.multiview.weights import CELL_STEPS, smooth_sigma
+from ringdic.uncertainty.matches import match_parts
 from ringdic.uncertainty.noise import camera_noise
 from ringdic.uncertainty.texture import Texture
 
 #: Cameras as they stood at a step, from their pixels and standard deviations (C, n, 2) px at that step.
 PoseRefinement = Callable[[int, Pixels, Pixels], Sequence[Camera]]
 
-_CELL = 8  # steps of the correlation's grid, side of the cells over which weights are smoothed
 _LEAST_SIGMA = 1e-3  # px, of the best of matches
 
 
@@ -89,7 +88,7 @@ def vertex_track(
     texture = shape.textures[camera].part(vertex)
     variance = camera_noise(float(shape.grey_noise[camera]), track.c_ls[1:], texture.contrast)
     noise, sigma = _displacement_sigma(track, texture, variance)
-    weight = np.stack([smooth_sigma(x0, np.maximum(one, _LEAST_SIGMA), _CELL * step) for one in sigma])
+    weight = np.stack([smooth_sigma(x0, np.maximum(one, _LEAST_SIGMA), CELL_STEPS * step) for one in sigma])
     used = np.zeros(status.shape, bool)
     return VertexTrack(camera, vertex, track.px, sigma, noise, weight, variance, track.c_ls, status, used)
 
@@ -101,7 +100,7 @@ def _displacement_sigma(track: CameraTrack, texture: Texture, variance: float) -
     """
     noise, total = np.zeros_like(track.sigma), np.zeros_like(track.sigma)
     for step in range(1, len(track.px)):
-        parts = match_uncertainty(track.sigma[step], track.c_ls[step], (texture, texture), (variance, variance))
+        parts = match_parts(track.sigma[step], track.c_ls[step], (texture, texture), (variance, variance))
         noise[step] = np.hypot(parts.reference, parts.current)
         total[step] = np.hypot(noise[step], parts.systematic)
     return noise, total

@@ -29,7 +29,7 @@ from ringdic.multiview.lattice import Pieces, SurfaceLattice, evaluate, robust_p
 from ringdic.multiview.matching import NodeMatches, ReferenceImages, match_nodes
 from ringdic.multiview.tube import lattice_faces
 from ringdic.multiview.views import visibility
-from ringdic.multiview.weights import smooth_sigma
+from ringdic.multiview.weights import CELL_STEPS, smooth_sigma
 from ringdic.sweep.sweep import DepthSearch, search_radii, sweep_depths
 from ringdic.uncertainty.texture import Texture, TextureMap
 
@@ -42,7 +42,6 @@ _PIECE = 6  # fewest connected positions of a sweep that are believed: an obstac
 _FEW = 1e-3  # share of the nodes that another retry must gain
 _REFERENCES = 3  # cameras that a node is matched from, one after the other, before it is given up
 
-_CELL = 8  # steps of the correlation's grid, side of the cells over which weights are smoothed
 _UNKNOWN_TEXTURE = TextureMap(np.full((1, 1, 5), np.nan, np.float32), 1, (1, 1))  # of a camera without an image
 
 
@@ -295,7 +294,7 @@ class _Surface:
             uncertain: Mask = np.asarray((sigma > settings.sigma_max).any(axis=2))
         uncertain[reference, np.arange(len(reference))] = False  # its pixel defines the point
         px = np.where(uncertain[..., None], np.nan, matches.px)
-        cell = _CELL * self.images.settings.step
+        cell = CELL_STEPS * self.images.settings.step
         sigma = np.stack([smooth_sigma(at, own, cell) for at, own in zip(px, sigma, strict=True)])
         points, used = triangulate_agreeing(cameras, px, sigma, reference)
         status = np.where(matches.status != 0, matches.status, 0)

@@ -13,6 +13,9 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from ringdic.arrays import Floats, Pixels
 
+#: Side of the cells over which weights are smoothed, in steps of the correlation's grid.
+CELL_STEPS = 8
+
 
 def smooth_sigma(px: Pixels, sigma: Floats, cell: float) -> Floats:
     """Smooth the standard deviations of one camera's pixels over its image.

@@ -36,7 +36,7 @@ SCALE = 0.25
 LATTICE = SurfaceLattice(radius=57.0, columns=240, z=np.arange(10.0, 230.1, 1.5))
 
 
-def ring(cameras: int = 12, scale: float = 1.0) -> list[Camera]:
+def calibrated_cameras(cameras: int = 12, scale: float = 1.0) -> list[Camera]:
     """The virtual rig's cameras as a perfect calibration has them."""
     found = []
     for camera in paper_rig(cameras, scale).cameras:
@@ -46,7 +46,7 @@ def ring(cameras: int = 12, scale: float = 1.0) -> list[Camera]:
     return found
 
 
-CAMERAS = ring()
+CAMERAS = calibrated_cameras()
 
 
 def cylinder(radius: float = 57.0) -> Pieces:
@@ -57,8 +57,8 @@ def test_warps_are_those_of_exact_lines_of_sight_to_a_cylinder() -> None:
     """Second differences over one pixel of lines of sight cut with the cylinder itself, no pieces."""
     first, second = CAMERAS[0], CAMERAS[1]
     pieces = cylinder()
-    sight, _ = visibility(pieces, (first, second), {}, 40.0, 30.0)
-    nodes = tuple(index[::53] for index in np.nonzero(sight.all(axis=0)))
+    visible, _ = visibility(pieces, (first, second), {}, 40.0, 30.0)
+    nodes = tuple(index[::53] for index in np.nonzero(visible.all(axis=0)))
     theta, z = (place[nodes] for place in LATTICE.coordinates)
     px = np.rint(first.project(pieces.xyz[nodes]))
     stencil = surface_stencil(LATTICE, pieces.coefficients[nodes], theta, z, first, px, 3.0)
@@ -84,15 +84,15 @@ def test_warps_are_those_of_exact_lines_of_sight_to_a_cylinder() -> None:
 
 def test_cameras_see_the_nodes_that_face_them() -> None:
     pieces = cylinder()
-    sight, cosine = visibility(pieces, CAMERAS, {}, 60.0, 0.0)
+    visible, cosine = visibility(pieces, CAMERAS, {}, 60.0, 0.0)
     towards = np.array([camera.centre for camera in CAMERAS])[:, None, None] - pieces.xyz
     normal = pieces.xyz * np.array([1, 1, 0]) / 57.0
     true = np.sum(towards * normal, axis=-1) / np.linalg.norm(towards, axis=-1)
     np.testing.assert_allclose(cosine, true, atol=1e-9)
-    assert not sight[true < 0.5].any()
+    assert not visible[true < 0.5].any()
     inside = [((px := camera.project(pieces.xyz)) >= 0).all(-1) & (px < camera.size).all(-1) for camera in CAMERAS]
-    assert sight[(true > 0.5) & np.array(inside)].mean() > 0.99
-    assert np.median(sight.sum(axis=0)) >= 3
+    assert visible[(true > 0.5) & np.array(inside)].mean() > 0.99
+    assert np.median(visible.sum(axis=0)) >= 3
 
 
 def test_a_mask_and_a_hidden_place_are_not_seen() -> None:
@@ -194,7 +194,7 @@ def limb() -> Images:
         for k in chosen
         for n, step in enumerate((0, STEP))
     }
-    cameras = ring(12, SCALE)
+    cameras = calibrated_cameras(12, SCALE)
     return Images([cameras[k] for k in chosen], grey)
 
 

@@ -73,9 +73,9 @@ def test_nodes_that_lie_off_are_left_out_and_no_other() -> None:
     radius = true + 0.01 * rng.standard_normal(true.shape)
     wrong = rng.random(true.shape) < 0.03
     radius[wrong] += rng.choice([-1, 1], wrong.sum()) * rng.uniform(0.3, 6.0, wrong.sum())
-    pieces, kept = robust_pieces(LATTICE, radius, 8.0)
-    assert not kept[wrong].any()
-    assert kept[~wrong].mean() > 0.999
+    pieces, agreeing = robust_pieces(LATTICE, radius, 8.0)
+    assert not agreeing[wrong].any()
+    assert agreeing[~wrong].mean() > 0.999
     assert np.sqrt(np.mean((pieces.radius - true) ** 2)) < 0.01  # smoother than what it was fitted to
 
 

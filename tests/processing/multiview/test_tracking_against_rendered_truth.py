@@ -44,17 +44,17 @@ def limb(shared_data: Path):
 
 
 @pytest.fixture(scope="module")
-def followed(limb, track_camera: Callable[..., CameraTrack]) -> dict[str, CameraTrack]:
+def tracks(limb, track_camera: Callable[..., CameraTrack]) -> dict[str, CameraTrack]:
     images, px, _ = limb
     settings = CorrelationSettings(radius=20, step=13)
     ways = {"first order": ONE_PASS, "second order": SECOND, "two passes": TWO_PASS}
     return {name: track_camera(images, px[0], settings, way) for name, way in ways.items()}
 
 
-def test_two_passes_are_unbiased_and_as_quiet_as_the_noise_allows(limb, followed, figures: Callable) -> None:
+def test_two_passes_are_unbiased_and_as_quiet_as_the_noise_allows(limb, tracks, figures: Callable) -> None:
     _, px, cosine = limb
     facing = cosine > np.cos(np.radians(50))
-    e = {name: errors(result, 2, px[2], facing) for name, result in followed.items()}
+    e = {name: errors(result, 2, px[2], facing) for name, result in tracks.items()}
     for name, each in e.items():
         mean, std = each.mean(axis=0), each.std(axis=0)
         figures(
@@ -71,15 +71,15 @@ def test_two_passes_are_unbiased_and_as_quiet_as_the_noise_allows(limb, followed
     assert np.abs(e["two passes"]).max() < 0.03
 
 
-def test_the_stated_uncertainty_is_the_scatter_observed_at_every_incidence(limb, followed, figures: Callable) -> None:
+def test_the_stated_uncertainty_is_the_scatter_observed_at_every_incidence(limb, tracks, figures: Callable) -> None:
     _, px, cosine = limb
     for low, high in ((0, 45), (45, 55), (55, 60)):
-        ring = (cosine <= np.cos(np.radians(low))) & (cosine > np.cos(np.radians(high)))
-        two = followed["two passes"]
+        band = (cosine <= np.cos(np.radians(low))) & (cosine > np.cos(np.radians(high)))
+        two = tracks["two passes"]
         measured = two.status[2] == Status.GOOD
-        assert measured[ring].mean() > 0.97
-        ring &= measured
-        ratio = np.sqrt(np.mean((errors(two, 2, px[2], ring) / two.sigma[2, ring]) ** 2))
+        assert measured[band].mean() > 0.97
+        band &= measured
+        ratio = np.sqrt(np.mean((errors(two, 2, px[2], band) / two.sigma[2, band]) ** 2))
         figures(f"limb in time, {low}-{high} degrees, observed / stated", f"{ratio:.2f}", "0.75 to 1.4")
         assert 0.75 < ratio < 1.4
 

@@ -100,10 +100,10 @@ def test_the_reference_is_the_points_themselves(track_all):
     expected[4] = np.nan
     np.testing.assert_array_equal(result.px[0], expected)
     np.testing.assert_array_equal(result.status[0, [0, 3, 4]], [Status.GOOD, Status.NOT_REACHED, Status.OUTSIDE])
-    kept = np.delete(np.arange(len(x0)), [3, 4])
-    assert (result.sigma[0, kept] == 0).all()
+    inside = np.delete(np.arange(len(x0)), [3, 4])
+    assert (result.sigma[0, inside] == 0).all()
     assert np.isnan(result.px[1, [3, 4]]).all()
-    assert np.abs(result.px[1, kept] - x0[kept]).max() < 1e-4  # nothing moved, between the pixels either
+    assert np.abs(result.px[1, inside] - x0[inside]).max() < 1e-4  # nothing moved, between the pixels either
 
 
 def test_motions_of_tens_of_pixels_between_steps_are_followed(track_all):
@@ -159,8 +159,8 @@ def test_what_is_covered_for_a_while_is_lost_and_found_again(track_all):
     assert covered.sum() > 15
     assert (result.status[1, covered] != Status.GOOD).all()
     assert (result.status[1, clear] == Status.GOOD).all()
-    kept = result.status[1] == Status.GOOD
-    assert errors(result, 1, truth)[kept].max() < 0.05  # a subset that overlaps by a row or two may pass
+    good = result.status[1] == Status.GOOD
+    assert errors(result, 1, truth)[good].max() < 0.05  # a subset that overlaps by a row or two may pass
     assert (result.status[2] == Status.GOOD).all()
     assert not result.updated[2].any()
     assert errors(result, 2, forward(ways[2], x0)).max() < 1e-3
@@ -206,8 +206,8 @@ def test_blocks_of_steps_continue_as_one_series(track_all):
         return track_block(images[0], lambda k: images[k], steps, x0, None, SETTINGS, state=state)
 
     first, state = block(range(1, 3))
-    kept = TrackState(**{name: values.copy() for name, values in state.arrays().items()})  # as if from a file
-    second, _ = block(range(3, 4), kept)
+    stored = TrackState(**{name: values.copy() for name, values in state.arrays().items()})  # as if from a file
+    second, _ = block(range(3, 4), stored)
     joined = CameraTrack.joined([at_reference(x0, images[0].shape), first, second])
     for name, values in whole.arrays().items():
         np.testing.assert_array_equal(joined.arrays()[name], values, err_msg=name)

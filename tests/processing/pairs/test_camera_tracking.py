@@ -25,19 +25,19 @@ def field(xy: np.ndarray, bent: float = 1.0) -> np.ndarray:
 
 def test_between_four_corners_a_quadratic_field_is_met_exactly() -> None:
     points = RNG.uniform(0, [110, 80], (200, 2))
-    told, weight = interpolate_lattice(lattice(), field(lattice()), STEP, points)
-    np.testing.assert_allclose(told, field(points), atol=1e-12)
+    interpolated, weight = interpolate_lattice(lattice(), field(lattice()), STEP, points)
+    np.testing.assert_allclose(interpolated, field(points), atol=1e-12)
     np.testing.assert_allclose(weight, 1.0)
 
 
 def test_without_a_corner_an_affine_field_is_met_and_at_a_corner_its_own_value() -> None:
     known = lattice()[RNG.permutation(len(lattice()))[:60]]
     points = RNG.uniform(-5, [125, 95], (400, 2))
-    told, weight = interpolate_lattice(known, field(known, 0.0), STEP, points)
+    interpolated, weight = interpolate_lattice(known, field(known, 0.0), STEP, points)
     inside = weight > 0
     assert 0.2 < inside.mean() < 1.0
-    np.testing.assert_allclose(told[inside, :6], field(points[inside], 0.0)[:, :6], atol=1e-12)
-    assert np.isnan(told[~inside]).all()
+    np.testing.assert_allclose(interpolated[inside, :6], field(points[inside], 0.0)[:, :6], atol=1e-12)
+    assert np.isnan(interpolated[~inside]).all()
     own, weight = interpolate_lattice(known, field(known), STEP, known.astype(float))
     np.testing.assert_array_equal(own, field(known))
     np.testing.assert_array_equal(weight, 1.0)
@@ -49,12 +49,12 @@ def test_a_place_is_lost_with_the_points_about_it_and_says_why() -> None:
     values = field(xy)
     values[lost] = np.nan
     zeros = np.zeros((len(xy), 2), np.float32)
-    found = CameraMatches(
+    matches = CameraMatches(
         xy, STEP, values[:, :2], values[:, 2:6].reshape(-1, 2, 2).astype(np.float32), zeros, zeros[:, 0],
         np.where(lost, Status.NO_CONVERGENCE, Status.GOOD).astype(np.int8),
     )  # fmt: skip
     at = np.array([[52.0, 41.0], [25.0, 43.0], [63.0, 40.0], [np.nan, 1.0], [500.0, 500.0]])
-    seen = interpolate_matches(found, at)
+    seen = interpolate_matches(matches, at)
     assert seen.status.tolist() == [Status.NO_CONVERGENCE, 0, 0, Status.NOT_REACHED, Status.NOT_REACHED]
     np.testing.assert_array_equal(np.isfinite(seen.px).all(axis=1), seen.status == 0)
     # All four corners about the second place; beside the hole the two that are left go on as straight lines.
@@ -105,11 +105,11 @@ def test_places_between_the_points_are_found_as_well_as_the_points(order: int) -
     own = STEP * np.stack([column, row], axis=1).astype(float)
     grid = camera_grid((260, 240), STEP, [(region, own)], [])
     np.testing.assert_array_equal(grid.xy, own)
-    found = match_camera(prepare_reference(reference, grid.region, settings), current, grid, settings)
+    matches = match_camera(prepare_reference(reference, grid.region, settings), current, grid, settings)
     at = RNG.uniform(40, [220, 200], (500, 2))
-    on, off = interpolate_matches(found, grid.xy), interpolate_matches(found, at)
+    on, off = interpolate_matches(matches, grid.xy), interpolate_matches(matches, at)
     assert (off.status == 0).all()
     errors = [np.sqrt(np.mean((seen.px - xy - motion(xy)) ** 2)) for seen, xy in ((on, grid.xy), (off, at))]
     assert errors[1] < 1.1 * errors[0]
-    assert errors[0] < 3 * np.sqrt(np.mean(found.sigma**2))
-    np.testing.assert_array_equal(on.px, grid.xy + found.uv)
+    assert errors[0] < 3 * np.sqrt(np.mean(matches.sigma**2))
+    np.testing.assert_array_equal(on.px, grid.xy + matches.uv)

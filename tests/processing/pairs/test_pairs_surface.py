@@ -16,7 +16,7 @@ from ringdic.settings import Settings, SurfaceGroup
 STEPS, PITCH, LOST = 3, 2.0, 7
 
 
-def sheet(pair: tuple[str, str], first: int, above: float, turned: float) -> PairSurface:
+def plate(pair: tuple[str, str], first: int, above: float, turned: float) -> PairSurface:
     """A plate of 30 x 20 points at x = first PITCH, moved by (0, 0, step) mm a step; every value tells its vertex."""
     i, j = (axis.ravel() for axis in np.meshgrid(np.arange(30), np.arange(20), indexing="ij"))
     n = len(i)
@@ -36,7 +36,7 @@ def sheet(pair: tuple[str, str], first: int, above: float, turned: float) -> Pai
     # One match more than there are vertices: it was lost from the start.
     in_pixels = {name: np.zeros((2, n + 1, 2)) for name in ("px", "sigma")}
     matched = SimpleNamespace(**in_pixels, c_ls=np.zeros(n + 1), seconds={"refine": 1.0})
-    places = [
+    steps = [
         PairStep(vertices[k], c_ls[k].astype(np.float32), sigma[k].astype(np.float32), np.append(status[k], 5), 0.0)
         for k in range(STEPS)
     ]
@@ -44,10 +44,10 @@ def sheet(pair: tuple[str, str], first: int, above: float, turned: float) -> Pai
     cameras = tuple(Camera(id_, np.eye(3, 4), (1, 1)) for id_ in pair)
     grid = np.vstack([xy, [-9, -9]])
     shape = PairShape(
-        cameras, grid, np.arange(n), faces, places[0], np.zeros((0, 4, 2), int), vertices[0], matched.sigma, 1.0
+        cameras, grid, np.arange(n), faces, steps[0], np.zeros((0, 4, 2), int), vertices[0], matched.sigma, 1.0
     )
     worst = c_ls.max(axis=0)
-    return PairSurface(shape, lambda k: (places[k], matched), worst, np.zeros(STEPS), np.zeros((STEPS, 2)))
+    return PairSurface(shape, lambda k: (steps[k], matched), worst, np.zeros(STEPS), np.zeros((STEPS, 2)))
 
 
 def run(heuristic: str) -> tuple[Results, dict]:
@@ -56,7 +56,7 @@ def run(heuristic: str) -> tuple[Results, dict]:
 
 
 def series_of(heuristic: str) -> tuple[PairsSeries, dict]:
-    surfaces = [sheet(("A", "B"), 0, 0.0, 0.0), sheet(("B", "C"), 20, 0.1, 0.03)]
+    surfaces = [plate(("A", "B"), 0, 0.0, 0.0), plate(("B", "C"), 20, 0.1, 0.03)]
     settings = Settings(surface=SurfaceGroup(merge=heuristic))
     return pairs_surface("plates", [], surfaces, [f"000{k}-specimen" for k in range(STEPS)], settings)
 

@@ -121,7 +121,7 @@ def merge(
     with ThreadPoolExecutor(1) as pool:  # the mismatches while the rest runs
         distances = pool.submit(mismatches, parts, seam.layers * edge)
         living = _without_overlap(mesh, owner, overlap, seam.gap * edge, seam.layers * edge)
-        faces, pair, added = _close_gaps(mesh, mesh.faces[living], owner, parts, seam, edge)
+        faces, pair, added = _close_gaps(mesh, mesh.faces[living], parts, seam, edge)
         return MergedSurface(faces, pair, np.unique(faces), np.flatnonzero(~living), added, distances.result())
 
 
@@ -208,7 +208,7 @@ def _tidy(mesh: Mesh, living: Mask) -> Mask:
 
 
 def _close_gaps(
-    mesh: Mesh, triangles: Indices, owner: Indices, parts: Sequence[SurfacePart], seam: Seam, edge: float
+    mesh: Mesh, triangles: Indices, parts: Sequence[SurfacePart], seam: Seam, edge: float
 ) -> tuple[Indices, Indices, int]:
     """Stitch the gaps between the parts and fill the holes.
 

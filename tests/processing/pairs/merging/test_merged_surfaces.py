@@ -43,12 +43,12 @@ def strip(
     return SurfacePart(vertices[used], faces.reshape(-1, 3), correlation[used])
 
 
-def ring(count: int = 6, width: float = 100.0, noise: float = 0.02) -> list[SurfacePart]:
+def strips(count: int = 6, width: float = 100.0, noise: float = 0.02) -> list[SurfacePart]:
     return [strip(360 / count * k, width, seed=k, noise=noise) for k in range(count)]
 
 
-def joined(sheets: Sequence[SurfacePart], merged: MergedSurface) -> Mesh:
-    return Mesh(np.concatenate([sheet.vertices for sheet in sheets]), merged.faces)
+def joined(parts: Sequence[SurfacePart], merged: MergedSurface) -> Mesh:
+    return Mesh(np.concatenate([part.vertices for part in parts]), merged.faces)
 
 
 def assert_sound(mesh: Mesh) -> None:
@@ -63,9 +63,9 @@ def assert_sound(mesh: Mesh) -> None:
 @pytest.mark.parametrize("heuristic", list(HEURISTICS))
 def test_a_ring_of_overlapping_strips_becomes_a_closed_tube(heuristic: str) -> None:
     """100° strips every 60°: each place is measured once to twice; whatever decides, all of it is covered once."""
-    sheets = ring()
-    merged = merge(sheets, heuristic)
-    mesh = joined(sheets, merged)
+    parts = strips()
+    merged = merge(parts, heuristic)
+    mesh = joined(parts, merged)
     assert_sound(mesh)
     assert is_closed_tube(mesh)
     assert set(merged.pair) == {-1, *range(6)}
@@ -74,15 +74,15 @@ def test_a_ring_of_overlapping_strips_becomes_a_closed_tube(heuristic: str) -> N
 
 
 def test_three_layers_are_no_harder_than_two() -> None:
-    sheets = ring(count=9, width=110.0)
-    mesh = joined(sheets, merge(sheets))
+    parts = strips(count=9, width=110.0)
+    mesh = joined(parts, merge(parts))
     assert_sound(mesh)
     assert is_closed_tube(mesh)
 
 
 def test_two_sheets_become_one_sheet_with_one_rim() -> None:
-    sheets = [strip(0, 80, seed=1), strip(50, 80, seed=2)]
-    mesh = joined(sheets, merge(sheets))
+    parts = [strip(0, 80, seed=1), strip(50, 80, seed=2)]
+    mesh = joined(parts, merge(parts))
     assert_sound(mesh)
     (rim,) = borders(mesh)
     assert rim.kind is Kind.RIM
@@ -92,26 +92,26 @@ def test_two_sheets_become_one_sheet_with_one_rim() -> None:
 def test_sheets_side_by_side_are_stitched_and_far_ones_are_not() -> None:
     """Beside one another with a gap of 1.5 edges nothing is removed; five edges away they stay two sheets."""
     edge = np.degrees(2.5 / RADIUS)
-    for gap, parts in ((1.5, 1), (8.0, 2)):
-        sheets = [strip(0, 40, seed=3), strip(40 + gap * edge, 40, seed=3)]
-        merged = merge(sheets)
+    for gap, pieces_left in ((1.5, 1), (8.0, 2)):
+        parts = [strip(0, 40, seed=3), strip(40 + gap * edge, 40, seed=3)]
+        merged = merge(parts)
         assert len(merged.removed) == 0
-        mesh = joined(sheets, merged)
+        mesh = joined(parts, merged)
         assert_sound(mesh)
-        assert pieces(mesh).max() + 1 == parts
-        assert (merged.added > 0) == (parts == 1)
-        assert (merged.pair[merged.pair < 0].size > 0) == (parts == 1)
+        assert pieces(mesh).max() + 1 == pieces_left
+        assert (merged.added > 0) == (pieces_left == 1)
+        assert (merged.pair[merged.pair < 0].size > 0) == (pieces_left == 1)
 
 
 def test_no_vertex_is_moved_or_made_and_old_triangles_keep_their_sheet() -> None:
-    sheets = ring()
-    merged = merge(sheets)
-    counts = [len(sheet.vertices) for sheet in sheets]
-    owner = np.repeat(np.arange(len(sheets)), counts)
+    parts = strips()
+    merged = merge(parts)
+    counts = [len(part.vertices) for part in parts]
+    owner = np.repeat(np.arange(len(parts)), counts)
     np.testing.assert_array_equal(np.unique(merged.faces), merged.vertex)
     assert merged.vertex.max() < sum(counts)
     offsets = np.cumsum([0, *counts[:-1]])
-    old = np.concatenate([sheet.faces + offset for sheet, offset in zip(sheets, offsets, strict=True)])
+    old = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=True)])
     kept = np.delete(old, merged.removed, axis=0)
     there = {tuple(np.sort(face)) for face in kept}
     first = merged.faces[: len(merged.faces) - merged.added]
@@ -152,9 +152,9 @@ def test_small_holes_are_closed_and_large_ones_are_not() -> None:
     for radius, closed in ((1.0, True), (12.0, False)):
         middle = np.argmin(np.linalg.norm(whole.vertices - [RADIUS, 0, 0], axis=1))
         gone = np.linalg.norm(whole.vertices - whole.vertices[middle], axis=1) < radius
-        sheet = SurfacePart(whole.vertices, whole.faces[~gone[whole.faces].any(axis=1)], whole.correlation)
-        merged = merge([sheet])
-        mesh = joined([sheet], merged)
+        part = SurfacePart(whole.vertices, whole.faces[~gone[whole.faces].any(axis=1)], whole.correlation)
+        merged = merge([part])
+        mesh = joined([part], merged)
         assert_sound(mesh)
         holes = [border for border in borders(mesh) if border.kind is Kind.HOLE]
         assert len(holes) == (0 if closed else 1)
@@ -174,18 +174,18 @@ def test_the_two_sides_of_a_plate_are_not_taken_for_an_overlap() -> None:
 def test_nothing_and_a_single_sheet_stay_as_they_are() -> None:
     empty = SurfacePart(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros(0))
     assert len(merge([]).faces) == len(merge([empty]).faces) == 0
-    sheet = strip(0, 60, seed=11)
-    merged = merge([empty, sheet])
-    np.testing.assert_array_equal(merged.faces, sheet.faces)
+    part = strip(0, 60, seed=11)
+    merged = merge([empty, part])
+    np.testing.assert_array_equal(merged.faces, part.faces)
     assert set(merged.pair) == {1}
 
 
 def test_what_cannot_be_merged_is_refused() -> None:
-    sheet = strip(0, 60)
+    part = strip(0, 60)
     with pytest.raises(ValueError, match="no heuristic 'best'"):
-        merge([sheet], "best")
+        merge([part], "best")
     with pytest.raises(ValueError, match="no measure 'colour'"):
-        merge([sheet], weights={"colour": 1.0})
+        merge([part], weights={"colour": 1.0})
     with pytest.raises(ValueError, match="finite"):
         SurfacePart(np.full((4, 3), np.nan), np.zeros((0, 3), np.int64), np.zeros(4))
     with pytest.raises(ValueError, match="as many correlations"):
