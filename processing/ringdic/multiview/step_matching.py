@@ -97,17 +97,14 @@ def match_tracked_points(
     two_pass : whether second derivatives of the neighbours' displacement are held fixed in a second, first-order pass.
     search : whether start values are sought in the images where too few of those given hold.
     """
-    start_at_pixels = None if start is None else shift_warps(start, points.shift)
+    pixel_start = None if start is None else shift_warps(start, points.shift)
     if not two_pass:
-        return _reject_outliers(
-            _match_pixels(reference, current, points.pixels, start_at_pixels, settings, search), points
-        )
-    part = (
-        current
-        if start_at_pixels is None
-        else _about(points.pixels + start_at_pixels[:, :2], settings.radius, current, current)
-    )
-    first = _at_knots(reference, (part, current), points, start_at_pixels, _of_knots(settings), search)
+        matches = _match_pixels(reference, current, points.pixels, pixel_start, settings, search)
+        return _reject_outliers(matches, points)
+    part = current
+    if pixel_start is not None:
+        part = _about(points.pixels + pixel_start[:, :2], settings.radius, current, current)
+    first = _at_knots(reference, (part, current), points, pixel_start, _of_knots(settings), search)
     if not first.good.any():
         return _lost(points, first.status[points.knot])
     warp = _predicted_warps(first, points, settings.radius)
@@ -116,7 +113,7 @@ def match_tracked_points(
     return _reject_outliers(_subtract_bias(first, second, points), points)
 
 
-def shift_warps(warp: Floats, shift: Floats) -> Floats:
+def shift_warps(warp: Floats, shift: Pixels) -> Floats:
     """Warps at points that are moved by a shift: displacement and gradient by their Taylor series.
 
     warp : (n, 12). shift : (n, 2) px. Returns (n, 12).
@@ -205,7 +202,7 @@ def _about(positions: Pixels, radius: int, part: Current, whole: Current) -> Cur
 def _match_pixels(
     reference: Reference,
     current: Current,
-    pixels: Floats,
+    pixels: Pixels,
     start: Floats | None,
     settings: CorrelationSettings,
     search: bool,
@@ -263,15 +260,17 @@ def _fixed_curvature(fit: QuadraticFit, first: Correlation, points: TrackedPoint
         harm = fit.curvature_sigma.max(axis=1) * radius**2 / 8.0
         known = np.isfinite(fit.curvature).all(axis=(1, 2)) & (harm < size)
         curvature = fit.curvature.reshape(-1, 6)
-        curvature = curvature * _clear(curvature, sigma.reshape(-1, 6), _CURVED)
+        curvature = curvature * _shrinkage(curvature, sigma.reshape(-1, 6), _CURVED)
     if not known.any():
         return np.zeros((len(points.positions), 6))
     return np.asarray(curvature[points.nearest(known)])
 
 
 def _subtract_bias(first: Correlation, second: Correlation, points: TrackedPoints) -> Correlation:
-    """Subtract the bias of the second pass: the smooth part of its difference from the first, where it
-    exceeds noise.
+    """Subtract from the second pass the smooth part of its difference from the first that exceeds noise.
+
+    This is the bias of first-order subsets where the field is not quadratic; its uncertainty is added to that of the
+    match.
     """
     second_sigma = second.sigma[points.knots]
     with np.errstate(invalid="ignore"):
@@ -280,7 +279,7 @@ def _subtract_bias(first: Correlation, second: Correlation, points: TrackedPoint
     fit = points.neighbourhoods.fit(second.uv[points.knots] - first.uv, size)
     with np.errstate(invalid="ignore", divide="ignore"):
         bias_sigma = _OVERLAP * fit.value_sigma[:, None] * excess / size[:, None]
-    share = _clear(fit.value, bias_sigma, _BIASED)
+    share = _shrinkage(fit.value, bias_sigma, _BIASED)
     known = np.isfinite(fit.value).all(axis=1) & np.isfinite(bias_sigma).all(axis=1)
     knot = points.nearest(known, points.neighbourhoods.window)
     bias = fit.extrapolate(knot, points.pixels - points.neighbourhoods.xy[knot])
@@ -291,7 +290,7 @@ def _subtract_bias(first: Correlation, second: Correlation, points: TrackedPoint
     return replace(second, uv=uv, sigma=sigma)
 
 
-def _clear(values: Floats, sigma: Floats, limit: float) -> Floats:
+def _shrinkage(values: Floats, sigma: Floats, limit: float) -> Floats:
     """Factor (n, 1) by which uncertain vectors (n, k) are shrunk towards zero: 1 - limit / Σ(v/σ)², at least 0.
 
     The positive part of the estimator of James & Stein (1961): where there is only noise it gives 0.

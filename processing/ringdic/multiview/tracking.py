@@ -261,7 +261,7 @@ class _CameraTracker:
             reference, current, points, start, self.settings, two_pass=self.options.two_pass, search=search
         )
 
-    def _tracked_points(self, reference: Reference, at: Floats) -> TrackedPoints:
+    def _tracked_points(self, reference: Reference, at: Pixels) -> TrackedPoints:
         """Points (n, 2) px of a reference image, prepared for tracking with the options of this track."""
         return tracked_points(reference, at, self.settings, self.options.window, thin=self.options.two_pass)
 

@@ -42,7 +42,9 @@ class _Nodes:
         return np.stack(np.divmod(node, self.xyz.shape[1]), axis=-1)
 
     def unrolled(self, node: Indices) -> Indices:
-        """Column and row (n, 2) of nodes (n,) close to one another; the columns count on across the last one."""
+        """Column and row (n, 2) of nodes (n,) near one another, the columns without a jump from the last to
+        the first.
+        """
         coordinates = self.coordinates(node)
         columns = self.xyz.shape[0]
         coordinates[:, 0] = (

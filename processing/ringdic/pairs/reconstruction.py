@@ -111,7 +111,7 @@ def pair_shape(
     step_px: int,
     sigma_max_px: float,
 ) -> PairShape:
-    """Triangulate a pair's reference matches, drop those that cannot be right in space, and lay triangles between them.
+    """Triangulate a pair's reference matches, drop those that cannot be right, and lay triangles between the rest.
 
     Parameters
     ----------

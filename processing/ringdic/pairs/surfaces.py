@@ -50,6 +50,7 @@ class PairSurface:
         return SurfacePart(self.shape.reference.vertices, self.shape.faces, correlation.astype(float))
 
 
+#: Merges the surfaces of pairs into one, by a heuristic.
 Merging = Callable[[Sequence[PairSurface], str], MergedSurface]
 
 
@@ -145,9 +146,8 @@ class PairsSeries:
             np.concatenate([getattr(one, name) for one in steps])[self.vertex]
             for name in ("vertices", "correlation", "sigma")
         )
-        status = np.concatenate([one.status[p.shape.rows] for one, p in zip(steps, self.pairs, strict=True)])[
-            self.vertex
-        ]
+        rows = [pair.shape.rows for pair in self.pairs]
+        status = np.concatenate([one.status[row] for one, row in zip(steps, rows, strict=True)])[self.vertex]
         return replace(
             reference,
             steps=(self.names[0], self.names[step]),

@@ -114,10 +114,10 @@ def camera_grid(
 def match_camera(reference: Reference, image: Image, grid: CameraGrid, settings: CorrelationSettings) -> CameraMatches:
     """Match the points of a camera's grid in its image of a step.
 
-    reference : its reference image, prepared with the grid's region. image : (height, width) grey levels. grid : (n,
-    2) px.
+    reference : its reference image, prepared with the grid's region. image : (height, width) grey levels. grid : the
+    points, (n, 2) px.
     """
-    matches = match_in_time(reference, prepare_current(image, settings=settings), grid.xy, settings)
+    matches = track_points(reference, prepare_current(image, settings=settings), grid.xy, settings)
     return CameraMatches(
         grid.xy.astype(np.int32),
         grid.step,
@@ -145,7 +145,7 @@ def interpolate_matches(matches: CameraMatches, xy: Pixels) -> CameraPixels:
     return CameraPixels(xy + interpolated[:, :2], interpolated[:, 6:8], interpolated[:, 8], status)
 
 
-def match_in_time(reference: Reference, current: Current, xy: Pixels, settings: CorrelationSettings) -> Correlation:
+def track_points(reference: Reference, current: Current, xy: Pixels, settings: CorrelationSettings) -> Correlation:
     """Match points of a camera's reference image in a later image, with start values from optical flow.
 
     Where these lead to few matches, the correlation seeks start values in its own ways. xy : (n, 2) float64, px.

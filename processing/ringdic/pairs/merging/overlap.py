@@ -55,7 +55,9 @@ def cover(mesh: Mesh, owner: Indices, reach: float) -> Cover:
         return Projector(Mesh(mesh.vertices, mesh.faces[part]), reach, _SAME_SIDE)
 
     def over(k: int) -> list[tuple[Indices, Indices, Floats]]:
-        """What the other surfaces cover of surface k."""
+        """Triangles of surface k that other surfaces cover, the triangles that cover them, and the heights between
+        them.
+        """
         part, covers = parts[k], []
         for j, surface in enumerate(surfaces):
             if j != k:
