@@ -16,7 +16,7 @@ from ringdic.multiview.agreement import triangulate_agreeing
 from ringdic.multiview.shape import ReferenceShape
 from ringdic.multiview.tracking import CameraTrack
 from ringdic.multiview.weights import CELL_STEPS, smooth_sigma
-from ringdic.uncertainty.matches import match_parts
+from ringdic.uncertainty.matches import match_uncertainty
 from ringdic.uncertainty.noise import camera_noise
 from ringdic.uncertainty.texture import Texture
 
@@ -100,7 +100,7 @@ def _displacement_sigma(track: CameraTrack, texture: Texture, variance: float) -
     """
     noise, total = np.zeros_like(track.sigma), np.zeros_like(track.sigma)
     for step in range(1, len(track.px)):
-        parts = match_parts(track.sigma[step], track.c_ls[step], (texture, texture), (variance, variance))
+        parts = match_uncertainty(track.sigma[step], track.c_ls[step], (texture, texture), (variance, variance))
         noise[step] = np.hypot(parts.reference, parts.current)
         total[step] = np.hypot(noise[step], parts.systematic)
     return noise, total
