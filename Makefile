@@ -6,7 +6,10 @@ BIN := $(VENV)/bin
 # A processor without AVX-512, as numba is told of it.
 NARROW := +sse,+sse2,+sse3,+ssse3,+sse4.1,+sse4.2,+avx,+avx2,+fma,+bmi,+bmi2,+popcnt,+lzcnt,+cmov,+cx8,+cx16,+f16c,+fxsr,+mmx,+movbe,+sahf,+xsave
 
-.PHONY: install demo test test-narrow lint bench clean
+# Fails unless the bundled page lies in the installed package.
+HAS_PAGE := from importlib.resources import files; files('ringdic_controller').joinpath('web/static/index.html').read_text()
+
+.PHONY: install demo test test-narrow test-dist lint bench dist clean
 
 $(VENV)/.installed: pyproject.toml
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
@@ -15,6 +18,10 @@ $(VENV)/.installed: pyproject.toml
 
 $(VENV)/.installed-test: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet -e ".[pc,test]"
+	touch $@
+
+$(VENV)/.installed-dist: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet -e ".[pc,dist]"
 	touch $@
 
 install: $(VENV)/.installed            ## the command .venv/bin/ringdic
@@ -37,6 +44,17 @@ test-narrow: $(VENV)/.installed-test   ## the kernels compiled for an x86-64 pro
 
 bench: install                         ## speed and memory
 	$(BIN)/ringdic bench
+
+dist: $(VENV)/.installed-dist          ## sdist, and from it the wheel with the page, checked as an index would
+	rm -rf dist
+	$(BIN)/python -m build
+	$(BIN)/python -m twine check --strict dist/*
+
+test-dist: dist                        ## the wheel alone, away from the tree, has the page and runs the demo
+	rm -rf build/away && $(PYTHON) -m venv build/away
+	build/away/bin/python -m pip install --quiet "$$(echo dist/*.whl)[pc]"
+	cd build/away && bin/python -P -c "$(HAS_PAGE)" && \
+	  bin/ringdic demo --cameras 6 --scale 0.2 --steps 1 --no-serve --out demo
 
 clean:
 	rm -rf $(VENV) build dist controller/ringdic_controller/web/static

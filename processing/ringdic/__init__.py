@@ -37,11 +37,64 @@ results' file; ``sweep`` and ``uncertainty``; ``calibration`` and ``correlation`
 
 from __future__ import annotations
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from ringdic.compiled import choose_cache_folder
-from ringdic.errors import ComputationError, InputError, RingdicError
+from ringdic.errors import ComputationError, InputError, RingdicError, missing_extra
+
+if TYPE_CHECKING:
+    from ringdic.api import ImageCorrelation, correlate, import_folder, process, read_run
+    from ringdic.jobs.run import Run
+    from ringdic.session.folder import Session, open_session
+    from ringdic.settings import Settings, load_settings
 
 __version__ = "0.2.0"
 
-__all__ = ["ComputationError", "InputError", "RingdicError", "__version__"]
+__all__ = [
+    "ComputationError",
+    "ImageCorrelation",
+    "InputError",
+    "RingdicError",
+    "Run",
+    "Session",
+    "Settings",
+    "__version__",
+    "correlate",
+    "import_folder",
+    "load_settings",
+    "open_session",
+    "process",
+    "read_run",
+]
+
+_MODULES = {
+    "ImageCorrelation": "ringdic.api",
+    "Run": "ringdic.jobs.run",
+    "Session": "ringdic.session.folder",
+    "Settings": "ringdic.settings",
+    "correlate": "ringdic.api",
+    "import_folder": "ringdic.api",
+    "load_settings": "ringdic.settings",
+    "open_session": "ringdic.session.folder",
+    "process": "ringdic.api",
+    "read_run": "ringdic.api",
+}
 
 choose_cache_folder()  # before any kernel is imported
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, whose module is loaded now: importing the package alone is quick."""
+    if name not in _MODULES:
+        raise AttributeError(f"module 'ringdic' has no attribute '{name}'")
+    try:
+        value = getattr(import_module(_MODULES[name]), name)
+    except ModuleNotFoundError as error:
+        raise missing_extra(error) or error from error
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -59,8 +59,9 @@ def choose_cache_folder() -> None:
             folder = parent() / name
             _use(folder)
             os.environ[_VARIABLE] = str(folder)
-            if "numba" in sys.modules:  # it has read its environment already
-                sys.modules["numba"].config.CACHE_DIR = str(folder)
+            numba = sys.modules.get("numba")
+            if numba is not None:  # it has read its environment already
+                numba.config.CACHE_DIR = str(folder)
             return
 
 

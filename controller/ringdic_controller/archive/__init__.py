@@ -1,1 +1,1 @@
-"""The sessions on the disk, and the catalogue of them."""
+"""The session folders on disk, and their catalogue."""

@@ -54,13 +54,13 @@ class Work(Protocol):
         """Lines that the child prints about the order, until the order ends."""
 
     def wait(self) -> int:
-        """Exit code, to be asked for after the last line; 0 of a child that goes on to live."""
+        """Exit code, known after the last line; 0 if the order has ended and its child goes on."""
 
     def end(self) -> None:
         """End the child and everything it started, at once."""
 
     def give_way(self) -> None:
-        """Ask for a stop as soon as intermediate results are safe; the order may complete before."""
+        """Ask the child to stop as soon as its intermediate results are cached; the order may complete before."""
 
 
 class Processing(Protocol):
@@ -299,8 +299,8 @@ def message_of(line: str) -> dict[str, Any] | None:
         message = json.loads(line)
     except json.JSONDecodeError:
         return None
-    known = isinstance(message, dict) and any(name in message for name in ("stage", "state", "worker"))
-    return message if known else None
+    is_message = isinstance(message, dict) and any(name in message for name in ("stage", "state", "worker"))
+    return message if is_message else None
 
 
 def serving_command() -> list[str]:

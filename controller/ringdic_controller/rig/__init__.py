@@ -1,1 +1,1 @@
-"""The rig as the controller sees it: the link to the nodes, capture rounds, and the intake of images."""
+"""The controller's side of the rig: the link to the nodes, capture rounds, and the intake of images."""

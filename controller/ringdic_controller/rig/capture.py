@@ -1,6 +1,6 @@
-"""The controller's capture round as a state machine: an event comes in, actions go out. Standard library only.
+"""The controller's capture round as a state machine without input or output: an event comes in, actions go out.
 
-::
+Needs the standard library only. Times are wall-clock times of the controller, ns since the Unix epoch::
 
     arming       SendArm until every expected camera has answered or the arm deadline passes
                  → refused     a camera is not armed and the operator did not override
@@ -10,13 +10,13 @@
     collecting   images are pushed by the nodes; after a while AskInventory and FetchImage pull what is missing
                  → closed      nothing is pending, or whoever is pending has gone, or the deadline passed
 
-Every expected camera ends ok, late or failed(reason). An image that arrives after the close is archived all the
-same and turns the camera's status to late; `judge` decides about every image alone from the archive's record.
+Every expected camera ends ok, late or failed with a reason. An image that arrives after the close is archived as well
+and turns the camera's status to late; `ringdic_controller.rig.judgement` decides about every image by itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from ringdic_node.wire import (
@@ -34,16 +34,16 @@ SECOND = 1_000_000_000
 
 @dataclass(frozen=True)
 class Timing:
-    """Waits of a round, ns: `lead` from the trigger's sending to its moment, `collect` from there to the deadline."""
+    """Waits of a capture round, ns; all positive."""
 
-    arm: int = 15 * SECOND
+    arm: int = 15 * SECOND  # for the answers of cameras that are to arm
     arm_retry: int = 3 * SECOND
-    lead: int = 400 * MS
+    lead: int = 400 * MS  # from the first trigger message to the moment that it plans
     trigger_retry: int = 80 * MS
-    pull_after: int = 3 * SECOND
+    pull_after: int = 3 * SECOND  # from the planned moment to the first question for missing images
     pull_every: int = 3 * SECOND
-    collect: int = 60 * SECOND
-    gone_grace: int = 2 * SECOND
+    collect: int = 60 * SECOND  # from the planned moment to the close, whatever is missing
+    gone_grace: int = 2 * SECOND  # a node that disappears for less is not given up
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -56,43 +56,57 @@ class Timing:
 
 @dataclass(frozen=True)
 class ArmAnswered:
+    """A node has answered whether its camera is armed."""
+
     reply: ArmReply
 
 
 @dataclass(frozen=True)
 class CaptureOpened:
-    """The archive has made the capture's folder and record."""
+    """The archive has created the capture's folder and record."""
 
     key: CaptureKey
 
 
 @dataclass(frozen=True)
 class TriggerAnswered:
+    """A node has accepted or rejected the trigger."""
+
     reply: TriggerReply
 
 
 @dataclass(frozen=True)
 class ImageArchived:
+    """An image is durable in the archive."""
+
     manifest: Manifest
 
 
 @dataclass(frozen=True)
 class FailureReported:
+    """A node has reported that it took no image, and why."""
+
     failure: Failure
 
 
 @dataclass(frozen=True)
 class InventoryAnswered:
+    """A node has listed the images and failures that it holds."""
+
     inventory: Inventory
 
 
 @dataclass(frozen=True)
 class NodeGone:
+    """A camera's node has lost its connection."""
+
     camera: str
 
 
 @dataclass(frozen=True)
 class NodeBack:
+    """A camera's node is connected again."""
+
     camera: str
 
 
@@ -119,12 +133,14 @@ Event = (
 
 @dataclass(frozen=True)
 class SendArm:
+    """Ask nodes to arm their cameras; answers come back as ArmAnswered."""
+
     cameras: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class OpenCapture:
-    """Make the record; answer with CaptureOpened. `unarmed` tells why cameras will not take part."""
+    """Create the capture's record and answer with CaptureOpened; `unarmed` says, by camera, why it takes no part."""
 
     fire_at_ns: int
     unarmed: dict[str, str]
@@ -132,23 +148,29 @@ class OpenCapture:
 
 @dataclass(frozen=True)
 class SendTrigger:
+    """Ask nodes to capture at the key's planned moment; answers come back as TriggerAnswered."""
+
     cameras: tuple[str, ...]
     key: CaptureKey
 
 
 @dataclass(frozen=True)
 class AskInventory:
+    """Ask nodes which images they hold; answers come back as InventoryAnswered."""
+
     cameras: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class FetchImage:
+    """Pull an image that a node holds."""
+
     manifest: Manifest
 
 
 @dataclass(frozen=True)
 class NoteOutcome:
-    """A camera's outcome changed: tell whoever watches."""
+    """Record a camera's new outcome and report it."""
 
     camera: str
     outcome: CameraOutcome
@@ -156,11 +178,15 @@ class NoteOutcome:
 
 @dataclass(frozen=True)
 class RefuseRound:
+    """End the round without a capture; `reasons` says, by camera, why it is not armed."""
+
     reasons: dict[str, str]
 
 
 @dataclass(frozen=True)
 class CloseCapture:
+    """Close the capture's record with the outcome of every camera."""
+
     outcomes: dict[str, CameraOutcome]
 
 
@@ -169,7 +195,7 @@ Action = SendArm | OpenCapture | SendTrigger | AskInventory | FetchImage | NoteO
 
 @dataclass(frozen=True)
 class CameraOutcome:
-    """How one camera stands: pending, ok or failed, with the reason in words."""
+    """Outcome of a round for one camera: ``status`` pending, ok or failed, the last with the reason in words."""
 
     status: str = "pending"
     reason: str | None = None
@@ -178,7 +204,7 @@ class CameraOutcome:
         if self.status not in ("pending", "ok", "failed"):
             raise ValueError(f"no such outcome: {self.status!r}")
         if self.status == "failed" and not self.reason:
-            raise ValueError("a failed outcome must tell the reason")
+            raise ValueError("a failed outcome must have a reason")
 
 
 class CaptureRound:
@@ -188,12 +214,16 @@ class CaptureRound:
     ----------
     cameras
         Ids of the expected cameras.
+    timing
+        Waits of the round.
+    now
+        Present time, ns, on the clock of every later call.
     absent
-        Those of them that are not connected as the round begins.
-    override : bool
+        Ids of those cameras that are not connected as the round begins.
+    override
         Fire although cameras are not armed; those end as failed with their reason.
-    now : int
-        ns, wall clock of the controller, as in every later call.
+
+    Raises ValueError if there is no camera or one is named twice.
     """
 
     def __init__(
@@ -218,24 +248,26 @@ class CaptureRound:
         self._armed: dict[str, ArmReply] = {}
         self._refusals: dict[str, str] = {}
         self._verdicts: dict[str, TriggerReply] = {}
-        self._gone = dict.fromkeys(absent, now)
+        self._absent_since = dict.fromkeys(absent, now)
         self._next_pull = 0
 
     @property
     def over(self) -> bool:
+        """Whether the round has ended, closed or refused."""
         return self.state in ("closed", "refused")
 
     @property
     def deadline(self) -> int | None:
-        """ns, when the round closes whatever happens; None before the capture is open."""
+        """Time at which the round closes whatever is missing, ns; None before the capture is open."""
         return None if self.key is None else self.key.fire_at_ns + self.timing.collect
 
     @property
     def pending(self) -> tuple[str, ...]:
+        """Ids of the cameras that have no outcome yet."""
         return tuple(camera for camera in self.cameras if self.outcomes[camera].status == "pending")
 
     def handle(self, event: Event, now: int) -> list[Action]:
-        """Take one event; return what to do, in order. After the end nothing is done any more."""
+        """Take one event at a time ``now``, ns; return the actions to perform, in order. None after the end."""
         if self.over:
             return []
         actions: list[Action] = []
@@ -254,9 +286,9 @@ class CaptureRound:
             case InventoryAnswered():
                 actions += self._note_inventory(event.inventory, now)
             case NodeGone():
-                self._gone.setdefault(event.camera, now)
+                self._absent_since.setdefault(event.camera, now)
             case NodeBack():
-                self._gone.pop(event.camera, None)
+                self._absent_since.pop(event.camera, None)
             case RoundTick():
                 pass
         return actions + self._advance(now)
@@ -264,7 +296,12 @@ class CaptureRound:
     def _expects(self, camera: str, key: CaptureKey) -> bool:
         return camera in self.outcomes and self.key == key
 
+    def _is_absent(self, camera: str, now: int) -> bool:
+        """Whether a camera's node has been without connection for longer than a short interruption."""
+        return camera in self._absent_since and now - self._absent_since[camera] >= self.timing.gone_grace
+
     def _advance(self, now: int) -> list[Action]:
+        """Make the transitions that are due at a time; the actions that they need."""
         if self.state == "arming":
             return self._advance_arming(now)
         if self.state == "triggering":
@@ -286,9 +323,9 @@ class CaptureRound:
 
     def _advance_arming(self, now: int) -> list[Action]:
         missing = tuple(camera for camera in self.cameras if camera not in self._armed)
-        # A camera that is not there cannot arm; one that refused may still come round before the deadline.
-        absent = all(camera in self._gone and now - self._gone[camera] >= self.timing.gone_grace for camera in missing)
-        if missing and not absent and now < self._arm_deadline:
+        # A camera that is not connected cannot arm; one that refused may still do so before the deadline.
+        all_absent = all(self._is_absent(camera, now) for camera in missing)
+        if missing and not all_absent and now < self._arm_deadline:
             if now < self._next_send:
                 return []
             self._next_send = now + self.timing.arm_retry
@@ -306,12 +343,12 @@ class CaptureRound:
     def _why_not_armed(self, camera: str) -> str:
         if camera in self._refusals:
             return f"not armed: {self._refusals[camera]}"
-        if camera in self._gone:
+        if camera in self._absent_since:
             return "not armed: the node is not connected"
         return f"not armed: no answer within {self.timing.arm / SECOND:g} s"
 
     def _moment(self, now: int) -> int:
-        """The planned moment, ns: far enough ahead, and on the frame grid if a node told one."""
+        """The moment to capture at, ns: `Timing.lead` ahead, moved to a frame's start if a node gave its frames."""
         earliest = now + self.timing.lead
         for camera in self.cameras:
             reply = self._armed.get(camera)
@@ -334,8 +371,8 @@ class CaptureRound:
     def _note_verdict(self, reply: TriggerReply) -> list[Action]:
         if not self._expects(reply.node, reply.key):
             return []
-        known = self._verdicts.get(reply.node)
-        if known is None or known.verdict == "not armed":
+        earlier = self._verdicts.get(reply.node)
+        if earlier is None or earlier.verdict == "not armed":
             self._verdicts[reply.node] = reply
         if reply.verdict == "late":
             return self._settle(reply.node, CameraOutcome("failed", reply.reason or "the trigger came too late"))
@@ -373,7 +410,7 @@ class CaptureRound:
         for failure in inventory.failures:
             if failure.key == key:
                 return self._note_failure(failure)
-        # Asked after the moment, so a trigger still on its way will be judged late by the node.
+        # The node was asked after the planned moment: it will reject a trigger that is still on its way as late.
         if inventory.capturing != key and now > key.fire_at_ns + self.timing.pull_after:
             return self._settle(camera, CameraOutcome("failed", self._why_missing(camera)))
         return []
@@ -389,12 +426,12 @@ class CaptureRound:
     def _advance_collecting(self, now: int) -> list[Action]:
         assert self.key is not None
         pending = self.pending
-        gone = [c for c in pending if c in self._gone and now - self._gone[c] >= self.timing.gone_grace]
-        if len(gone) < len(pending) and now < self.key.fire_at_ns + self.timing.collect:
+        absent = [camera for camera in pending if self._is_absent(camera, now)]
+        if len(absent) < len(pending) and now < self.key.fire_at_ns + self.timing.collect:
             if now < self._next_pull:
                 return []
             self._next_pull = now + self.timing.pull_every
-            return [AskInventory(tuple(c for c in pending if c not in gone))]
+            return [AskInventory(tuple(camera for camera in pending if camera not in absent))]
         actions: list[Action] = []
         for camera in pending:
             actions += self._settle(camera, CameraOutcome("failed", self._why_unfinished(camera)))
@@ -403,70 +440,40 @@ class CaptureRound:
 
     def _why_unfinished(self, camera: str) -> str:
         verdict = self._verdicts.get(camera)
-        taken = "after it had accepted the trigger" if verdict and verdict.verdict == "accepted" else ""
-        if camera in self._gone:
-            return " ".join(f"the node disappeared {taken}".split()) + ", before its image arrived"
+        after_trigger = " after it had accepted the trigger" if verdict and verdict.verdict == "accepted" else ""
+        if camera in self._absent_since:
+            return f"the node disappeared{after_trigger}, before its image arrived"
         if verdict is None:
             return "the node did not answer the trigger and no image arrived by the deadline"
         return f"no image arrived within {self.timing.collect / SECOND:g} s of the planned moment"
 
     def _settle(self, camera: str, outcome: CameraOutcome) -> list[Action]:
-        """Set the outcome; an archived image is never overruled by a report of failure."""
-        known = self.outcomes[camera]
-        if known == outcome or known.status == "ok":
+        """Set a camera's outcome; an archived image outweighs every report of failure."""
+        present = self.outcomes[camera]
+        if present == outcome or present.status == "ok":
             return []
         self.outcomes[camera] = outcome
         return [NoteOutcome(camera, outcome)]
 
 
-# Judging images ----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """What to do with an image: archive, repeat (it is there already), unknown (no such capture) or corrupt."""
-
-    verdict: str
-    reason: str = ""
-
-
-def judge(
-    manifest: Manifest, sha256: str, length: int, fire_at_ns: int | None, archived: Mapping[str, str | None]
-) -> Judgement:
-    """Decide about one image from its manifest, what really arrived, and the archive's record.
-
-    Parameters
-    ----------
-    sha256, length
-        Of the bytes that arrived.
-    fire_at_ns
-        The planned moment in the archive's record; None: there is no such capture here.
-    archived
-        Per expected camera of the record, the hash of its archived image or None.
-    """
-    if sha256 != manifest.sha256 or length != manifest.bytes:
-        return Judgement("corrupt", f"{length} bytes with another checksum than the {manifest.bytes} promised")
-    if fire_at_ns is None or fire_at_ns != manifest.key.fire_at_ns:
-        return Judgement("unknown", f"no capture {manifest.key} was made here at that moment")
-    if manifest.node not in archived:
-        return Judgement("unknown", f"camera {manifest.node} is not in capture {manifest.key}")
-    if archived[manifest.node] == sha256:
-        return Judgement("repeat")
-    return Judgement("archive")
+# Skew --------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Skew:
-    """Spread of the frames' measured times, ns."""
+    """Spread of the frames' measured times in a capture, ns, and whether it exceeds the tolerance.
+
+    Both are None where fewer than two cameras measured a time, ``exceeded`` also where there is no tolerance.
+    """
 
     skew_ns: int | None
     exceeded: bool | None
 
     @classmethod
     def of(cls, times_ns: Iterable[int | None], tolerance_ns: int | None) -> Skew:
-        """From the measured times; None where fewer than two cameras measured one."""
-        known = [time for time in times_ns if time is not None]
-        if len(known) < 2:
+        """Skew of some cameras' frames, from the time that each measured, ns, or None where it did not."""
+        times = [time for time in times_ns if time is not None]
+        if len(times) < 2:
             return cls(None, None)
-        skew = max(known) - min(known)
+        skew = max(times) - min(times)
         return cls(skew, None if tolerance_ns is None else skew > tolerance_ns)

@@ -1,7 +1,7 @@
-"""Images on their way from the network into the archive: queued, checked, stored, acknowledged.
+"""Intake of images from the network into the archive: they are queued, checked, stored and acknowledged.
 
-An image is acknowledged only after it is durable in the archive under its own checksum. Whatever is not
-acknowledged stays with its node and comes again, so this room may drop an image at any time.
+An image is acknowledged only after it is durable in the archive under its own checksum. An image that is not
+acknowledged stays with its node and is sent again, so the intake may drop any image.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 from ringdic_node.wire import CaptureKey, Failure, Manifest
 
 from ringdic_controller.archive.writer import Archive
-from ringdic_controller.rig.capture import judge
+from ringdic_controller.rig.judgement import judge
 from ringdic_controller.rig.rounds import capture_event
 
 log = logging.getLogger(__name__)
@@ -31,16 +31,20 @@ _Image = tuple[str, CaptureKey, str]  # node, capture, SHA-256
 class Intake:
     """A bounded queue of images and the threads that archive them.
 
+    All callbacks are called with no lock held.
+
     Parameters
     ----------
+    archive
+        Receives the images.
     acknowledge : callable (manifest, verdict)
-        Sends an acknowledgement: ``archived`` or ``unknown``.
+        Sends an acknowledgement to the node: ``archived`` or ``unknown``.
     on_archived : callable (manifest)
-        Told after every image that is safe, repeats included.
+        Called after every image that is durable in the archive, repeats included.
     on_event : callable (dict)
-        Told when a capture's record has changed.
-    limit : int
-        Bytes that may wait; an image beyond it is dropped, for it will be pulled later.
+        Called with `capture_event` when a capture's record has changed.
+    limit
+        Bytes that may wait; an image beyond it is dropped, and pulled from its node later.
     """
 
     def __init__(
@@ -57,20 +61,21 @@ class Intake:
         self._on_archived = on_archived
         self._on_event = on_event
         self._limit = limit
-        self._waiting = 0
-        self._here: set[_Image] = set()
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # guards the two below
+        self._waiting_bytes = 0
+        self._waiting: set[_Image] = set()
         self._inbox: queue.Queue[tuple[Manifest, bytes] | None] = queue.Queue()
         self._threads = [
             threading.Thread(target=self._work, name=f"archivist-{k}", daemon=True) for k in range(ARCHIVISTS)
         ]
 
     def start(self) -> None:
+        """Start the threads."""
         for thread in self._threads:
             thread.start()
 
     def stop(self, timeout: float) -> None:
-        """Archive what has arrived, then end; wait at most `timeout` seconds for it."""
+        """Archive what has arrived, then end the threads; wait at most ``timeout`` seconds for them."""
         deadline = time.monotonic() + timeout
         for _ in self._threads:
             self._inbox.put(None)
@@ -78,43 +83,44 @@ class Intake:
             thread.join(max(deadline - time.monotonic(), 0.0))
 
     def has_room(self, size: int) -> bool:
-        """Whether an image of `size` bytes would be taken."""
+        """Whether an image of ``size`` bytes would be queued."""
         with self._lock:
-            return self._waiting + size <= self._limit
+            return self._waiting_bytes + size <= self._limit
 
     def holds(self, manifest: Manifest) -> bool:
-        """Whether this very image waits here already: it came again, or was pulled while it was being pushed."""
+        """Whether the image waits in the queue already: it came again, or was pulled while it was being pushed."""
         with self._lock:
-            return _image(manifest) in self._here
+            return _image(manifest) in self._waiting
 
     def put(self, manifest: Manifest, image: bytes) -> bool:
-        """Queue an image; returns at once, False if there was no room. One that waits here already is not queued."""
+        """Queue an image, unless it waits already; returns at once, False if there was no room."""
         with self._lock:
-            if _image(manifest) in self._here:
+            if _image(manifest) in self._waiting:
                 return True
-            if self._waiting + len(image) > self._limit:
+            if self._waiting_bytes + len(image) > self._limit:
                 log.warning("the inbox is full; the image of %s from %s will be pulled", manifest.key, manifest.node)
                 return False
-            self._waiting += len(image)
-            self._here.add(_image(manifest))
+            self._waiting_bytes += len(image)
+            self._waiting.add(_image(manifest))
         self._inbox.put((manifest, image))
         return True
 
     def _work(self) -> None:
-        while (parcel := self._inbox.get()) is not None:
-            manifest, image = parcel
+        """Archive one image after the other, until the inbox is closed."""
+        while (entry := self._inbox.get()) is not None:
+            manifest, image = entry
             try:
                 self.take(manifest, image)
             except (OSError, ValueError) as error:  # a full disk, a damaged record: the node keeps the image
                 log.error("the image of %s from %s is not archived: %s", manifest.key, manifest.node, error)
             finally:
                 with self._lock:
-                    self._waiting -= len(image)
-                    self._here.discard(_image(manifest))
-                del parcel, image  # not held until the next one comes
+                    self._waiting_bytes -= len(image)
+                    self._waiting.discard(_image(manifest))
+                del entry, image  # not held until the next one comes
 
     def take(self, manifest: Manifest, image: bytes) -> None:
-        """Check one image, archive it and acknowledge it, or tell the node that it is unknown here."""
+        """Check one image, archive it and acknowledge it; acknowledge it as ``unknown`` if no capture expects it."""
         capture = self._archive.capture(manifest.key.session, manifest.key.capture_id)
         record = capture.record() if capture else None
         sha256 = hashlib.sha256(image).hexdigest()
@@ -141,7 +147,7 @@ class Intake:
             self._on_event(capture_event(capture.record()))
 
     def wants(self, manifest: Manifest) -> bool:
-        """Whether an image that a node holds should be pulled; acknowledges it if it is safe already."""
+        """Whether an image that a node holds should be pulled; acknowledges it if it is archived already."""
         capture = self._archive.capture(manifest.key.session, manifest.key.capture_id)
         if capture is None:
             return False
@@ -149,13 +155,13 @@ class Intake:
         if record["fire_at_ns"] != manifest.key.fire_at_ns or manifest.node not in record["cameras"]:
             return False
         if record["cameras"][manifest.node]["sha256"] == manifest.sha256:
-            self._acknowledge(manifest, "archived")  # the acknowledgement was lost
+            self._acknowledge(manifest, "archived")  # the first acknowledgement was lost
             return False
-        # While a capture is open its round pulls; two transfers would only compete.
+        # While a capture is open, its round pulls the images; a second transfer would compete with that.
         return bool(record["state"] == "closed")
 
     def note_failure(self, failure: Failure) -> None:
-        """Put a node's own reason into the record of a capture that has no image of it."""
+        """Record why a node says it took no image, in place of the general reason in a closed capture's record."""
         capture = self._archive.capture(failure.key.session, failure.key.capture_id)
         if capture is None:
             return

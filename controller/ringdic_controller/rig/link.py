@@ -1,8 +1,8 @@
-"""The live rig: Zenoh router, roster of nodes, capture rounds, archiving and reconciliation.
+"""Link to the rig's nodes over Zenoh: their states, capture rounds, images, and reconciliation.
 
-The only contact of the controller with Zenoh. The router runs inside this process; nodes connect to it.
-Zenoh's callbacks only enqueue: images go to the intake, which archives them in a thread of its own. Another thread
-asks the nodes, when they appear and at an interval, what they still hold.
+This is the controller's only contact with Zenoh. The router runs inside this process, and the nodes connect to it.
+Zenoh's callbacks only queue what they receive; the intake archives images in threads of its own. Another thread asks
+the nodes, when they appear and at an interval, which images they still hold.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class RigBusyError(ComputationError):
 
 @dataclass
 class _Node:
-    """What is known of one camera's node."""
+    """Present state of one camera's node."""
 
     alive: bool = False
     status: NodeStatus | None = None
@@ -65,29 +65,34 @@ class _Node:
     quickest_ns: int = 0
 
     def note_offset(self, round_trip_ns: int, offset_ns: int) -> None:
-        """Keep the clock's offset as seen over a quick round trip; half the round trip bounds its error."""
+        """Take over the node's clock offset, ns, if its round trip, ns, was quick: half of that bounds the error."""
         if self.offset_ms is None or round_trip_ns <= 1.5 * self.quickest_ns:
             self.offset_ms = offset_ns / 1e6
             self.quickest_ns = min(round_trip_ns, self.quickest_ns or round_trip_ns)
 
 
 class RigLink:
-    """The rig's nodes as the rest of the controller sees them; a context manager.
+    """Link to the nodes of a rig; a context manager that listens for them.
 
     Parameters
     ----------
-    rig_name : str
-    cameras : list of str
+    rig_name
+        Name of the rig, which nodes and controller have in common.
+    cameras
         Ids of the expected cameras, in ring order.
-    endpoint : str
+    endpoint
         Where nodes connect, like ``tcp/0.0.0.0:7447``; the port must be a definite one.
-    archive : Archive
+    archive
+        Receives the captures.
     on_event : callable (dict)
-        Told about ``node`` and ``capture`` changes, from several threads.
-    tolerance_ns : int
-        Largest skew of a capture that is not flagged.
-    reconcile_s : float
-        Interval at which nodes are asked what they hold.
+        Called when a node (``type`` node) or a capture (``type`` capture) has changed, from several threads and with
+        no lock held.
+    timing
+        Waits of a capture round; None for the usual ones.
+    tolerance_ns
+        Largest skew of a capture that is not flagged, ns.
+    reconcile_s
+        Interval at which nodes are asked which images they hold, s.
     """
 
     def __init__(
@@ -110,15 +115,14 @@ class RigLink:
         self._timing = timing or Timing()
         self._tolerance_ns = tolerance_ns
         self._reconcile_s = reconcile_s
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # guards the two below
         self._nodes = {camera: _Node() for camera in self.cameras}
+        self._round_events: queue.Queue[steps.Event] | None = None  # of the capture that is under way
         self._intake = Intake(
-            archive, self._acknowledge, lambda manifest: self._tell_round(steps.ImageArchived(manifest)), on_event
+            archive, self._acknowledge, lambda manifest: self._pass_to_round(steps.ImageArchived(manifest)), on_event
         )
-        self._round_events: queue.Queue[steps.Event] | None = None
         self._visits: queue.Queue[str | None] = queue.Queue()
         self._stop = threading.Event()
-        self._capturing = threading.Lock()
 
     def __enter__(self) -> RigLink:
         for name in self._archive.close_unfinished("the controller was restarted before the image arrived"):
@@ -154,7 +158,7 @@ class RigLink:
     # The roster
 
     def roster(self) -> list[dict[str, Any]]:
-        """The expected cameras in ring order with what is known of their nodes."""
+        """One dictionary for each expected camera, in ring order, with the present state of its node."""
         with self._lock:
             return [self._entry(camera, node) for camera, node in self._nodes.items()]
 
@@ -175,7 +179,7 @@ class RigLink:
         }
 
     def wait_for_nodes(self, timeout: float) -> list[str]:
-        """Wait until every expected node is alive; return those that are not when the time (s) is over."""
+        """Wait until every expected node is alive, at most ``timeout`` seconds; ids of those that are not."""
         deadline = time.monotonic() + timeout
         while True:
             with self._lock:
@@ -185,7 +189,7 @@ class RigLink:
             time.sleep(0.05)
 
     def preview(self, camera: str, timeout: float = 3.0) -> bytes | None:
-        """A small PGM of the camera's newest frame, or None if there is none."""
+        """The camera's newest frame as a small PGM (bytes); None if no answer comes within ``timeout`` seconds."""
         for reply in self._session.get(self._keys.node(camera, "preview"), timeout=timeout):
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()
@@ -202,7 +206,7 @@ class RigLink:
             node.seen_ns = time.time_ns()
             entry = self._entry(camera, node)
         log.info("node %s %s", camera, "appeared" if alive else "disappeared")
-        self._tell_round(steps.NodeBack(camera) if alive else steps.NodeGone(camera))
+        self._pass_to_round(steps.NodeBack(camera) if alive else steps.NodeGone(camera))
         if alive:
             self._visits.put(camera)
         self._on_event({"type": "node", "node": entry})
@@ -214,7 +218,7 @@ class RigLink:
             log.warning("a status on %s breaks the contract: %s", sample.key_expr, error)
             return
         if isinstance(message, Failure):
-            self._note_failure(message)
+            self._pass_to_round(steps.FailureReported(message))
         elif isinstance(message, NodeStatus):
             self._note_status(message)
 
@@ -226,12 +230,9 @@ class RigLink:
             before = self._entry(status.node, node)
             node.status, node.seen_ns = status, time.time_ns()
             entry = self._entry(status.node, node)
-        watched = ("alive", "state", "armed", "spool_images")
-        if any(before[name] != entry[name] for name in watched):
+        shown = ("alive", "state", "armed", "spool_images")
+        if any(before[name] != entry[name] for name in shown):
             self._on_event({"type": "node", "node": entry})
-
-    def _note_failure(self, failure: Failure) -> None:
-        self._tell_round(steps.FailureReported(failure))
 
     # Images
 
@@ -277,7 +278,7 @@ class RigLink:
                 self._visit(camera)
 
     def _visit(self, camera: str) -> None:
-        """Reconcile one node; trouble with it must not keep the others from their turn."""
+        """Reconcile one node; an error with it is logged, so that the others have their turn."""
         try:
             self._reconcile_node(camera)
         except (OSError, ValueError, zenoh.ZError) as error:
@@ -285,7 +286,7 @@ class RigLink:
                 log.error("node %s could not be reconciled: %s", camera, error)
 
     def _reconcile_node(self, camera: str) -> None:
-        """Ask one node for its status and its inventory; fetch what the archive lacks."""
+        """Ask one node for its status and its inventory; pull the images that the archive lacks."""
         sent = time.time_ns()
         for status in self._answers(camera, "status", NodeStatus):
             received = time.time_ns()
@@ -300,7 +301,7 @@ class RigLink:
                     self.fetch(manifest)
 
     def fetch(self, manifest: Manifest) -> None:
-        """Pull an image that a node holds; it enters the inbox like a pushed one. Returns at once."""
+        """Pull an image that a node holds; it enters the intake like a pushed one. Returns at once."""
         if self._intake.holds(manifest):
             return
 
@@ -341,25 +342,33 @@ class RigLink:
         override: bool = False,
         settings: dict[str, Any] | None = None,
     ) -> dict[str, Any]:
-        """Capture one image with every camera into `session`; return the closed record.
+        """Capture one image with every camera; return the closed record.
 
-        Blocks until the round closes, at most the sum of its waits. The cameras are locked to `settings`, or else
-        to the ``[capture]`` table of the session's rig.toml.
+        Blocks until the round closes, at most the sum of its waits.
+
+        Parameters
+        ----------
+        session, kind
+            Writer of the session that the images go to, and kind of the capture.
+        override
+            Fire although cameras are not armed.
+        settings
+            Camera settings that the cameras are locked to; None for the ``[capture]`` table of the session's rig.toml.
 
         Raises
         ------
         CaptureRefusedError
-            Not every camera is armed and `override` is not given, or none is armed.
+            Not every camera is armed and ``override`` is not given, or none is armed.
         RigBusyError
             Another capture is under way.
         """
-        if not self._capturing.acquire(blocking=False):
-            raise RigBusyError("a capture is under way; wait until it has closed")
         events: queue.Queue[steps.Event] = queue.Queue()
+        with self._lock:
+            if self._round_events is not None:
+                raise RigBusyError("a capture is under way; wait until it has closed")
+            self._round_events = events
+            absent = [camera for camera, node in self._nodes.items() if not node.alive]
         try:
-            with self._lock:
-                self._round_events = events
-                absent = [camera for camera, node in self._nodes.items() if not node.alive]
             return run_round(
                 self,
                 events,
@@ -376,9 +385,9 @@ class RigLink:
         finally:
             with self._lock:
                 self._round_events = None
-            self._capturing.release()
 
-    def _tell_round(self, event: steps.Event) -> None:
+    def _pass_to_round(self, event: steps.Event) -> None:
+        """Hand an event to the capture that is under way, if there is one."""
         with self._lock:
             events = self._round_events
         if events is not None:
@@ -391,9 +400,9 @@ class RigLink:
         on_answer: Callable[[Any], None],
         timeout: float,
     ) -> None:
-        """Put a question of a round to one node: arm, trigger, or (None) its inventory; returns at once.
+        """Ask one node to arm, to capture or, with None, for its inventory; returns at once.
 
-        `on_answer` is called from Zenoh's thread with a well-formed answer, or never.
+        ``on_answer`` is called from Zenoh's thread with a well-formed answer within ``timeout`` seconds, or never.
         """
         verb, answer = ("inventory", Inventory) if question is None else _ANSWERS[type(question)]
 
@@ -419,7 +428,7 @@ _ANSWERS: dict[type[Any], tuple[str, type[Any]]] = {Arm: ("arm", ArmReply), Trig
 
 
 def _decoded(reply: zenoh.Reply, answer: type[Any]) -> Any | None:
-    """The reply's message; None, with a line in the log, for a refusal or a breach of the contract."""
+    """The message in a reply; None, with a line in the log, for an error or a message that breaks the contract."""
     if reply.ok is None:
         reason = reply.err.payload.to_string() if reply.err else "no reason given"
         log.warning("a question to a node went without its answer: %s", reason)
@@ -432,7 +441,7 @@ def _decoded(reply: zenoh.Reply, answer: type[Any]) -> Any | None:
 
 
 def _router_config(endpoint: str) -> zenoh.Config:
-    """Zenoh's configuration of the controller: the router that all nodes connect to."""
+    """Zenoh's configuration of the controller, which is the router that all nodes connect to."""
     config = zenoh.Config()
     for key, value in {"mode": "router", "listen/endpoints": [endpoint], **NETWORK}.items():
         config.insert_json5(key, json.dumps(value))

@@ -1,4 +1,4 @@
-"""One capture round performed: the round decides, this loop asks nodes, keeps the record and tells who watches."""
+"""Loop that performs a capture round: the state machine decides; this asks nodes, writes the record and reports."""
 
 from __future__ import annotations
 
@@ -22,26 +22,31 @@ HEARTBEAT = 0.02
 
 
 class CaptureRefusedError(ComputationError):
-    """A capture was not fired, because cameras are not armed. `reasons` tells why, by camera."""
+    """No camera was fired, because cameras are not armed; ``reasons`` says why, by camera."""
 
     def __init__(self, reasons: dict[str, str]) -> None:
         self.reasons = reasons
-        told = "; ".join(f"{camera}: {reason}" for camera, reason in reasons.items())
-        super().__init__(f"not captured, because not every camera is armed ({told}); mend it or override")
+        by_camera = "; ".join(f"{camera}: {reason}" for camera, reason in reasons.items())
+        super().__init__(f"not captured, because not every camera is armed ({by_camera}); mend it or override")
 
 
-class Nodes(Protocol):
-    """What a round needs of the network."""
+class NodeQueries(Protocol):
+    """Questions to the nodes that a round needs: `ringdic_controller.rig.link.RigLink` puts them."""
 
     def ask(
         self, camera: str, question: Arm | Trigger | None, on_answer: Callable[[Any], None], timeout: float
-    ) -> None: ...
+    ) -> None:
+        """Ask a node to arm, to capture or, with None, for its inventory; returns at once.
 
-    def fetch(self, manifest: Manifest) -> None: ...
+        ``on_answer`` is called from another thread within ``timeout`` seconds, or never.
+        """
+
+    def fetch(self, manifest: Manifest) -> None:
+        """Pull an image that a node holds into the intake; returns at once."""
 
 
 def run_round(
-    nodes: Nodes,
+    nodes: NodeQueries,
     events: queue.Queue[steps.Event],
     session: SessionWriter,
     kind: str,
@@ -55,14 +60,34 @@ def run_round(
     on_event: Callable[[dict[str, Any]], None],
     wall_ns: Callable[[], int] = time.time_ns,
 ) -> dict[str, Any]:
-    """Run one capture round to its end; return the closed record.
+    """Run one capture round to its end and return the closed record.
 
-    `events` brings what happens meanwhile: archived images, failures, nodes that go and come back.
-    Raises CaptureRefusedError if the round refuses to fire.
+    Parameters
+    ----------
+    nodes
+        Takes the questions to the nodes.
+    events
+        Brings what happens meanwhile: archived images, failures, nodes that go and come back.
+    session, kind
+        Writer of the session, and kind of the capture.
+    cameras, absent
+        Ids of the expected cameras, and of those whose node is not connected.
+    timing, tolerance_ns
+        Waits of the round; largest skew that is not flagged, ns.
+    override
+        Fire although cameras are not armed.
+    settings
+        Camera settings (exposure, gain, …) that the cameras are locked to.
+    on_event
+        Called with `capture_event` when the capture has changed.
+    wall_ns
+        Present time, ns since the Unix epoch.
+
+    Raises CaptureRefusedError if cameras are not armed and ``override`` is not given, or none is armed.
     """
     machine = CaptureRound(cameras, timing, wall_ns(), absent=absent, override=override)
     performer = _Performer(nodes, events, session, kind, tuple(cameras), timing, tolerance_ns, settings, on_event)
-    performer.tell_waiting("arming")
+    performer.report_without_record("arming")
     event: steps.Event = steps.RoundTick()
     while True:
         for action in machine.handle(event, wall_ns()):
@@ -77,11 +102,11 @@ def run_round(
 
 
 class _Performer:
-    """Performs the actions of one round."""
+    """Performs the actions that the state machine of one round asks for."""
 
     def __init__(
         self,
-        nodes: Nodes,
+        nodes: NodeQueries,
         events: queue.Queue[steps.Event],
         session: SessionWriter,
         kind: str,
@@ -110,44 +135,39 @@ class _Performer:
         return self._writer.record()
 
     def perform(self, action: steps.Action) -> None:
+        """Perform one action; raises CaptureRefusedError for RefuseRound."""
         match action:
             case steps.SendArm():
-                for camera in action.cameras:
-                    self._nodes.ask(
-                        camera,
-                        self._arm,
-                        lambda reply: self._events.put(steps.ArmAnswered(reply)),
-                        self._timing.arm / SECOND,
-                    )
+                self._ask(action.cameras, self._arm, steps.ArmAnswered, self._timing.arm / SECOND)
             case steps.OpenCapture():
                 self._open(action)
             case steps.SendTrigger():
-                for camera in action.cameras:
-                    self._nodes.ask(
-                        camera,
-                        Trigger(action.key, self._kind, self._scene),
-                        lambda reply: self._events.put(steps.TriggerAnswered(reply)),
-                        TRIGGER_ANSWER_TIMEOUT,
-                    )
+                trigger = Trigger(action.key, self._kind, self._scene)
+                self._ask(action.cameras, trigger, steps.TriggerAnswered, TRIGGER_ANSWER_TIMEOUT)
             case steps.AskInventory():
-                for camera in action.cameras:
-                    self._nodes.ask(
-                        camera,
-                        None,
-                        lambda reply: self._events.put(steps.InventoryAnswered(reply)),
-                        INVENTORY_TIMEOUT,
-                    )
+                self._ask(action.cameras, None, steps.InventoryAnswered, INVENTORY_TIMEOUT)
             case steps.FetchImage():
                 self._nodes.fetch(action.manifest)
             case steps.NoteOutcome():
                 self._note(action)
             case steps.RefuseRound():
-                self.tell_waiting("refused", action.reasons)
+                self.report_without_record("refused", action.reasons)
                 raise CaptureRefusedError(action.reasons)
             case steps.CloseCapture():
                 assert self._writer is not None
                 reasons = {camera: outcome.reason or "" for camera, outcome in action.outcomes.items()}
                 self._on_event(capture_event(self._writer.close(reasons)))
+
+    def _ask(
+        self,
+        cameras: tuple[str, ...],
+        question: Arm | Trigger | None,
+        event: Callable[[Any], steps.Event],
+        timeout: float,
+    ) -> None:
+        """Put a question to nodes; their answers come back to the state machine as events."""
+        for camera in cameras:
+            self._nodes.ask(camera, question, lambda answer: self._events.put(event(answer)), timeout)
 
     def _open(self, action: steps.OpenCapture) -> None:
         self._writer = self._session.begin_capture(
@@ -166,12 +186,12 @@ class _Performer:
 
     def _note(self, action: steps.NoteOutcome) -> None:
         if self._writer is None or action.outcome.status != "failed":
-            return  # an image's arrival is told by whoever archived it
+            return  # the intake reports an image's arrival
         self._writer.fail(action.camera, action.outcome.reason or "")
         self._on_event(capture_event(self._writer.record()))
 
-    def tell_waiting(self, state: str, reasons: dict[str, str] | None = None) -> None:
-        """Tell of a round that has no record (yet)."""
+    def report_without_record(self, state: str, reasons: dict[str, str] | None = None) -> None:
+        """Report a round that has no record: not yet, or because it was refused."""
         self._on_event(
             {
                 "type": "capture",
@@ -193,9 +213,9 @@ class _Performer:
 
 
 def capture_event(record: dict[str, Any]) -> dict[str, Any]:
-    """What those who watch are told of a capture's record."""
-    told = {name: record[name] for name in ("session", "capture_id", "kind", "state", "skew_ns", "skew_exceeded")}
+    """The event that reports a capture's record: its state, and the status of every camera with its reason."""
+    header = {name: record[name] for name in ("session", "capture_id", "kind", "state", "skew_ns", "skew_exceeded")}
     cameras = {
         camera: {"status": entry["status"], "reason": entry["reason"]} for camera, entry in record["cameras"].items()
     }
-    return {"type": "capture", **told, "cameras": cameras}
+    return {"type": "capture", **header, "cameras": cameras}

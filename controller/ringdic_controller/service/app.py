@@ -17,7 +17,7 @@ from ringdic_controller.service.routes import captures, events, jobs, live_step,
 
 STATIC = Path(__file__).parents[1] / "web" / "static"
 _NO_PAGE = (
-    "<!doctype html><title>RingDIC</title><p>The page is not part of this installation: it was made with "
+    "<!doctype html><title>RingDIC</title><p>The page is not part of this installation: it was built with "
     "RINGDIC_SKIP_PAGE set. Install again without it. The HTTP interface works: see "
     "<a href='/openapi.json'>/openapi.json</a>."
 )

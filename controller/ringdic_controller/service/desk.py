@@ -77,9 +77,7 @@ class Desk:
         self.catalogue = Catalogue(root)
         self.roster = NodeRoster(rig_toml)
         self.sessions = Sessions(self.catalogue, rig_toml, clock)
-        self.rounds = Rounds(
-            self.sessions, self.catalogue, self.roster, self._publish_round, self._publish_and_process_capture
-        )
+        self.rounds = Rounds(self.sessions, self.roster, self._publish_round, self._publish_and_process_capture)
         self.jobs = Jobs(root / ".jobs", processing, lambda job: self.state.publish_job(job))
         self.processing = SessionProcessing(self.sessions, self.catalogue, self.jobs, live, quiet)
         self.state = LiveState(self.catalogue, self.roster, self.sessions, self.rounds, self.jobs)
@@ -127,7 +125,8 @@ class Desk:
         if event.get("type") != "capture":
             self.state.publish_rig()
         elif event["capture_id"] is not None:  # None of a round that has no record yet
-            self.rounds.note_record(event["session"], event["capture_id"])
+            if event["state"] == "open":  # else it is a late image of an earlier capture, or the close
+                self.rounds.note_open(event["session"], event["capture_id"])
             self.state.publish_capture(event["session"], event["capture_id"])
 
     def _refuse_during_capture(self, session: str | None) -> None:

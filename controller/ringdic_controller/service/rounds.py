@@ -11,7 +11,6 @@ from typing import Any
 from ringdic.errors import InputError
 from ringdic_node.wire import CAPTURE_KINDS
 
-from ringdic_controller.archive.catalogue import Catalogue
 from ringdic_controller.service.refusals import NotFoundError, RefusedError
 from ringdic_controller.service.roster import NodeRoster
 from ringdic_controller.service.sessions import Sessions
@@ -44,8 +43,8 @@ class Rounds:
 
     Parameters
     ----------
-    sessions, catalogue, roster
-        Where captures go to, which there are, and the cameras that take them.
+    sessions, roster
+        Where captures go to, and the cameras that take them.
     on_change
         Called with the round after each of its changes, from several threads.
     on_archived
@@ -55,13 +54,11 @@ class Rounds:
     def __init__(
         self,
         sessions: Sessions,
-        catalogue: Catalogue,
         roster: NodeRoster,
         on_change: Callable[[Round], None],
         on_archived: Callable[[Round, str], None],
     ) -> None:
         self._sessions = sessions
-        self._catalogue = catalogue
         self._roster = roster
         self._on_change = on_change
         self._on_archived = on_archived
@@ -127,13 +124,10 @@ class Rounds:
         Thread(target=self._capture, args=(new,), name=f"capture-{new.id}", daemon=True).start()
         return new
 
-    def note_record(self, session: str, capture_id: str) -> None:
-        """Note that a capture's record exists or has changed: a new one is the capture of the running round."""
+    def note_open(self, session: str, capture_id: str) -> None:
+        """Note that a capture is open in a session; it is the capture of the running round."""
         running = self.running()
-        if running is None or running.capture_id is not None or session != running.session:
-            return
-        earlier = {record["capture_id"] for record in self._catalogue.captures(session)}
-        if capture_id not in earlier:  # else it is a late image of an earlier capture
+        if running is not None and running.state == "arming" and running.session == session:
             self._change(running.id, state="open", capture_id=capture_id)
 
     def _capture(self, new: Round) -> None:

@@ -1,1 +1,1 @@
-"""The cameras found from images of a checkerboard and of the dotted cylinder (Solav et al. 2018, steps 0 and 1)."""
+"""Camera calibration from images of a checkerboard and of a dotted cylinder (Solav et al. 2018, steps 0 and 1)."""

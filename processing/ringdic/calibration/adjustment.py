@@ -1,10 +1,13 @@
-"""The joint least-squares adjustment of cameras and target: state, normal equations, steps, weights.
+"""Bundle adjustment of cameras and target by robust least squares: state, normal equations, steps, variances.
 
-Minimised is ``Σ ρ(r / σ) + Σ (x − m)ᵀ Λ (x − m) + Σ (d / σ_d)² + Σ (g − g₀)² / σ_g²``: dots' centroids with Huber's ρ,
-the lenses as the boards know them, print errors d of the dots, geometry g of the sheet. σ follows from the median of
-the residuals, σ_d from the print errors found, each divided by its redundancy (Förstner 1979).
-Parameters: sixteen of each camera (``fx fy s cx cy k1 k2 p1 p2 k3``, ω, τ), radius, pitch, tilt, two of each dot; the
-dots are eliminated from the normal equations (Schur complement).
+The cost is ``Σ ρ(r / σ) + Σ (x − m)ᵀ Λ (x − m) + Σ (d / σ_d)² + Σ (g − g₀)² / σ_g²``: residuals r of the dots'
+centroids with Huber's ρ; lenses x against their estimates m from the boards, with information Λ; print errors d of
+the dots; and geometry g of the sheet against its nominal g₀. σ is estimated from the median of the residuals and σ_d
+from the print errors, each divided by its redundancy (Förstner 1979).
+
+The parameters are sixteen for each of C cameras (``fx fy s cx cy k1 k2 p1 p2 k3``, ω, τ), radius, pitch and tilt of the
+sheet, and two for each of m dots. The dots are eliminated from the normal equations (Schur complement). Units are px,
+mm, rad, or none; a covariance has the products of the units of its parameters.
 """
 
 from __future__ import annotations
@@ -15,38 +18,48 @@ import cv2
 import numpy as np
 import scipy
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Pixels, Vectors
 from ringdic.calibration.parameters import PER_CAMERA
 from ringdic.calibration.patch import (
+    DotViews,
     PrintedSheet,
-    Views,
-    by_sheet,
     patch_jacobians,
     project_centres,
     project_patches,
+    sheet_jacobians,
     sheet_points,
 )
 from ringdic.errors import ComputationError
+from ringdic.geometry.outliers import SIGMA_OF_MAD
 from ringdic.session.rig import Target
 
-#: Residuals beyond this many σ count by their length, not by its square (Huber 1964).
+#: Residuals beyond this many σ enter the cost linearly instead of squared (Huber 1964).
 HUBER = 2.5
-#: The adjustment trusts no centroid and no print to better than this, px and mm.
+#: Least standard deviations of a centroid, px, and of a print error, mm, that the adjustment supposes.
 _PX_FLOOR, _PRINT_FLOOR = 1e-5, 5e-4
 
 
 @dataclass(frozen=True)
 class State:
-    """inner (C, 10), rotation (C, 3, 3), translation (C, 3), the sheet, print errors of the dots (m, 2) mm."""
+    """Values of all parameters of the adjustment.
+
+    inner : (C, 10) fx fy s cx cy k1 k2 p1 p2 k3, px or without unit.
+    rotation, translation : (C, 3, 3) and (C, 3) mm, world to camera.
+    sheet : radius, pitch and tilt of the printed sheet.
+    offsets : (m, 2) mm, print errors of the dots along arc and axis.
+    """
 
     inner: Floats
     rotation: Floats
-    translation: Floats
+    translation: Vectors
     sheet: PrintedSheet
     offsets: Floats
 
-    def moved(self, step: Floats, dots: Floats) -> State:
-        """The state after a step of cameras and sheet (16 C + 3,), and of the dots (m, 2) unless they are held."""
+    def plus(self, step: Floats, dots: Floats) -> State:
+        """The state after a step of the adjustment.
+
+        step : (16 C + 3,) of cameras and sheet; px, rad, mm. dots : (m, 2) mm of the print errors, empty if held.
+        """
         cameras = step[:-3].reshape(-1, PER_CAMERA)
         radius, pitch, tilt = step[-3:]
         turns = np.array([cv2.Rodrigues(omega)[0] for omega in cameras[:, 10:13]])
@@ -61,17 +74,20 @@ class State:
 
 @dataclass(frozen=True)
 class Problem:
-    """What is observed and what is known beforehand.
+    """Observations and prior knowledge of a bundle adjustment.
 
-    px : (n, 2) centroids. camera, dot : (n,) whose and of which dot. rows, columns : (m,) of the dots.
-    lens : (C, 10) lenses expected, with their information matrices lens_information (C, 10, 10), 1/unit².
-    sheet_sigma : (3,) standard deviations of radius, pitch and tilt about the nominal, 0 where held.
-    free : (16 C + 3,) which parameters of cameras and sheet are adjusted. The dots are where their print errors have
-        a scale.
+    px : (n, 2) px, observed centroids.
+    camera, dot : (n,) indices of the camera and the dot of each observation.
+    rows, columns : (m,) of the dots on the target, from 1.
+    lens, lens_information : (C, 10) prior values of the lenses and (C, 10, 10) their information matrices, in the
+        inverse products of the parameters' units, 0 where nothing is known.
+    sheet_sigma : (3,) prior standard deviations of radius (mm), pitch (mm) and tilt (rad); 0 holds the nominal value.
+    free : (16 C + 3,) bool, which parameters of cameras and sheet are adjusted. The dots are adjusted unless the
+        standard deviation of the print errors is 0.
     """
 
     target: Target
-    px: Floats
+    px: Pixels
     camera: Indices
     dot: Indices
     rows: Indices
@@ -81,34 +97,37 @@ class Problem:
     sheet_sigma: Floats
     free: Mask
 
-    def views(self, state: State) -> Views:
-        """The patch of every observation in its camera."""
+    def views(self, state: State) -> DotViews:
+        """The observations with the parameters of their cameras and the positions of their dots."""
         sz = sheet_points(self.target, state.sheet, self.rows, self.columns) + state.offsets
         c = self.camera
-        return Views(state.inner[c], state.rotation[c], state.translation[c], sz[self.dot], state.sheet.radius)
+        return DotViews(state.inner[c], state.rotation[c], state.translation[c], sz[self.dot], state.sheet.radius)
 
-    def project(self, state: State) -> Floats:
-        """Centroids expected. (n, 2) px."""
+    def project(self, state: State) -> Pixels:
+        """Image centroids of the observed dots by a state, (n, 2) px."""
         return project_patches(self.views(state), self.target.dot_shape, self.target.dot_size_mm)
 
-    def project_centres(self, state: State) -> Floats:
-        """Images of the dots' centres. (n, 2) px."""
+    def project_centres(self, state: State) -> Pixels:
+        """Projections of the centres of the observed dots by a state, (n, 2) px."""
         return project_centres(self.views(state))
 
     def lens_gap(self, state: State) -> Floats:
-        """Squared distance of each lens from what is known of it, in units of its covariance. (C,)."""
+        """Squared Mahalanobis distance of each lens from its prior values, (C,) without unit."""
         gap = state.inner - self.lens
         return np.einsum("ci,cij,cj->c", gap, self.lens_information, gap)
 
     def without(self, left_out: Mask) -> Problem:
-        """The same with some observations (n,) taken away."""
+        """The problem without some of its observations. left_out : (n,) bool."""
         return replace(self, px=self.px[~left_out], camera=self.camera[~left_out], dot=self.dot[~left_out])
 
 
 @dataclass(frozen=True)
 class Scales:
-    """Standard deviations of a centroid, px a component, and of the print errors, mm, 0 where the dots are held; and
-    by what the standard errors that the boards gave the lenses must be multiplied, 1 or more.
+    """Scales of the weights of an adjustment.
+
+    px : standard deviation of a centroid, px per component. print : of the print errors, mm per component, 0 where the
+    dots are held. lens : factor, 1 or more, by which the boards' standard errors of the lenses are enlarged so that
+    they agree with the target.
     """
 
     px: float
@@ -118,11 +137,12 @@ class Scales:
 
 @dataclass(frozen=True)
 class Solution:
-    """The adjusted state, the scales and how certain it is.
+    """Result of an adjustment: the state, its scales and its covariance.
 
-    covariance : (16 C + 3, 16 C + 3) of cameras and sheet, zero for what was held.
-    dots_covariance : (m, 2, 2) of the print errors, mm².
-    chi2 : (C,) squared residuals of each camera's centroids in units of their variance, a degree of freedom.
+    covariance : (16 C + 3, 16 C + 3) of cameras and sheet, px, mm and rad; zero for parameters that were held.
+    dots_covariance : (m, 2, 2) mm², of the print errors.
+    chi2 : (C,) sum of squared residuals of each camera's centroids in units of their variance, per degree of freedom.
+    iterations : number of steps.
     """
 
     state: State
@@ -134,9 +154,10 @@ class Solution:
 
 
 def adjust(problem: Problem, start: State, print_sigma: float, *, limit: int = 60) -> Solution:
-    """The adjustment to convergence, scales and all, by Levenberg-Marquardt with reweighting.
+    """Adjust all free parameters to convergence by the Levenberg-Marquardt method, with estimation of the scales.
 
-    print_sigma : mm, expected size of the print errors; the size found takes its place. 0 holds the dots.
+    print_sigma : mm, prior standard deviation of the print errors, replaced by its estimate; 0 holds the dots.
+    limit : largest number of steps.
 
     Raises ComputationError where the observations do not determine the free parameters.
     """
@@ -144,9 +165,9 @@ def adjust(problem: Problem, start: State, print_sigma: float, *, limit: int = 6
     scales = Scales(max(_robust_sigma(problem.px - problem.project(start)), _PX_FLOOR), print_sigma)
     near = settled = False
     while True:
-        normal = _normal(problem, state, scales)
+        normal = _normal_equations(problem, state, scales)
         if near:
-            now = _estimate(problem, state, normal)
+            now = _estimated_scales(problem, state, normal)
             settled = (
                 abs(now.px / scales.px - 1) < 0.005
                 and abs(now.print - scales.print) <= 0.02 * scales.print
@@ -155,7 +176,7 @@ def adjust(problem: Problem, start: State, print_sigma: float, *, limit: int = 6
             scales, normal = now, _reweighted(problem, state, normal, now)
         trial, damping, gained, cost = _step(problem, state, normal, damping)
         iterations += 1
-        # A hundredth of a squared standard deviation is nothing to any parameter, but an exact world ends exactly.
+        # A gain of 1e-2 moves no parameter by more than a tenth of its standard error; exact data reach zero cost.
         at_rest = gained <= 1e-4 * cost or gained <= 1e-12
         done = trial is None or (at_rest and gained <= 1e-2)
         state = state if trial is None else trial
@@ -174,10 +195,12 @@ def adjust(problem: Problem, start: State, print_sigma: float, *, limit: int = 6
 
 @dataclass(frozen=True)
 class _Normal:
-    """Normal equations at a state and at scales: A of the k free parameters of cameras and sheet (k, k), D of each dot
-    (m, 2, 2), B between them (k, m, 2), right sides a (k,) and d (m, 2); the information known beforehand, prior
-    (k, k), is in A. by_rest (2 n, k) and by_dot (n, 2, 2) are the Jacobians and residuals (n, 2), all in px;
-    weights (n, 2) in px⁻².
+    """Normal equations at a state, for given scales.
+
+    A : (k, k) block of the k free parameters of cameras and sheet. D : (m, 2, 2) blocks of the dots. B : (k, m, 2)
+    blocks between them. a, d : (k,) and (m, 2) right sides. prior : (k, k) prior information, which is contained in A.
+    by_rest, by_dot : sparse (2 n, k) and (n, 2, 2) Jacobians of the centroids by the free parameters and by the dots.
+    residuals : (n, 2) px. weights : (n, 2) px⁻².
     """
 
     scales: Scales
@@ -189,15 +212,16 @@ class _Normal:
     prior: Floats
     by_rest: scipy.sparse.csr_array
     by_dot: Floats
-    residuals: Floats
+    residuals: Pixels
     weights: Floats
 
 
-def _normal(problem: Problem, state: State, scales: Scales) -> _Normal:
+def _normal_equations(problem: Problem, state: State, scales: Scales) -> _Normal:
+    """Normal equations of a problem, with Jacobians evaluated at the state."""
     target = problem.target
     px, inner, pose, by_dot, radius = patch_jacobians(problem.views(state), target.dot_shape, target.dot_size_mm)
-    by_sheet_now = by_dot @ by_sheet(target, problem.rows, problem.columns)[problem.dot]
-    values = np.concatenate([inner, pose, radius, by_sheet_now], axis=-1)
+    by_sheet = by_dot @ sheet_jacobians(target, problem.rows, problem.columns)[problem.dot]
+    values = np.concatenate([inner, pose, radius, by_sheet], axis=-1)
     n, C = len(px), len(state.inner)
     at = np.concatenate(
         [
@@ -214,16 +238,17 @@ def _normal(problem: Problem, state: State, scales: Scales) -> _Normal:
 
 
 def _reweighted(problem: Problem, state: State, normal: _Normal, scales: Scales) -> _Normal:
-    """The same at other scales."""
+    """Normal equations with the Jacobians of earlier ones, for other scales."""
     return _assembled(problem, state, scales, normal.by_rest, normal.by_dot, normal.residuals)
 
 
 def _assembled(
-    problem: Problem, state: State, scales: Scales, by_rest: scipy.sparse.csr_array, by_dot: Floats, residuals: Floats
+    problem: Problem, state: State, scales: Scales, by_rest: scipy.sparse.csr_array, by_dot: Floats, residuals: Pixels
 ) -> _Normal:
+    """Normal equations from Jacobians (2 n, k) and (n, 2, 2) and residuals (n, 2) px."""
     m = len(problem.rows) if scales.print else 0
-    w = np.minimum(1.0, HUBER * scales.px / np.maximum(np.abs(residuals), 1e-300)) / scales.px**2  # (n, 2)
-    prior, a = _beforehand(problem, state, scales)
+    w = huber_weights(residuals, scales.px)
+    prior, a = _prior_information(problem, state, scales)
     weighted = by_rest * w.reshape(-1)[:, None]
     A = (by_rest.T @ weighted).toarray() + prior
     a = a + by_rest.T @ (w * residuals).ravel()
@@ -239,8 +264,17 @@ def _assembled(
     return _Normal(scales, A, B, D, a, d, prior, by_rest, by_dot, residuals, w)
 
 
-def _beforehand(problem: Problem, state: State, scales: Scales) -> tuple[Floats, Floats]:
-    """Information on the free parameters known beforehand (k, k), and its pull on the state (k,)."""
+def huber_weights(residuals: Floats, sigma: Floats | float) -> Floats:
+    """Weights of residuals in iteratively reweighted least squares with Huber's cost (1964).
+
+    residuals : (n, 2) px. sigma : standard deviations, px, one number or (n, 2). Returns ``min(1, 2.5 σ/|r|) / σ²``,
+    (n, 2) px⁻².
+    """
+    return np.asarray(np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(residuals), 1e-300)) / sigma**2)
+
+
+def _prior_information(problem: Problem, state: State, scales: Scales) -> tuple[Floats, Floats]:
+    """Information matrix of the prior knowledge of the free parameters (k, k), and its right side (k,)."""
     C = len(state.inner)
     whole, pull = np.zeros((len(problem.free),) * 2), np.zeros(len(problem.free))
     for c, (information, gap) in enumerate(zip(problem.lens_information, state.inner - problem.lens, strict=True)):
@@ -255,18 +289,23 @@ def _beforehand(problem: Problem, state: State, scales: Scales) -> tuple[Floats,
 
 
 def _sheet_gap(problem: Problem, state: State) -> Floats:
+    """Radius, pitch (mm) and tilt (rad) of the sheet minus their nominal values, (3,)."""
     nominal, sheet = PrintedSheet.nominal(problem.target), state.sheet
     return np.array([sheet.radius - nominal.radius, sheet.pitch - nominal.pitch, sheet.tilt])
 
 
 def _step(problem: Problem, state: State, normal: _Normal, damping: float) -> tuple[State | None, float, float, float]:
-    """The state after one step, or None where none lowers the cost; the damping, the gain and the cost before."""
+    """One Levenberg-Marquardt step.
+
+    Returns the new state, or None where no step lowers the cost; the new damping, the decrease of the cost, and the
+    cost before.
+    """
     cost = _cost(problem, state, normal.scales)
     while damping < 1e8:
         rest, dots = _solve(normal, damping)
         step = np.zeros(len(problem.free))
         step[problem.free] = rest
-        trial = state.moved(step, dots)
+        trial = state.plus(step, dots)
         trial_cost = _cost(problem, trial, normal.scales)
         if trial_cost <= cost:
             return trial, damping / 10, cost - trial_cost, cost
@@ -275,6 +314,7 @@ def _step(problem: Problem, state: State, normal: _Normal, damping: float) -> tu
 
 
 def _cost(problem: Problem, state: State, scales: Scales) -> float:
+    """The cost of a state, without unit; infinite where it is not a camera."""
     with np.errstate(all="ignore"):
         t = np.abs(problem.px - problem.project(state)) / scales.px
         cost = float(np.sum(np.where(t <= HUBER, t * t, HUBER * (2 * t - HUBER))))
@@ -286,13 +326,13 @@ def _cost(problem: Problem, state: State, scales: Scales) -> float:
     return cost if np.isfinite(cost) and np.all(state.inner[:, :2] > 0) else float("inf")
 
 
-def _estimate(problem: Problem, state: State, normal: _Normal) -> Scales:
-    """All scales from what is left over, each divided by its redundancy."""
+def _estimated_scales(problem: Problem, state: State, normal: _Normal) -> Scales:
+    """Scales from the residuals of centroids, lenses and print errors, each divided by its redundancy."""
     old = normal.scales
     covariance, crossed, dots = _inverse(normal)
     redundancy = 1 - _leverage(problem, normal, covariance, crossed, dots)
-    telling = redundancy > 0.05  # the rest is what fits anything
-    px = max(_robust_sigma(normal.residuals[telling] / np.sqrt(redundancy[telling])), _PX_FLOOR)
+    testable = redundancy > 0.05  # with less, the parameters fit any value of an observation
+    px = max(_robust_sigma(normal.residuals[testable] / np.sqrt(redundancy[testable])), _PX_FLOOR)
     lens = 1.0
     known: Mask = np.any(problem.lens_information != 0, axis=2)
     if known.any():
@@ -306,11 +346,12 @@ def _estimate(problem: Problem, state: State, normal: _Normal) -> Scales:
         return Scales(px, 0.0, lens)
     count = state.offsets.size
     own = float(np.einsum("mii->", dots)) / old.print**2
-    found = float(np.sqrt(np.sum(state.offsets**2) / max(count - own, 1e-6 * count)))
-    return Scales(px, max(found, _PRINT_FLOOR), lens)
+    print_sigma = float(np.sqrt(np.sum(state.offsets**2) / max(count - own, 1e-6 * count)))
+    return Scales(px, max(print_sigma, _PRINT_FLOOR), lens)
 
 
 def _chi2(problem: Problem, normal: _Normal, redundancy: Floats) -> Floats:
+    """Weighted squared residuals of each camera per degree of freedom, (C,); redundancy : (n, 2)."""
     count = len(problem.lens)
     squares = np.sum(normal.weights * normal.residuals**2, axis=1)
     degrees = np.bincount(problem.camera, weights=redundancy.sum(axis=1), minlength=count)
@@ -318,24 +359,30 @@ def _chi2(problem: Problem, normal: _Normal, redundancy: Floats) -> Floats:
 
 
 def _leverage(problem: Problem, normal: _Normal, covariance: Floats, crossed: Floats, dots: Floats) -> Floats:
-    """Share of each residual (n, 2) that the parameters take up: diagonal of J N⁻¹ Jᵀ W."""
+    """Leverage of each observation (n, 2), the diagonal of J N⁻¹ Jᵀ W: the share of its error that the fit absorbs.
+
+    covariance (k, k), crossed (k, m, 2), dots (m, 2, 2) : of ``_inverse``.
+    """
     J, by_dot = normal.by_rest, normal.by_dot
-    taken = np.sum((J @ covariance) * J.toarray(), axis=1).reshape(-1, 2)
+    leverage = np.sum((J @ covariance) * J.toarray(), axis=1).reshape(-1, 2)
     if len(dots):
         both = (J @ crossed.reshape(len(covariance), -1)).reshape(len(by_dot), 2, -1, 2)
         both = both[np.arange(len(by_dot)), :, problem.dot]
-        taken += 2 * np.einsum("nri,nri->nr", both, by_dot)
-        taken += np.einsum("nri,nij,nrj->nr", by_dot, dots[problem.dot], by_dot)
-    return np.asarray(taken * normal.weights, dtype=np.float64)
+        leverage += 2 * np.einsum("nri,nri->nr", both, by_dot)
+        leverage += np.einsum("nri,nij,nrj->nr", by_dot, dots[problem.dot], by_dot)
+    return np.asarray(leverage * normal.weights, dtype=np.float64)
 
 
 def _robust_sigma(residuals: Floats) -> float:
-    """Standard deviation a component, from the median of its size."""
-    return 1.4826 * float(np.median(np.abs(residuals)))
+    """Standard deviation of a component of residuals (n, 2), from the median of their absolute values."""
+    return SIGMA_OF_MAD * float(np.median(np.abs(residuals)))
 
 
 def _reduced(normal: _Normal, damping: float) -> tuple[tuple[Floats, bool], Floats, Floats, Floats]:
-    """Factor and scale of the equations without the dots, D⁻¹ (m, 2, 2) and B D⁻¹ (k, m, 2)."""
+    """Normal equations of cameras and sheet after elimination of the dots, ``S = A − B D⁻¹ Bᵀ``.
+
+    Returns the Cholesky factor of the scaled S, its scale (k,), D⁻¹ (m, 2, 2) and B D⁻¹ (k, m, 2).
+    """
     A = normal.A + damping * np.diag(np.diag(normal.A))
     inverse_D = np.asarray(np.linalg.inv(normal.D + damping * normal.D * np.eye(2)), dtype=np.float64)
     BD: Floats = np.einsum("kmi,mij->kmj", normal.B, inverse_D)
@@ -352,7 +399,7 @@ def _reduced(normal: _Normal, damping: float) -> tuple[tuple[Floats, bool], Floa
 
 
 def _solve(normal: _Normal, damping: float) -> tuple[Floats, Floats]:
-    """One damped step: of the free parameters of cameras and sheet (k,) and of the dots (m, 2)."""
+    """Solution of the damped normal equations: steps of cameras and sheet (k,) and of the dots (m, 2) mm."""
     factor, scale, inverse_D, BD = _reduced(normal, damping)
     right = normal.a - np.einsum("kmi,mi->k", BD, normal.d)
     rest = scale * scipy.linalg.cho_solve(factor, scale * right)
@@ -361,7 +408,7 @@ def _solve(normal: _Normal, damping: float) -> tuple[Floats, Floats]:
 
 
 def _inverse(normal: _Normal) -> tuple[Floats, Floats, Floats]:
-    """Covariance of the free parameters of cameras and sheet (k, k), with the dots (k, m, 2), of each dot (m, 2, 2)."""
+    """Covariances of cameras and sheet (k, k), of these with the dots (k, m, 2), and of each dot (m, 2, 2) mm²."""
     factor, scale, inverse_D, BD = _reduced(normal, 0.0)
     covariance = scipy.linalg.cho_solve(factor, np.eye(len(scale))) * np.outer(scale, scale)
     crossed = -np.tensordot(covariance, BD, axes=1)

@@ -1,4 +1,4 @@
-"""The corners of a checkerboard in an image, found coarsely and refined at full resolution."""
+"""Detection of the corners of a checkerboard in an image, refined to sub-pixel positions at full resolution."""
 
 from __future__ import annotations
 
@@ -6,29 +6,29 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats
+from ringdic.arrays import Floats, Pixels
 from ringdic.session.rig import Board
 
-#: Long sides to which an image is brought to look for the board, px: smallest first, because it is fastest.
+#: Long sides to which an image is scaled for the detection of the board, px: the smallest first, as it is fastest.
 _SEARCH_SIZES = (1000, 2000)
 
 
 def board_points(board: Board) -> Floats:
-    """Inner corners on the board, in the order of :func:`find_corners`. (n, 2) mm, (0, 0) at the first corner."""
+    """Positions of the inner corners on the board, (n, 2) mm, the first at (0, 0), in the order of `find_corners`."""
     across, along = board.inner_corners
     y, x = np.mgrid[:along, :across]
     return np.column_stack([x.ravel(), y.ravel()]) * float(board.square_mm)
 
 
-def find_corners(image: NDArray[np.generic], inner_corners: tuple[int, int]) -> Floats | None:
-    """Inner corners of the checkerboard, or None where the whole board is not found.
+def find_corners(image: NDArray[np.generic], inner_corners: tuple[int, int]) -> Pixels | None:
+    """Sub-pixel positions of the inner corners of a checkerboard in an image.
 
     image : (height, width) grey, uint8, uint16 or float in 0 … 255.
-    inner_corners : (across, along).
+    inner_corners : numbers of corners (across, along) the board.
 
-    Returns (n, 2) px, first index running fastest along ``across``. Which end of the board comes first is
-    arbitrary, which intrinsics do not feel. Sub-pixel positions: the point to which all grey gradients around the
-    corner are perpendicular (Förstner & Gülch 1987).
+    Returns (n, 2) px, row by row, ``across`` running fastest, or None where the whole board is not detected. Which end
+    of the board comes first is arbitrary; the intrinsics do not depend on it. A corner is the point to which the grey
+    gradients around it are perpendicular (Förstner & Gülch 1987).
     """
     grey = _as_uint8(image)
     rough = _search(grey, inner_corners)
@@ -43,22 +43,22 @@ def find_corners(image: NDArray[np.generic], inner_corners: tuple[int, int]) -> 
     return fine if np.all(moved < 0.35 * spacing) else None
 
 
-def _search(grey: NDArray[np.uint8], inner_corners: tuple[int, int]) -> Floats | None:
-    """Corners good to a pixel or so, from the smallest version of the image that shows the board."""
+def _search(grey: NDArray[np.uint8], inner_corners: tuple[int, int]) -> Pixels | None:
+    """Corners (n, 2) px good to about a pixel, from the smallest scaled image in which the board is detected."""
     height, width = grey.shape
     for size in _SEARCH_SIZES:
         scale = min(size / max(height, width), 2.0)
         method = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
         small = cv2.resize(grey, (round(width * scale), round(height * scale)), interpolation=method).astype(np.uint8)
-        found, corners = cv2.findChessboardCornersSB(small, inner_corners, flags=0)
-        if found:
+        detected, corners = cv2.findChessboardCornersSB(small, inner_corners, flags=0)
+        if detected:
             factor = np.array([width / small.shape[1], height / small.shape[0]])
             return (corners.reshape(-1, 2).astype(float) + 0.5) * factor - 0.5
     return None
 
 
-def _spacing(corners: Floats, inner_corners: tuple[int, int]) -> float:
-    """Smallest distance of neighbouring corners, px."""
+def _spacing(corners: Pixels, inner_corners: tuple[int, int]) -> float:
+    """Smallest distance between neighbouring corners (n, 2), px."""
     grid = corners.reshape(inner_corners[1], inner_corners[0], 2)
     return float(
         min(
@@ -69,6 +69,7 @@ def _spacing(corners: Floats, inner_corners: tuple[int, int]) -> float:
 
 
 def _as_uint8(image: NDArray[np.generic]) -> NDArray[np.uint8]:
+    """Grey levels of the image (height, width) in 8 bits."""
     if image.ndim != 2:
         raise ValueError(f"a grey image has two axes, not {image.ndim}")
     if image.dtype == np.uint8:

@@ -1,8 +1,9 @@
-"""All cameras of a ring and their target adjusted together: what the direct linear transformation starts, ended.
+"""Bundle adjustment of all cameras of a rig and their calibration target, started at the cameras' single calibrations.
 
-Dots are observed as the centroids of the images of printed patches, lenses are known from the boards with their full
-covariance, and the printed dots may lie off their places. Where the lens is free and centroids are taken for centres,
-the focal length absorbs the difference and every diameter comes out too large, with no residual that would tell.
+The observations are the centroids of the images of printed dots, taken as patches of a cylinder. The lenses are known
+from the boards with their full covariance, and the dots may be printed off their nominal positions. (If centroids were
+taken for images of the dots' centres, a free focal length would absorb the difference: every diameter would come out
+too large, and no residual would show it.)
 """
 
 from __future__ import annotations
@@ -14,29 +15,38 @@ from typing import Any
 
 import numpy as np
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Pixels, Vectors
 from ringdic.calibration.adjustment import Problem, Solution, State, adjust
 from ringdic.calibration.camera_calibration import CameraCalibration
-from ringdic.calibration.parameters import PER_CAMERA, Parameters
-from ringdic.calibration.patch import PrintedSheet, Views, project_centres, project_patches, sheet_points, wrapped
+from ringdic.calibration.parameters import PER_CAMERA, CameraParameters
+from ringdic.calibration.patch import (
+    DotViews,
+    PrintedSheet,
+    cylinder_points,
+    project_centres,
+    project_patches,
+    sheet_points,
+)
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.session.rig import Target
 
 log = logging.getLogger(__name__)
 
-#: Corners of a board are not trusted to better than this, px a component.
+#: Least standard deviation of a board's corner that is supposed, px per component.
 _CORNER_SIGMA = 0.005
-#: A centroid further off than this many σ is a gross error.
+#: A centroid whose residual is longer than this many σ is a gross error.
 _GROSS = 6.0
 
 
 @dataclass(frozen=True)
 class TargetPrior:
-    """How far the target may be from its description, as standard deviations; 0 holds it.
+    """Prior standard deviations of the target about its description; 0 holds the nominal value.
 
-    dots : of a dot's place on the sheet, mm in each direction; what is found in the images takes the number's place.
-    radius, pitch : mm. tilt : of the sheet in its surface, rad. The rows' distance is the scale of everything.
+    dots : of the print errors, mm in each direction; only the start of their estimation from the images.
+    radius, pitch : of the printed surface and of its columns, mm. tilt : of the sheet in its surface, rad.
+
+    The distance of the rows is always held: it gives the world its scale.
     """
 
     dots: float = 0.03
@@ -51,20 +61,22 @@ class TargetPrior:
 
 @dataclass(frozen=True)
 class BundleFit:
-    """What the adjustment found beside the cameras.
+    """Result of a bundle adjustment beside the cameras: covariance, target geometry and measures of fit.
 
     cameras : C ids, in the order of the parameters.
-    covariance : (16 C + 3, 16 C + 3) of ``fx fy s cx cy k1 k2 p1 p2 k3``, ω, τ of each camera, then radius, pitch and
-        tilt. A pose moves as ``R ← exp([ω]×) R``, ``t ← t + τ``; rad and mm. Zero for what was held.
-    sheet : as adjusted.
-    px_sigma : standard deviation of a centroid, px a component, from the residuals' median.
-    print_sigma : the same of the print errors, mm a direction; 0 where the dots were held.
-    rows, columns : (m,) dots seen. offsets, offsets_sigma : (m, 2) their print errors along arc and axis, mm.
-    lens_chi2 : (C,) squared distance of the lens from the board's, in units of the board's covariance, a parameter:
-        about 1 or less, or board and target contradict each other. NaN where no board was used.
-    lens_scale : by what the boards' standard errors of the lenses had to be multiplied to agree with the target.
-    chi2 : (C,) squared residuals of a camera's centroids in units of their variance, a degree of freedom: a camera far
-        above 1 is worse than the others.
+    covariance : (16 C + 3, 16 C + 3) of ``fx fy s cx cy k1 k2 p1 p2 k3`` (px or without unit), ω (rad) and τ (mm) of
+        each camera, then radius, pitch (mm) and tilt (rad). The pose is changed as ``R ← exp([ω]×) R``, ``t ← t + τ``.
+        Zero for parameters that were held.
+    sheet : the adjusted geometry of the printed sheet.
+    px_sigma : standard deviation of a centroid, px per component, estimated from the residuals.
+    print_sigma : standard deviation of the print errors, mm per component; 0 where the dots were held.
+    rows, columns : (m,) of the dots seen, from 1.
+    offsets, offsets_sigma : (m, 2) mm, print errors of these dots along arc and axis, and their standard errors.
+    lens_chi2 : (C,) squared Mahalanobis distance of the adjusted lens from the board's estimate, per parameter: about 1
+        or less, unless board and target contradict each other. NaN where no board was used.
+    lens_scale : factor by which the boards' standard errors of the lenses had to be enlarged to agree with the target.
+    chi2 : (C,) squared residuals of a camera's centroids in units of their variance, per degree of freedom: far above 1
+        for a camera that is worse than the others.
     """
 
     cameras: tuple[str, ...]
@@ -87,18 +99,18 @@ class BundleFit:
 
     @property
     def camera_sigma(self) -> Floats:
-        """Standard errors of each camera's parameters. (C, 16)."""
+        """Standard errors of each camera's parameters, (C, 16): px or without unit, then rad and mm."""
         return np.sqrt(np.diag(self.covariance)[:-3]).reshape(-1, PER_CAMERA)
 
     @property
     def sheet_sigma(self) -> Floats:
-        """Standard errors of radius, pitch (mm) and tilt (rad). (3,)."""
+        """Standard errors of radius (mm), pitch (mm) and tilt (rad) of the sheet, (3,)."""
         return np.sqrt(np.diag(self.covariance)[-3:])
 
     def figures(self, target: Target) -> dict[str, Any]:
-        """What an operator reads, as JSON values: the target as found, and a row a camera.
+        """Figures for the operator, as JSON values: the adjusted target, and one row for each camera.
 
-        Lengths mm, ``_px`` px; each ``_sigma`` is the standard error of what it follows.
+        Names end in their unit; a name with ``_sigma`` is the standard error of the quantity before it.
         """
         radius, pitch, tilt = (float(value) for value in self.sheet_sigma)
         sigma = self.camera_sigma
@@ -129,7 +141,7 @@ class BundleFit:
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as JSON values."""
+        """The fit as JSON values."""
         return {
             "cameras": list(self.cameras),
             "covariance": self.covariance.tolist(),
@@ -147,7 +159,7 @@ class BundleFit:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> BundleFit:
-        """The fit of :meth:`to_dict`."""
+        """The fit from the JSON values of :meth:`to_dict`."""
         return cls(
             tuple(values["cameras"]),
             np.array(values["covariance"], dtype=float),
@@ -164,44 +176,54 @@ class BundleFit:
         )
 
 
-def adjust_ring(
+def bundle_adjustment(
     calibrations: Mapping[str, CameraCalibration], target: Target, prior: TargetPrior | None = None
 ) -> tuple[dict[str, CameraCalibration], BundleFit]:
-    """Cameras and target adjusted together.
+    """Adjust all cameras and the target together to the dots that the cameras see.
 
-    calibrations : of the single cameras by id, the start. Lenses fitted to a board are observations with their
-        covariance, lenses given otherwise are held, and where distortion is not corrected focal lengths, skew and
-        centre are free.
-    prior : of the target; None is ``TargetPrior()``.
+    Parameters
+    ----------
+    calibrations : single calibrations by camera id, at which the adjustment starts. A lens that was fitted to a board
+        counts as an observation with its covariance; a lens from a file is held; without distortion, focal lengths,
+        skew and principal point are free.
+    target : description of the target.
+    prior : standard deviations of the target about its description; None is ``TargetPrior()``.
 
-    Returns the calibrations with adjusted cameras, with dots at the places found (mm, the print errors in them), and
-    the fit. Raises ComputationError where the dots do not determine the cameras.
+    Returns
+    -------
+    The calibrations with adjusted cameras and with the dots at their adjusted positions (mm, with print errors), and
+    the fit.
+
+    Raises
+    ------
+    ComputationError : the dots do not determine the cameras.
     """
     prior = prior or TargetPrior()
     ids = tuple(calibrations)
     problem, start = _problem([calibrations[id_] for id_ in ids], target, prior)
-    kept = np.ones(len(problem.px), dtype=bool)
+    inliers = np.ones(len(problem.px), dtype=bool)
     part, solution = problem, adjust(problem, start, prior.dots)
     for _ in range(4):
         lengths = np.linalg.norm(problem.px - problem.project(solution.state), axis=1)
         now = lengths <= _GROSS * max(solution.scales.px, 1e-6)
-        if np.array_equal(now, kept):
+        if np.array_equal(now, inliers):
             break
-        kept = now
-        part = problem.without(~kept)
+        inliers = now
+        part = problem.without(~inliers)
         _require_dots(ids, part)
         solution = adjust(part, solution.state, solution.scales.print)
     log.info(
         "bundle of %d cameras: %d of %d centroids, %.4f px each, print errors %.3f mm, %d steps",
         len(ids),
-        kept.sum(),
-        len(kept),
+        inliers.sum(),
+        len(inliers),
         solution.scales.px,
         solution.scales.print,
         solution.iterations,
     )
     adjusted = {
-        id_: _adjusted(calibrations[id_], number, problem, kept, solution.state) for number, id_ in enumerate(ids)
+        id_: _adjusted_calibration(calibrations[id_], number, problem, inliers, solution.state)
+        for number, id_ in enumerate(ids)
     }
     return adjusted, _fit(ids, part, solution)
 
@@ -214,22 +236,29 @@ def centroid_shift(
     *,
     sheet: PrintedSheet | None = None,
     rotation: Floats | None = None,
-    translation: Floats | None = None,
-) -> Floats:
-    """Centroid of the image of each dot minus the image of its centre, for a target that was moved. (n, 2) px.
+    translation: Vectors | None = None,
+) -> Pixels:
+    """Bias of the centroids of dots: centroid of the image of each dot minus the projection of its centre.
 
-    Measured centroids less this are images of points, which lines of sight through them meet.
+    Measured centroids minus this bias are projections of points, so that lines of sight through them meet.
 
-    rows, columns : (n,), from 1. sheet : as adjusted, else the nominal one.
-    rotation : (3, 3) and translation : (3,) mm, of the target in the world; none leaves it in place.
+    Parameters
+    ----------
+    rows, columns : (n,) of the dots, from 1.
+    sheet : the adjusted geometry of the sheet, or None for the nominal one.
+    rotation, translation : (3, 3) and (3,) mm, motion of the target in the world since the calibration, or None.
+
+    Returns
+    -------
+    (n, 2) px.
     """
     sheet = sheet or PrintedSheet.nominal(target)
-    state = Parameters.of(camera)
+    state = CameraParameters.of(camera)
     R, t = state.rotation, state.translation
     t = t if translation is None else t + R @ np.asarray(translation, dtype=float)
     R = R if rotation is None else R @ np.asarray(rotation, dtype=float)
     n = len(rows)
-    views = Views(
+    views = DotViews(
         np.tile(state.inner, (n, 1)),
         np.tile(R, (n, 1, 1)),
         np.tile(t, (n, 1)),
@@ -240,6 +269,7 @@ def centroid_shift(
 
 
 def _problem(given: list[CameraCalibration], target: Target, prior: TargetPrior) -> tuple[Problem, State]:
+    """Observations and prior knowledge of the adjustment, and the state of the single calibrations."""
     rows = np.concatenate([each.dots.rows for each in given])
     columns = np.concatenate([each.dots.columns for each in given])
     names, dot = np.unique(np.column_stack([columns, rows]), axis=0, return_inverse=True)
@@ -259,7 +289,7 @@ def _problem(given: list[CameraCalibration], target: Target, prior: TargetPrior)
         sheet_sigma=sheet_sigma,
         free=np.concatenate([free_cameras.ravel(), sheet_sigma > 0]),
     )
-    poses = [Parameters.of(each.camera) for each in given]
+    poses = [CameraParameters.of(each.camera) for each in given]
     return problem, State(
         inner,
         np.array([each.rotation for each in poses]),
@@ -270,7 +300,7 @@ def _problem(given: list[CameraCalibration], target: Target, prior: TargetPrior)
 
 
 def _lens(given: CameraCalibration) -> tuple[Floats, Floats, Mask]:
-    """Parameters of a lens (10,), what is known of them (10, 10), and which are free (10,)."""
+    """Parameters of a camera's lens (10,), their prior information (10, 10), and which are free (10,)."""
     information, free = np.zeros((10, 10)), np.zeros(10, dtype=bool)
     if given.camera.intrinsics is None:
         free[:5] = True
@@ -280,40 +310,45 @@ def _lens(given: CameraCalibration) -> tuple[Floats, Floats, Mask]:
         correlation = given.fit.covariance[np.ix_(free, free)] / np.outer(sigma, sigma)
         inflation = max(1.0, 2 * _CORNER_SIGMA**2 / max(given.fit.rms**2, 1e-12))
         information[np.ix_(free, free)] = np.linalg.pinv(correlation) / np.outer(sigma, sigma) / inflation
-    return Parameters.of(given.camera).inner, information, free
+    return CameraParameters.of(given.camera).inner, information, free
 
 
 def _require_dots(ids: tuple[str, ...], part: Problem) -> None:
+    """Raise ComputationError, naming the camera, where fewer than 12 dots of one are inliers."""
     for number, id_ in enumerate(ids):
-        found = int((part.camera == number).sum())
-        if found < 12:
+        count = int((part.camera == number).sum())
+        if count < 12:
             raise ComputationError(
-                f"camera {id_}: only {found} of its dots lie where a camera with its lens can see them; check that the "
+                f"camera {id_}: only {count} of its dots lie where a camera with its lens can see them; check that the "
                 "images of board and target are of this camera, sharp and unscaled"
             )
 
 
-def _adjusted(given: CameraCalibration, number: int, problem: Problem, kept: Mask, state: State) -> CameraCalibration:
-    """One camera's calibration after the adjustment."""
-    found = Parameters(state.inner[number], state.rotation[number], state.translation[number])
-    camera = found.camera(given.camera)
+def _adjusted_calibration(
+    given: CameraCalibration, number: int, problem: Problem, inliers: Mask, state: State
+) -> CameraCalibration:
+    """The calibration of camera ``number`` after the adjustment. inliers : (n,) observations without gross errors."""
+    parameters = CameraParameters(state.inner[number], state.rotation[number], state.translation[number])
+    camera = parameters.camera(given.camera)
     own = problem.camera == number
-    keep = kept[own]
-    dot = problem.dot[own & kept]
-    centroid = problem.project(state)[own & kept]
+    dot = problem.dot[own & inliers]
+    centroid = problem.project(state)[own & inliers]
     sz = sheet_points(problem.target, state.sheet, problem.rows, problem.columns) + state.offsets
-    dots = replace(given.dots.chosen(keep), xyz=wrapped(sz[dot], state.sheet.radius))
+    s, z = sz[dot].T
+    xyz = cylinder_points(state.sheet.radius, s / state.sheet.radius, z)
+    dots = replace(given.dots.subset(inliers[own]), xyz=xyz)
     return replace(
         given,
         camera=camera,
         dots=dots,
         residuals=camera.undistort(dots.px) - camera.undistort(centroid),
-        left_out=given.left_out + int((~keep).sum()),
-        centroid_shift=centroid - problem.project_centres(state)[own & kept],
+        left_out=given.left_out + int((~inliers[own]).sum()),
+        centroid_shift=centroid - problem.project_centres(state)[own & inliers],
     )
 
 
 def _fit(ids: tuple[str, ...], part: Problem, solution: Solution) -> BundleFit:
+    """The fit of a solution of the problem without gross errors."""
     state = solution.state
     dots_sigma = np.sqrt(np.einsum("mii->mi", solution.dots_covariance))
     count = part.free[:-3].reshape(-1, PER_CAMERA)[:, :10].sum(axis=1)

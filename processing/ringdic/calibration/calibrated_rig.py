@@ -1,8 +1,8 @@
-"""All cameras of a session calibrated, and how well they agree on the control points.
+"""Calibration of all cameras of a session, with its quality figures and with advice to the operator.
 
-Each camera is calibrated alone, by the direct linear transformation; the bundle adjustment starts from there. A
-calibration depends on the images of board and target, the rig and the settings alone. It is kept in the session under
-a key made of these, so that a later run, or a run after one more capture, need not repeat it.
+Each camera is first calibrated alone, by the direct linear transformation; the bundle adjustment starts from there. A
+calibration depends only on the images of board and target, the rig and the settings. It is stored in the session under
+a hash of these, so that a later run, or a run after one more capture, does not repeat it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.calibration.advice import camera_advice, pair_advice
-from ringdic.calibration.bundle import BundleFit, TargetPrior, adjust_ring
+from ringdic.calibration.azimuths import AzimuthCandidates, azimuth_candidates, camera_azimuths
+from ringdic.calibration.bundle import BundleFit, TargetPrior, bundle_adjustment
 from ringdic.calibration.camera_calibration import CameraCalibration, calibrate_camera
 from ringdic.calibration.dots import find_dots
 from ringdic.calibration.intrinsics import read_intrinsics
@@ -32,7 +33,6 @@ from ringdic.calibration.quality import (
     camera_quality,
     pair_quality,
 )
-from ringdic.calibration.survey import Sight, sight, survey
 from ringdic.errors import ComputationError, InputError
 from ringdic.session.folder import Capture, Session
 from ringdic.session.images import read_gray
@@ -40,19 +40,22 @@ from ringdic.session.rig import Rig, Target
 from ringdic.settings import CalibrationGroup
 from ringdic.tasks.step_images import Digests
 
-_VERSION = 3  # of what a kept calibration means; raise it when the method changes
-#: A lens this much further from the board's than its uncertainty tells of a fault of board or target.
+_VERSION = 3  # of the method; raise it when stored calibrations are no longer what a new run would give
+#: Squared Mahalanobis distance per parameter between the lenses by board and by target that shows a fault of one.
 _LENS_CHI2 = 25.0
 
 
 @dataclass(frozen=True)
 class CalibratedRig:
-    """Calibrated cameras by id, and one sentence for each that could not take part or whose images disagree.
+    """The calibrated cameras of a rig, with figures and sentences for the operator.
 
     target : as the rig describes it.
-    bundle : of the adjustment of all cameras together, None where each was calibrated alone.
+    cameras : calibrations by camera id.
+    warnings : sentences on cameras without an image of the target, on a rotated target, and on lenses that do not agree
+        with the board.
+    bundle : fit of the bundle adjustment, None where each camera was calibrated alone.
     quality, pairs : figures of each camera, and of the rig's pairs that see dots in common.
-    advice : what could be done for a better calibration, a sentence each.
+    advice : sentences on what would improve the calibration.
     """
 
     target: Target
@@ -67,9 +70,11 @@ class CalibratedRig:
 def calibrate_rig(
     session: Session, settings: CalibrationGroup, progress: Callable[[float, str], None] = lambda *_: None
 ) -> CalibratedRig:
-    """Calibrate every camera that has an image of the target.
+    """Calibrate every camera of a session that has an image of the target.
 
-    Raises InputError or ComputationError, naming the camera, for images that do not determine it.
+    progress : called with the part done, 0 to 1, and the name of what is done.
+
+    Raises InputError or ComputationError, naming the camera, for images that do not determine its calibration.
     """
     targets = session.of_kind("target")
     if not targets:
@@ -82,14 +87,14 @@ def calibrate_rig(
         if camera.id not in target.images
     )
     digests = Digests(session)
-    rig, turned = _surveyed(session, target, taking_part, digests)
-    warnings = (*warnings, *turned)
+    rig, turn_warnings = _with_true_azimuths(session, target, taking_part, digests)
+    warnings = (*warnings, *turn_warnings)
     done = 0
     calibrated: dict[str, CameraCalibration] = {}
     keys: list[str] = []
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         futures = {
-            id_: pool.submit(_calibrated, replace(session, rig=rig), id_, target, settings, digests)
+            id_: pool.submit(_camera_calibration, replace(session, rig=rig), id_, target, settings, digests)
             for id_ in taking_part
         }
         for id_, future in futures.items():
@@ -98,10 +103,11 @@ def calibrate_rig(
             done += 1
             progress(done / len(taking_part), f"camera {id_}")
     if settings.method == "dlt":
-        return _judged(session.rig, CalibratedRig(session.rig.target, calibrated, warnings))
+        return _with_quality(session.rig, CalibratedRig(session.rig.target, calibrated, warnings))
     progress(1.0, "all cameras together")
-    adjusted, fit = _adjusted(session, calibrated, keys, settings)
-    return _judged(session.rig, CalibratedRig(session.rig.target, adjusted, (*warnings, *_contradictions(fit)), fit))
+    adjusted, fit = _bundle(session, calibrated, keys, settings)
+    warnings = (*warnings, *_contradictions(fit))
+    return _with_quality(session.rig, CalibratedRig(session.rig.target, adjusted, warnings, fit))
 
 
 def control_points(first: CameraCalibration, second: CameraCalibration) -> ReconstructionError:
@@ -109,33 +115,34 @@ def control_points(first: CameraCalibration, second: CameraCalibration) -> Recon
     return pair_quality(first, second)[0]
 
 
-def _surveyed(session: Session, seen_in: Capture, ids: list[str], digests: Digests) -> tuple[Rig, tuple[str, ...]]:
-    """The rig with the azimuths at which the cameras stand, from the session's folder if they are there; sentences."""
+def _with_true_azimuths(
+    session: Session, capture: Capture, ids: list[str], digests: Digests
+) -> tuple[Rig, tuple[str, ...]]:
+    """The rig with the azimuths that the images of the target show, and warnings; stored in the session's folder."""
     target = session.rig.target
     cameras = {camera.id: camera for camera in session.rig.cameras if camera.id in ids}
     digest = hashlib.sha256(f"{_VERSION} {target} {list(cameras.values())}".encode())
     for id_ in ids:
-        digest.update(bytes.fromhex(digests.image(seen_in, id_) or ""))
-    kept = session.path / "calibration" / f"survey-{digest.hexdigest()[:16]}.json"
-    if kept.is_file():
-        values = json.loads(kept.read_text(encoding="utf-8"))
-    else:
+        digest.update(bytes.fromhex(digests.image(capture, id_) or ""))
+    path = session.path / "calibration" / f"survey-{digest.hexdigest()[:16]}.json"
+    values = _stored(path)
+    if values is None:
 
-        def seen(id_: str) -> Sight:
-            image = read_gray(seen_in.images[id_])
-            return sight(image, find_dots(image, target), cameras[id_], target)
+        def candidates(id_: str) -> AzimuthCandidates:
+            image = read_gray(capture.images[id_])
+            return azimuth_candidates(image, find_dots(image, target), cameras[id_], target)
 
         with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-            found = survey(dict(zip(cameras, pool.map(seen, cameras), strict=True)), target)
-        values = {"azimuths": found.azimuths, "warnings": list(found.warnings)}
-        _keep(kept, values)
+            result = camera_azimuths(dict(zip(cameras, pool.map(candidates, cameras), strict=True)), target)
+        values = {"azimuths": result.azimuths, "warnings": list(result.warnings)}
+        _store(path, values)
     azimuths = values["azimuths"]
     entries = (replace(c, azimuth_deg=azimuths.get(c.id, c.azimuth_deg)) for c in session.rig.cameras)
     return replace(session.rig, cameras=tuple(entries)), tuple(values["warnings"])
 
 
-def _judged(rig: Rig, ring: CalibratedRig) -> CalibratedRig:
-    """The ring with its figures and with advice."""
+def _with_quality(rig: Rig, ring: CalibratedRig) -> CalibratedRig:
+    """The calibrated rig with figures of its cameras and pairs, and with advice."""
     quality = tuple(camera_quality(each, rig.camera(id_).azimuth_deg) for id_, each in ring.cameras.items())
     advice = [sentence for row in quality for sentence in camera_advice(ring.cameras[row.camera], row)]
     pairs = []
@@ -149,20 +156,21 @@ def _judged(rig: Rig, ring: CalibratedRig) -> CalibratedRig:
     return replace(ring, quality=quality, pairs=tuple(pairs), advice=tuple(advice))
 
 
-def _calibrated(
+def _camera_calibration(
     session: Session, camera_id: str, target: Capture, settings: CalibrationGroup, digests: Digests
 ) -> tuple[CameraCalibration, str]:
-    """One camera's calibration and its key, from the session's folder if it is there, else made and kept."""
+    """The calibration of one camera alone and its key; stored in the session's folder, and read from there again."""
     captures = [capture for capture in session.of_kind("board") if camera_id in capture.images]
     boards = {capture.id: capture.images[camera_id] for capture in captures}
     lens_file = session.rig.camera(camera_id).intrinsics
-    seen = [digests.image(capture, camera_id) or "" for capture in (target, *captures)]
-    key = _key(session, camera_id, seen, settings)
-    kept = session.path / "calibration" / f"{camera_id}-{key}.json"
-    if kept.is_file():
-        return CameraCalibration.from_dict(json.loads(kept.read_text(encoding="utf-8"))), key
-    looked_at = boards if settings.distortion and lens_file is None else {}
-    images = _of_one_size(camera_id, [target.images[camera_id], *looked_at.values()])
+    hashes = [digests.image(capture, camera_id) or "" for capture in (target, *captures)]
+    key = _key(session, camera_id, hashes, settings)
+    path = session.path / "calibration" / f"{camera_id}-{key}.json"
+    values = _stored(path)
+    if values is not None:
+        return CameraCalibration.from_dict(values), key
+    views = boards if settings.distortion and lens_file is None else {}
+    images = _images_of_one_size(camera_id, [target.images[camera_id], *views.values()])
     calibration = calibrate_camera(
         session.rig,
         camera_id,
@@ -175,21 +183,24 @@ def _calibrated(
         skew=settings.skew,
         fewest_terms=settings.terms == "criterion",
         drop_percentile=settings.drop_percentile,
-        board_names=list(looked_at),
+        board_names=list(views),
     )
-    _keep(kept, calibration.to_dict())
+    _store(path, calibration.to_dict())
     return calibration, key
 
 
-def _adjusted(
+def _bundle(
     session: Session, calibrated: dict[str, CameraCalibration], keys: list[str], settings: CalibrationGroup
 ) -> tuple[dict[str, CameraCalibration], BundleFit]:
-    """The cameras adjusted together, from the session's folder if they are there, else made and kept."""
-    own = settings.model_copy(update={"refine_poses": False})  # which comes after the calibration
+    """Bundle adjustment of the cameras; stored in the session's folder, and read from there again.
+
+    keys : of the single calibrations.
+    """
+    own = settings.model_copy(update={"refine_poses": False})  # the poses are refined after the calibration
     digest = hashlib.sha256(f"{_VERSION} {keys} {own}".encode()).hexdigest()[:16]
-    kept = session.path / "calibration" / f"bundle-{digest}.json"
-    if kept.is_file():
-        values = json.loads(kept.read_text(encoding="utf-8"))
+    path = session.path / "calibration" / f"bundle-{digest}.json"
+    values = _stored(path)
+    if values is not None:
         cameras = [CameraCalibration.from_dict(each) for each in values["cameras"]]
         return {each.camera.id: each for each in cameras}, BundleFit.from_dict(values["fit"])
     prior = TargetPrior(
@@ -198,13 +209,13 @@ def _adjusted(
         pitch=settings.pitch_error_mm,
         tilt=math.radians(settings.tilt_error_deg),
     )
-    adjusted, fit = adjust_ring(calibrated, session.rig.target, prior)
-    _keep(kept, {"cameras": [each.to_dict() for each in adjusted.values()], "fit": fit.to_dict()})
+    adjusted, fit = bundle_adjustment(calibrated, session.rig.target, prior)
+    _store(path, {"cameras": [each.to_dict() for each in adjusted.values()], "fit": fit.to_dict()})
     return adjusted, fit
 
 
 def _contradictions(fit: BundleFit) -> tuple[str, ...]:
-    """A sentence where the lenses that the target asks for are not those of the boards."""
+    """A sentence that names cameras whose lenses by target and by board contradict each other; none if all agree."""
     off = [id_ for id_, chi2 in zip(fit.cameras, fit.lens_chi2, strict=True) if chi2 > _LENS_CHI2]
     if not off:
         return ()
@@ -216,15 +227,24 @@ def _contradictions(fit: BundleFit) -> tuple[str, ...]:
     )
 
 
-def _keep(path: Path, values: dict[str, Any]) -> None:
+def _stored(path: Path) -> dict[str, Any] | None:
+    """The values of a JSON file, or None where it does not exist."""
+    if not path.is_file():
+        return None
+    values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return values
+
+
+def _store(path: Path, values: dict[str, Any]) -> None:
+    """Write values to a JSON file, which appears only when it is complete."""
     path.parent.mkdir(exist_ok=True)
     aside = path.with_suffix(".partial")
     aside.write_text(json.dumps(values), encoding="utf-8")
     aside.replace(path)
 
 
-def _of_one_size(camera_id: str, paths: list[Path]) -> list[NDArray]:
-    """The images, grey; InputError names the first whose size differs from that of the first image."""
+def _images_of_one_size(camera_id: str, paths: list[Path]) -> list[NDArray]:
+    """Grey images (height, width) of some files; InputError names one whose size differs from that of the first."""
     images = [read_gray(path) for path in paths]
     height, width = images[0].shape
     for path, image in zip(paths, images, strict=True):
@@ -237,7 +257,7 @@ def _of_one_size(camera_id: str, paths: list[Path]) -> list[NDArray]:
 
 
 def _key(session: Session, camera_id: str, images: list[str], settings: CalibrationGroup) -> str:
-    """Of everything that a camera's calibration depends on. images : SHA-256 of the target's and the boards', hex."""
+    """Hash of all that the calibration of a camera depends on. images : SHA-256 of its images, hexadecimal."""
     digest = hashlib.sha256()
     alone = f"{settings.distortion} {settings.drop_percentile} {settings.terms} {settings.radial_terms}"
     alone += f" {settings.tangential} {settings.skew}"

@@ -1,4 +1,4 @@
-"""One camera calibrated: its lens from the board, its place from the target."""
+"""Calibration of one camera: its lens from images of the board, its projection from an image of the target."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats
+from ringdic.arrays import Pixels
 from ringdic.calibration import dlt
 from ringdic.calibration.board import board_points, find_corners
 from ringdic.calibration.dots import find_dots
@@ -20,40 +20,38 @@ from ringdic.calibration.intrinsics import (
     intrinsics_from_dict,
     intrinsics_to_dict,
 )
-from ringdic.calibration.target import DotObservations, identify
+from ringdic.calibration.target import DotObservations, identify_dots
 from ringdic.errors import ComputationError, InputError
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.session.rig import Rig
 
-Image = NDArray[np.generic]
-
-#: A focal length less certain than this part of itself is not one.
+#: Largest standard error of a focal length that counts as determined, as a part of it.
 _FOCAL_UNCERTAINTY = 0.03
-#: Dots nearer than this to their projection are never gross errors, px.
+#: Least residual of a dot that is a gross error, px.
 _OUTLIER_FLOOR = 0.3
 
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """A calibrated camera and what it rests on.
+    """A calibrated camera with the observations on which it rests.
 
     camera : projection and lens.
-    dots : the dots of the target that were used.
-    residuals : (n, 2) measured minus projected, undistorted px.
-    left_out : number of dots recognised but left out as gross errors.
-    fit : the fit of the lens to the board, or None where it was given or distortion is not corrected.
-    centroid_shift : (n, 2) centroid of a dot's image minus the image of its centre, px, as far as it is modelled: zero
+    dots : the n dots of the target that were used.
+    residuals : (n, 2) undistorted px, measured minus projected positions of the dots.
+    left_out : number of dots that were identified but left out as gross errors.
+    fit : the fit of the lens to the board, or None where the lens was given or distortion is not corrected.
+    centroid_shift : (n, 2) px, bias of the dots' centroids: centroid of the image minus projection of the centre. Zero
         after the direct linear transformation, which takes the one for the other.
-    views : names of the board images on which the fit rests or which it left out, in its order.
-    blank : names of the board images in which the board was not found.
+    views : names of the board images in which the board was detected, in the order of the fit's views.
+    blank : names of the board images in which it was not.
     """
 
     camera: Camera
     dots: DotObservations
-    residuals: Floats
+    residuals: Pixels
     left_out: int
     fit: IntrinsicsFit | None
-    centroid_shift: Floats
+    centroid_shift: Pixels
     views: tuple[str, ...] = ()
     blank: tuple[str, ...] = ()
 
@@ -62,17 +60,17 @@ class CameraCalibration:
             raise ValueError("a calibration needs one residual and one shift of the centroid for each dot")
 
     @property
-    def dot_centres(self) -> Floats:
-        """Images of the dots' centres, measured. (n, 2) px."""
+    def dot_centres(self) -> Pixels:
+        """Measured image positions of the dots' centres: centroids without their bias, (n, 2) px."""
         return self.dots.px - self.centroid_shift
 
     @property
     def residual_rms(self) -> float:
-        """RMS distance of the dots from their projection, undistorted px."""
+        """RMS length of the dots' residuals, undistorted px."""
         return float(np.sqrt(np.mean(np.sum(self.residuals**2, axis=1))))
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as JSON values."""
+        """The calibration as JSON values."""
         lens = self.camera.intrinsics
         return {
             "camera": self.camera.id,
@@ -90,7 +88,7 @@ class CameraCalibration:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> CameraCalibration:
-        """The calibration of :meth:`to_dict`."""
+        """The calibration from the JSON values of :meth:`to_dict`."""
         width, height = values["size"]
         lens, fit = values["intrinsics"], values["intrinsics_fit"]
         return cls(
@@ -113,8 +111,8 @@ class CameraCalibration:
 def calibrate_camera(
     rig: Rig,
     camera_id: str,
-    board_images: Sequence[Image],
-    target_image: Image,
+    board_images: Sequence[NDArray[np.generic]],
+    target_image: NDArray[np.generic],
     *,
     distortion: bool = True,
     intrinsics: Intrinsics | None = None,
@@ -128,112 +126,114 @@ def calibrate_camera(
     linear_light: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> CameraCalibration:
-    """One camera from its images of the board and of the target.
+    """Calibrate a camera from its images of the board and of the target.
 
+    Parameters
+    ----------
     board_images, target_image : grey, (height, width), all of one size; uint8, uint16 or float in 0 … 255.
-    distortion : False calibrates by the DLT alone; the board images are not looked at.
-    intrinsics : the lens, where the rig gives it; the board images are not looked at.
-    radial, tangential, skew, fewest_terms, drop_percentile : see ``calibrate_intrinsics``.
-    board_names : what to call the board images; None numbers them from 1.
-    max_incidence_deg : dots seen more obliquely are not used.
-    linear_light : images are sRGB-coded.
-    progress : called with (images done, images in all).
+    distortion : False calibrates by the DLT alone, without the board images.
+    intrinsics : the lens, where the rig gives it; the board images are then not used.
+    radial, tangential, skew, fewest_terms, drop_percentile : of the lens model, as in `calibrate_intrinsics`.
+    board_names : names of the board images; None numbers them from 1.
+    max_incidence_deg : dots whose surface is seen more obliquely than this are not used.
+    linear_light : True for sRGB-coded images, False for raw ones.
+    progress : called with the number of board images done and their total.
 
-    Raises InputError for images of different sizes, too few views of the board, a target that is not recognised;
-    ComputationError where the views do not determine the lens.
+    Raises
+    ------
+    InputError : images of different sizes, too few views of the board, or a target that is not identified.
+    ComputationError : the views do not determine the lens, or the dots the projection.
     """
-    height, width = target_image.shape
-    size = (width, height)
+    size = (target_image.shape[1], target_image.shape[0])
+    lens = intrinsics if distortion else None
+    _require_one_size(camera_id, size, board_images, lens)
+    fit = None
+    views: tuple[str, ...] = ()
+    blank: tuple[str, ...] = ()
+    if distortion and lens is None:
+        names = [str(i + 1) for i in range(len(board_images))] if board_names is None else list(board_names)
+        corners = _board_corners(rig, camera_id, board_images, progress)
+        views = tuple(name for name, view in zip(names, corners, strict=True) if view is not None)
+        blank = tuple(name for name, view in zip(names, corners, strict=True) if view is None)
+        fit = calibrate_intrinsics(
+            [view for view in corners if view is not None], board_points(rig.board), size,
+            radial=radial, tangential=tangential, skew=skew, fewest_terms=fewest_terms, drop_percentile=drop_percentile,
+        )  # fmt: skip
+        _require_focal_length(camera_id, fit)
+        lens = fit.intrinsics
+    entry = rig.camera(camera_id)
+    dots = identify_dots(
+        find_dots(target_image, rig.target, linear_light=linear_light), rig.target, entry.azimuth_deg,
+        camera=camera_id, intrinsics=lens, rotation_deg=entry.rotation_deg, height_mm=entry.height_mm,
+        max_incidence_deg=max_incidence_deg,
+    )  # fmt: skip
+    return replace(_dlt_calibration(camera_id, size, dots, lens, fit), views=views, blank=blank)
+
+
+def _require_one_size(
+    camera_id: str, size: tuple[int, int], board_images: Sequence[NDArray[np.generic]], lens: Intrinsics | None
+) -> None:
+    """Raise InputError where a board image or the lens has another size (width, height) than the target image."""
+    width, height = size
     for number, image in enumerate(board_images, start=1):
-        if image.shape != target_image.shape:
+        if image.shape != (height, width):
             raise InputError(
                 f"camera {camera_id}: board image {number} is {image.shape[1]} x {image.shape[0]} pixels, the target "
                 f"image is {width} x {height}; all images of a camera must have one size"
             )
-    fit = None
-    found: tuple[str, ...] = ()
-    blank: tuple[str, ...] = ()
-    if not distortion:
-        intrinsics = None
-    elif intrinsics is not None:
-        if intrinsics.size != size:
-            raise InputError(
-                f"camera {camera_id}: its intrinsics are for images of {intrinsics.size[0]} x {intrinsics.size[1]} "
-                f"pixels, the target image is {width} x {height}; give intrinsics made at this size"
-            )
-    else:
-        names = [str(i + 1) for i in range(len(board_images))] if board_names is None else list(board_names)
-        views = _find_views(rig, camera_id, board_images, progress)
-        found = tuple(name for name, view in zip(names, views, strict=True) if view is not None)
-        blank = tuple(name for name, view in zip(names, views, strict=True) if view is None)
-        fit = calibrate_intrinsics(
-            [view for view in views if view is not None],
-            board_points(rig.board),
-            size,
-            radial=radial,
-            tangential=tangential,
-            skew=skew,
-            fewest_terms=fewest_terms,
-            drop_percentile=drop_percentile,
+    if lens is not None and lens.size != size:
+        raise InputError(
+            f"camera {camera_id}: its intrinsics are for images of {lens.size[0]} x {lens.size[1]} "
+            f"pixels, the target image is {width} x {height}; give intrinsics made at this size"
         )
-        _require_focal_length(camera_id, fit)
-        intrinsics = fit.intrinsics
-    entry = rig.camera(camera_id)
-    observed = identify(
-        find_dots(target_image, rig.target, linear_light=linear_light),
-        rig.target,
-        entry.azimuth_deg,
-        camera=camera_id,
-        intrinsics=intrinsics,
-        rotation_deg=entry.rotation_deg,
-        height_mm=entry.height_mm,
-        max_incidence_deg=max_incidence_deg,
-    )
-    return replace(_place(camera_id, size, observed, intrinsics, fit), views=found, blank=blank)
 
 
-def _find_views(
-    rig: Rig, camera_id: str, images: Sequence[Image], progress: Callable[[int, int], None] | None
-) -> list[Floats | None]:
-    """Corners of the board in each image, None where it is not seen whole."""
-    views = []
+def _board_corners(
+    rig: Rig, camera_id: str, images: Sequence[NDArray[np.generic]], progress: Callable[[int, int], None] | None
+) -> list[Pixels | None]:
+    """Corners of the board (n, 2) px in each image, None where the whole board is not detected.
+
+    Raises InputError where it is detected in fewer than ``VIEWS_NEEDED`` images.
+    """
+    corners = []
     for number, image in enumerate(images, start=1):
-        views.append(find_corners(image, rig.board.inner_corners))
+        corners.append(find_corners(image, rig.board.inner_corners))
         if progress is not None:
             progress(number, len(images))
-    found = sum(view is not None for view in views)
-    if found < VIEWS_NEEDED:
+    count = sum(view is not None for view in corners)
+    if count < VIEWS_NEEDED:
         across, along = rig.board.squares
         raise InputError(
-            f"camera {camera_id}: the checkerboard was found in {found} of {len(images)} board images; the lens "
+            f"camera {camera_id}: the checkerboard was found in {count} of {len(images)} board images; the lens "
             f"needs at least {VIEWS_NEEDED}. Check that every image shows the whole board, sharp and without glare, "
             f"and that [board] squares in rig.toml ({across} x {along}) counts its squares; or give the camera an "
             "intrinsics file, or switch calibration.distortion off"
         )
-    return views
+    return corners
 
 
 def _require_focal_length(camera_id: str, fit: IntrinsicsFit) -> None:
+    """Raise ComputationError where the views leave the focal length too uncertain."""
     focal, uncertainty = fit.intrinsics.K[0, 0], fit.sigma[0]
     if not uncertainty <= _FOCAL_UNCERTAINTY * focal:
         raise ComputationError(
-            f"camera {camera_id}: the {len(fit.kept)} views of the checkerboard do not determine its focal length "
+            f"camera {camera_id}: the {len(fit.inliers)} views of the checkerboard do not determine its focal length "
             f"({focal:.0f} ± {uncertainty:.0f} px); tilt the board by 20° to 45° in several directions"
         )
 
 
-def _place(
-    camera_id: str, size: tuple[int, int], observed: DotObservations, lens: Intrinsics | None, fit: IntrinsicsFit | None
+def _dlt_calibration(
+    camera_id: str, size: tuple[int, int], dots: DotObservations, lens: Intrinsics | None, fit: IntrinsicsFit | None
 ) -> CameraCalibration:
-    """The camera's projection from its dots, gross errors left out."""
-    undistorted = observed.px if lens is None else lens.to_undistorted(observed.px)
-    L, kept = dlt.solve_dlt_robust(observed.xyz, undistorted, sigmas=5.0, floor=_OUTLIER_FLOOR)
-    used = observed.chosen(kept)
+    """The calibration whose projection is the DLT of the dots without gross errors."""
+    undistorted = dots.px if lens is None else lens.to_undistorted(dots.px)
+    L, inliers = dlt.solve_dlt_robust(dots.xyz, undistorted, sigmas=5.0, floor=_OUTLIER_FLOOR)
+    used = dots.subset(inliers)
     return CameraCalibration(
         camera=Camera(camera_id, dlt.to_projection(L), size, lens),
         dots=used,
-        residuals=dlt.residuals(L, used.xyz, undistorted[kept]),
-        left_out=int((~kept).sum()),
+        residuals=dlt.residuals(L, used.xyz, undistorted[inliers]),
+        left_out=int((~inliers).sum()),
         fit=fit,
         centroid_shift=np.zeros((len(used), 2)),
     )

@@ -1,22 +1,22 @@
-"""Where in the image a board was seen, and what is left over there in common: two figures of a lens's calibration."""
+"""Two figures of a lens calibration: the part of the image that the board covered, and systematic residuals there."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-from ringdic.arrays import Floats
+from ringdic.arrays import Pixels
 
 #: Cells along the longer side of the image, for the area covered and for the residuals.
 _AREA_CELLS, _CELLS = 120, 10
-#: A cell with fewer corners tells nothing.
+#: A cell with fewer corners has no reliable mean.
 _FEWEST = 8
 
 
-def coverage(views: Floats, size: tuple[int, int]) -> float:
-    """Part of the image, 0 to 1, that lies inside the outline of at least one view.
+def coverage(views: Pixels, size: tuple[int, int]) -> float:
+    """Part of the image, 0 to 1, that lies inside the convex outline of the corners of at least one view.
 
-    views : (v, n, 2) corners, px. size : (width, height), px.
+    views : (v, n, 2) px, corners of the board in v views. size : (width, height) of the image, px.
     """
     scale = _AREA_CELLS / max(size)
     seen = np.zeros((max(1, round(size[1] * scale)), max(1, round(size[0] * scale))), np.uint8)
@@ -26,14 +26,16 @@ def coverage(views: Floats, size: tuple[int, int]) -> float:
     return float(seen.mean())
 
 
-def residual_distortion(px: Floats, residuals: Floats, size: tuple[int, int]) -> float:
-    """RMS over cells of the image of the mean residual in a cell, the share of random errors taken off. px.
+def residual_distortion(px: Pixels, residuals: Pixels, size: tuple[int, int]) -> float:
+    """Systematic residuals of a lens model: RMS over cells of the image of the mean residual in a cell, px.
 
-    px, residuals : (..., 2). size : (width, height). NaN where no cell has corners enough.
+    The variance that random errors of single corners give to such means is subtracted.
+    px, residuals : (..., 2) px, positions of the corners and their residuals. size : (width, height) of the image, px.
+    NaN where no cell has enough corners.
     """
-    places, residuals = px.reshape(-1, 2), residuals.reshape(-1, 2)
+    positions, residuals = px.reshape(-1, 2), residuals.reshape(-1, 2)
     cell = max(size) / _CELLS
-    column, row = np.floor(places.T / cell).astype(int)
+    column, row = np.floor(positions.T / cell).astype(int)
     _, index, count = np.unique(row * 1000 + column, return_inverse=True, return_counts=True)
     mean = np.stack([np.bincount(index, weights=axis) for axis in residuals.T], axis=1) / count[:, None]
     spread = np.sum((residuals - mean[index]) ** 2, axis=1)

@@ -1,24 +1,25 @@
-"""The direct linear transformation: eleven parameters of a camera from control points (Solav et al. 2018, step 1).
+"""Direct linear transformation (DLT): the projection of a camera from control points (Solav et al. 2018, step 1).
 
-``u = (L1 X + L2 Y + L3 Z + L4) / (L9 X + L10 Y + L11 Z + 1)``, ``v = (L5 X + … + L8) / (same)``
-(Abdel-Aziz & Karara 1971).
+``u = (L1 X + L2 Y + L3 Z + L4) / (L9 X + L10 Y + L11 Z + 1)``,
+``v = (L5 X + L6 Y + L7 Z + L8) / (L9 X + L10 Y + L11 Z + 1)`` (Abdel-Aziz & Karara 1971).
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from ringdic.arrays import Floats, Mask
+from ringdic.arrays import Floats, Mask, Pixels, Points
 from ringdic.errors import ComputationError
+from ringdic.geometry.camera import Camera
 
 
-def solve_dlt(xyz: Floats, px: Floats) -> Floats:
-    """The eleven parameters by plain linear least squares over all points.
+def solve_dlt(xyz: Points, px: Pixels) -> Floats:
+    """DLT parameters from control points, by linear least squares over all of them.
 
-    xyz : (n, 3) mm, not all in one plane, n ≥ 6.
+    xyz : (n, 3) mm, world frame, not all in one plane, n ≥ 6.
     px : (n, 2) undistorted px.
 
-    Returns L (11,). Raises ComputationError where the points do not determine it.
+    Returns L1 … L11, (11,). Raises ComputationError where the points do not determine them.
     """
     xyz, px = np.asarray(xyz, dtype=float), np.asarray(px, dtype=float)
     n = len(xyz)
@@ -38,32 +39,56 @@ def solve_dlt(xyz: Floats, px: Floats) -> Floats:
 
 
 def to_projection(L: Floats) -> Floats:
-    """Projection matrix with ``P[2, 3] = 1``. (3, 4)."""
+    """Projection matrix of DLT parameters, scaled to ``P[2, 3] = 1``.
+
+    L : (11,). Returns P (3, 4), world mm to undistorted px.
+    """
     return np.append(np.asarray(L, dtype=float), 1.0).reshape(3, 4)
 
 
-def residuals(L: Floats, xyz: Floats, px: Floats) -> Floats:
-    """Measured minus projected position. (n, 2) px."""
+def to_camera(L: Floats, id_: str = "") -> Camera:
+    """Camera of DLT parameters: without lens distortion and with an unknown image size.
+
+    L : (11,), world mm to undistorted px.
+    """
+    return Camera(id_, to_projection(L), (1, 1))
+
+
+def residuals(L: Floats, xyz: Points, px: Pixels) -> Pixels:
+    """Measured minus projected positions of control points.
+
+    L : (11,) DLT parameters. xyz : (n, 3) mm, world frame. px : (n, 2) undistorted px. Returns (n, 2) px.
+    """
     h = np.asarray(xyz, dtype=float) @ to_projection(L)[:, :3].T + to_projection(L)[:, 3]
     return np.asarray(px, dtype=float) - h[:, :2] / h[:, 2:]
 
 
-def solve_dlt_robust(xyz: Floats, px: Floats, *, sigmas: float = 5.0, floor: float = 0.5) -> tuple[Floats, Mask]:
-    """The DLT without gross errors: points off by more than ``sigmas`` robust standard deviations are left out.
+def solve_dlt_robust(xyz: Points, px: Pixels, *, sigmas: float = 5.0, floor: float = 0.5) -> tuple[Floats, Mask]:
+    """DLT parameters from control points, without those that are gross errors.
 
-    The scale is the median of the residuals' lengths (for a normal error 1.1774 σ a component), never taken
-    smaller than ``floor`` px, so that a good target keeps all its points.
+    Parameters
+    ----------
+    xyz : (n, 3) mm, world frame.
+    px : (n, 2) undistorted px.
+    sigmas, floor : a residual longer than ``sigmas`` robust standard deviations and than ``floor`` px is a gross error.
+        The standard deviation is the median length divided by 1.1774, as for normal errors of both components.
 
-    Returns L (11,) and which points were kept (n,).
+    Returns
+    -------
+    L (11,) and the inliers (n,) bool, on which it rests.
+
+    Raises
+    ------
+    ComputationError : the points do not determine the camera.
     """
-    kept = np.ones(len(xyz), dtype=bool)
+    inliers = np.ones(len(xyz), dtype=bool)
     L = solve_dlt(xyz, px)
     for _ in range(20):
         lengths = np.linalg.norm(residuals(L, xyz, px), axis=1)
-        limit = sigmas * max(float(np.median(lengths[kept])) / 1.1774, floor / sigmas)
+        limit = sigmas * max(float(np.median(lengths[inliers])) / 1.1774, floor / sigmas)
         now = lengths <= limit
-        if np.array_equal(now, kept) or now.sum() < 6:
+        if np.array_equal(now, inliers) or now.sum() < 6:
             break
-        kept = now
-        L = solve_dlt(xyz[kept], px[kept])
-    return L, kept
+        inliers = now
+        L = solve_dlt(xyz[inliers], px[inliers])
+    return L, inliers

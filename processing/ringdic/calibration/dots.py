@@ -1,7 +1,7 @@
-"""Dark dots on a white surface, found in an image and measured to a hundredth of a pixel.
+"""Detection of dark dots on a white surface, with centroids good to a hundredth of a pixel.
 
-The position of a dot is the centroid of its missing light: in linear light, with a plane ``W`` fitted to the white
-around it, ``q = 1 − I / W`` with the extremes flattened, position = Σ q x / Σ q.
+The position of a dot is the centroid of its darkness ``q = 1 − I / W``, where I is the linear light of a pixel and W a
+plane fitted to the white round the dot: position = Σ q x / Σ q. Values of q near 0 and 1 are clipped.
 """
 
 from __future__ import annotations
@@ -12,32 +12,32 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Mask
+from ringdic.arrays import Floats, Mask, Pixels
 from ringdic.session.rig import Target
 
 Grey = NDArray[np.float32]
 
-#: Long side to which an image is reduced to look for dots, px.
+#: Long side to which an image is reduced for the detection of dots, px.
 _SEARCH_SIZE = 1640
-#: Light missing in a dot, as a part of the white around it, to be looked at.
+#: Darkness from which a spot is a candidate, as a part of the white around it.
 _SEARCH_CONTRAST = 0.25
-#: Missing light that is certainly the dot's.
+#: Darkness above which a pixel certainly belongs to a dot.
 _SPOT_CONTRAST = 0.2
-#: Parts of a dot's full missing light that count as none and as all: what lies beyond is noise, texture or sheen.
+#: Parts of a dot's full darkness that count as 0 and as 1: beyond them are noise, texture and gloss.
 _EMPTY, _FULL = 0.05, 0.95
 
 
 @dataclass(frozen=True)
 class Dots:
-    """Dot-like dark spots of an image, dots of the target or not.
+    """Dark spots of an image that may be dots of the target.
 
-    px : (n, 2) centroids, px.
-    width, height : (n,) of the upright box round each spot, px.
-    contrast : (n,) median part of the light missing in it.
+    px : (n, 2) px, centroids.
+    width, height : (n,) px, of the upright box round each spot.
+    contrast : (n,) median darkness of its pixels, 0 to 1.
     size : (width, height) of the image, px.
     """
 
-    px: Floats
+    px: Pixels
     width: Floats
     height: Floats
     contrast: Floats
@@ -56,11 +56,11 @@ class Dots:
 
 
 def find_dots(image: NDArray[np.generic], target: Target, *, linear_light: bool = True) -> Dots:
-    """Every spot of an image that may be a dot of the target.
+    """Dark spots of an image that may be dots of the target, with their centroids.
 
     image : (height, width) grey, uint8, uint16 or float in 0 … 255.
-    target : how large dots can be: all of its rows are taken to be in the image.
-    linear_light : the image is sRGB-coded and is decoded before the centroid is taken; False for raw images.
+    target : its description bounds the size of a dot, supposing that all of its rows are in the image.
+    linear_light : True for an sRGB-coded image, which is decoded before centroids are taken; False for a raw image.
     """
     if image.ndim != 2:
         raise ValueError(f"a grey image has two axes, not {image.ndim}")
@@ -68,27 +68,28 @@ def find_dots(image: NDArray[np.generic], target: Target, *, linear_light: bool 
     boxes = _candidate_boxes(grey, target)
     light = _to_linear(grey) if linear_light else grey
     size = (grey.shape[1], grey.shape[0])
-    measured = [m for box in boxes if (m := _measure(light, box)) is not None]
-    if not measured:
+    spots = [spot for box in boxes if (spot := _measure(light, box)) is not None]
+    if not spots:
         return Dots(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0), size)
-    table = np.array(measured)
+    table = np.array(spots)
     return Dots(table[:, :2], table[:, 2], table[:, 3], table[:, 4], size)
 
 
 def _as_unit(image: NDArray[np.generic]) -> Grey:
+    """Grey levels of the image (height, width) scaled to 0 … 1."""
     full = 65535.0 if image.dtype == np.uint16 else 255.0
     return image.astype(np.float32) / np.float32(full)
 
 
 def _to_linear(coded: Grey) -> Grey:
-    """Light of sRGB values in 0 … 1 (IEC 61966-2-1), by a table finer than any 8-bit or 12-bit step."""
+    """Linear light of sRGB values in 0 … 1 (IEC 61966-2-1), by a table finer than the steps of 12-bit images."""
     x = np.linspace(0.0, 1.0, 65536)
     table = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
     return table[np.clip(coded * 65535.0 + 0.5, 0, 65535).astype(np.uint16)]
 
 
 def _candidate_boxes(grey: Grey, target: Target) -> NDArray[np.intp]:
-    """Boxes (x, y, width, height) of full-size pixels round solid dark spots on bright ground. (m, 4)."""
+    """Upright boxes round solid dark spots on bright ground: (m, 4) x, y, width and height, px of the full image."""
     height, width = grey.shape
     scale = min(1.0, _SEARCH_SIZE / max(height, width))
     small = grey
@@ -110,9 +111,9 @@ def _candidate_boxes(grey: Grey, target: Target) -> NDArray[np.intp]:
 
 
 def _measure(light: Grey, box: NDArray[np.intp]) -> tuple[float, float, float, float, float] | None:
-    """Centroid x, y, width, height and contrast of the spot in a box; None where it is not a spot on white."""
+    """Centroid x and y, width, height (px) and contrast of the spot in a box; None where it is not on white ground."""
     x, y, w, h = (int(value) for value in box)
-    # Blur carries a dot's edge a few pixels outwards.
+    # Blur spreads the edge of a dot a few pixels outwards.
     edge = 2 if h < 12 else 3
     mx, my = max(edge + 3, w // 2), max(edge + 3, h // 2)
     x0, y0 = max(x - mx, 0), max(y - my, 0)
@@ -137,7 +138,7 @@ def _measure(light: Grey, box: NDArray[np.intp]) -> tuple[float, float, float, f
     if counts.max() < 4:
         return None
     spot = labels == counts.argmax()
-    # The blurred edge belongs to the dot: leaving out its faint pixels would draw the centroid to the full ones.
+    # The blurred edge belongs to the dot: without its faint pixels the centroid would be biased to the dark side.
     reach = cv2.dilate(spot.astype(np.uint8), np.ones((2 * edge + 1,) * 2, np.uint8)).astype(bool)
     full = float(np.median(missing[spot]))
     q = np.where(reach, np.clip((missing / full - _EMPTY) / (_FULL - _EMPTY), 0.0, 1.0), 0.0)
@@ -152,7 +153,7 @@ def _measure(light: Grey, box: NDArray[np.intp]) -> tuple[float, float, float, f
 
 
 def _fit_plane(columns: NDArray[np.intp], rows: NDArray[np.intp], window: Floats, chosen: Mask) -> Floats:
-    """Least-squares plane through the chosen pixels, over the whole window."""
+    """Least-squares plane through the chosen pixels, evaluated at all pixels of the window (height, width)."""
     cx, cy = columns.mean(), rows.mean()
     A = np.column_stack([columns[chosen] - cx, rows[chosen] - cy, np.ones(int(chosen.sum()))])
     a, b, c = np.linalg.solve(A.T @ A, A.T @ window[chosen])

@@ -1,7 +1,7 @@
-"""Cameras that moved: the mean vertical residual of matches, step by step, as sentences for the operator.
+"""Detection of cameras that moved, by the mean distance of matches from their epipolar lines, step by step.
 
-Steady cameras leave nothing in the mean across the epipolar line. What they leave at the reference came between the
-calibration and the reference image, what is added later came between two steps.
+Matches between cameras that stand still lie on their epipolar lines in the mean. A mean distance at the reference step
+shows a motion between calibration and reference; what is added at later steps shows a motion since.
 """
 
 from __future__ import annotations
@@ -12,14 +12,15 @@ import numpy as np
 
 from ringdic.arrays import Floats
 
-#: Mean vertical residual beyond which a camera has moved, px.
+#: Mean distance from the epipolar lines beyond which a camera has moved, px.
 LIMIT = 0.1
 
 
 def drift_sentences(drift: Mapping[str, Floats], steps: Sequence[str], limit: float = LIMIT) -> tuple[str, ...]:
-    """One sentence for what moved since the calibration, and one for what moved between steps; none where all is still.
+    """Sentences that name the cameras that moved before the reference and after it; none where all stood still.
 
-    drift : (F,) px by camera or pair; NaN where not measured. steps : F names. limit : px.
+    drift : for each camera or pair (F,) px, signed mean distance from the epipolar line at each step, NaN where not
+    measured. steps : F names. limit : px.
     """
     measured = {who: values for who, values in drift.items() if len(values)}
     before = {who: float(values[0]) for who, values in measured.items() if abs(values[0]) > limit}

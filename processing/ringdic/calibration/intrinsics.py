@@ -1,7 +1,8 @@
-"""A camera's inner orientation from views of a plane checkerboard (Zhang 2000), with skew and with its uncertainty.
+"""Intrinsic calibration of a camera from views of a plane checkerboard (Zhang 2000), with the covariance of its lens.
 
-The parameters are ``fx fy s cx cy k1 k2 p1 p2 k3``; each view adds a pose of six. Levenberg-Marquardt on the
-reprojection error of all corners; the poses are eliminated from the normal equations (Schur complement).
+The parameters are ``fx fy s cx cy k1 k2 p1 p2 k3`` and six of the pose of each view. The reprojection error of all
+corners is minimised by the Levenberg-Marquardt method; the poses are eliminated from the normal equations (Schur
+complement).
 """
 
 from __future__ import annotations
@@ -15,10 +16,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ringdic.arrays import Floats, Mask
+from ringdic.arrays import Floats, Mask, Pixels, Points
 from ringdic.calibration.coverage import coverage, residual_distortion
-from ringdic.calibration.lens_model import LensModel, LensModelChoice, choose, independent, possible
-from ringdic.calibration.parameters import lens_jacobians
+from ringdic.calibration.lens_model import (
+    LensModel,
+    LensModelChoice,
+    candidate_models,
+    choose_model,
+    independent_observations,
+)
+from ringdic.calibration.parameters import lens_of, pose_jacobians
 from ringdic.errors import ComputationError, InputError
 from ringdic.geometry.camera import Intrinsics
 
@@ -26,37 +33,38 @@ log = logging.getLogger(__name__)
 
 PARAMETERS = ("fx", "fy", "s", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 
-#: A third radial term less certain than this is left at zero: the views cannot tell it from the second.
+#: A third radial term with a larger standard error is held at zero: the views do not separate it from the second.
 K3_SIGMA_LIMIT = 0.2
-#: With fewer views than this no view is dropped for being above the percentile.
+#: With fewer views than this, none is left out for an error above the percentile.
 VIEWS_FOR_DROPPING = 10
-#: Parameters that every lens has.
+#: Which of the parameters every lens has.
 _ALWAYS = np.array([True, True, False, True, True, True, True, False, False, False])
-#: No corner is better than this, px.
+#: Least standard deviation of a corner that is supposed, px.
 _CORNER_FLOOR = 1e-6
-#: Views without which a camera with free skew, focal lengths and centre is not determined.
+#: Fewest views that determine a camera with free skew, focal lengths and principal point.
 VIEWS_NEEDED = 3
 
 
 @dataclass(frozen=True)
 class IntrinsicsFit:
-    """The intrinsics of a camera and how well they are known.
+    """Intrinsics of a camera from views of a board, with their uncertainty and measures of fit.
 
-    sigma : (10,), standard errors in the order of ``PARAMETERS``; 0 for a parameter that was held.
-    view_errors : (n,), RMS distance of each given view's corners after the fit, px; also of the views left out.
-    kept : (n,), which views the fit rests on.
-    rms : RMS distance over the kept views, px.
-    covariance : (10, 10) of the same parameters; rows and columns of held ones are 0.
-    model : the terms that are free, in words. reason : why these.
-    coverage : part of the image that the kept views of the board cover together.
-    residual_distortion : px, RMS over the cells of the image of what corners seen there are off in common, which
-        noise does not explain: a lens or a board that is not as the model says.
+    intrinsics : the lens.
+    sigma : (10,) standard errors in the order of ``PARAMETERS``, px or without unit; 0 for a parameter that was held.
+    view_errors : (n,) px, RMS residual of the corners of each view, also of the views that were left out.
+    inliers : (n,) bool, the views on which the fit rests.
+    rms : RMS residual over these views, px.
+    covariance : (10, 10) of the parameters in the order of ``PARAMETERS``; 0 for those that were held.
+    model : the free terms of the lens, in words. reason : why these were chosen.
+    coverage : part of the image that the board covers in these views together, 0 to 1.
+    residual_distortion : px, RMS over cells of the image of the mean residual in a cell, less what noise explains; it
+        shows a lens or a board that differs from the model.
     """
 
     intrinsics: Intrinsics
     sigma: Floats
     view_errors: Floats
-    kept: Mask
+    inliers: Mask
     rms: float
     covariance: Floats
     model: str = ""
@@ -70,7 +78,7 @@ class IntrinsicsFit:
             "intrinsics": intrinsics_to_dict(self.intrinsics),
             "sigma": self.sigma.tolist(),
             "view_errors": self.view_errors.tolist(),
-            "kept": self.kept.tolist(),
+            "kept": self.inliers.tolist(),
             "rms": self.rms,
             "covariance": self.covariance.tolist(),
             "model": self.model,
@@ -81,7 +89,7 @@ class IntrinsicsFit:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> IntrinsicsFit:
-        """The fit of :meth:`to_dict`."""
+        """The fit from the JSON values of :meth:`to_dict`."""
         return cls(
             intrinsics_from_dict(values["intrinsics"]),
             np.array(values["sigma"], dtype=float),
@@ -97,7 +105,7 @@ class IntrinsicsFit:
 
 
 def intrinsics_to_dict(intrinsics: Intrinsics) -> dict[str, Any]:
-    """Intrinsics as JSON values."""
+    """JSON values of intrinsics: K, distortion and size."""
     return {
         "K": intrinsics.K.tolist(),
         "distortion": intrinsics.distortion.tolist(),
@@ -106,13 +114,17 @@ def intrinsics_to_dict(intrinsics: Intrinsics) -> dict[str, Any]:
 
 
 def intrinsics_from_dict(values: dict[str, Any]) -> Intrinsics:
-    """Intrinsics of :func:`intrinsics_to_dict`."""
+    """Intrinsics from the JSON values of :func:`intrinsics_to_dict`."""
     width, height = values["size"]
     return Intrinsics(np.array(values["K"]), np.array(values["distortion"]), (int(width), int(height)))
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
-    """Intrinsics of a JSON file: ``K`` (3 × 3, px), ``distortion`` (k1 k2 p1 p2 k3), ``size`` (width, height)."""
+    """Read the intrinsics of a camera from a JSON file.
+
+    The file holds ``K`` (3 x 3, px), ``distortion`` (k1 k2 p1 p2 k3) and ``size`` (width, height). Raises InputError,
+    naming the file, where it does not exist or is not such a file.
+    """
     path = Path(path)
     try:
         return intrinsics_from_dict(json.loads(path.read_text(encoding="utf-8")))
@@ -126,7 +138,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
 
 
 def calibrate_intrinsics(
-    views: list[Floats],
+    views: list[Pixels],
     board_xy: Floats,
     size: tuple[int, int],
     *,
@@ -136,18 +148,22 @@ def calibrate_intrinsics(
     fewest_terms: bool = False,
     drop_percentile: float = 80.0,
 ) -> IntrinsicsFit:
-    """Intrinsics from the corners of a board in several views.
+    """Intrinsics of a camera from the corners of a plane board in several views.
 
+    Parameters
+    ----------
     views : corners of each view, (n, 2) px, all n corners in the order of ``board_xy``.
-    board_xy : (n, 2) mm.
-    size : (width, height), px.
-    radial : number of radial terms, 2 or 3; None takes 3 where the standard error of k3 is below ``K3_SIGMA_LIMIT``.
-    tangential, skew : whether these are free.
-    fewest_terms : of the models without some of these terms that of the smallest information criterion is taken.
-    drop_percentile : views whose error lies above this percentile are left out and the rest is fitted again, where
-        there are at least ``VIEWS_FOR_DROPPING``; 100 keeps all.
+    board_xy : (n, 2) mm, corners on the board.
+    size : (width, height) of the image, px.
+    radial : number of radial terms, 2 or 3; None takes 3 if the standard error of k3 is below ``K3_SIGMA_LIMIT``.
+    tangential, skew : whether these terms are free.
+    fewest_terms : True takes, of all models with some of these terms, that of the least information criterion.
+    drop_percentile : with at least ``VIEWS_FOR_DROPPING`` views, those with an error above this percentile are left
+        out and the others are fitted again; 100 keeps all.
 
-    Raises ComputationError where there are too few views.
+    Raises
+    ------
+    ComputationError : fewer than ``VIEWS_NEEDED`` views, or the corners are not those of a board.
     """
     if len(views) < VIEWS_NEEDED:
         raise ComputationError(
@@ -155,68 +171,76 @@ def calibrate_intrinsics(
         )
     px = np.stack([np.asarray(view, dtype=float).reshape(-1, 2) for view in views])
     board = np.column_stack([np.asarray(board_xy, dtype=float), np.zeros(len(board_xy))])
-    models = possible(radial, tangential, skew, fewest_terms)
-    largest = models[0]
-    whole, _ = _refine(_start(px, board, size), px, board, largest.free)
-    kept = _views_to_keep(_view_errors(whole, px, board), drop_percentile)
-    inner, rotations, translations = whole
-    best = px[kept]
-    fits: dict[LensModel, tuple[State, Floats]] = {}
-
-    def fit(model: LensModel) -> tuple[float, float]:
-        start = (np.where(model.free | _ALWAYS, inner, 0.0), rotations[kept], translations[kept])
-        fits[model] = _refine(start, best, board, model.free)
-        state, covariance = fits[model]
-        return _cost(state, best, board) / best.size, float(np.sqrt(covariance[9, 9]))
-
-    worth = independent((px - _project(whole, board)[0])[kept], board[:, :2])
-    choice = choose(models, fit, worth, K3_SIGMA_LIMIT, fewest_terms)
-    if choice.model not in fits:
-        fit(choice.model)
-    (inner, rotations_kept, translations_kept), covariance = fits[choice.model]
-    rotations, translations = rotations.copy(), translations.copy()
-    rotations[kept], translations[kept] = rotations_kept, translations_kept
-    state = (inner, *_poses_refined(inner, rotations, translations, px, board))
+    models = candidate_models(radial, tangential, skew, fewest_terms)
+    state, _ = _refine(_start(px, board, size), px, board, models[0].free)
+    inliers = _inlier_views(_view_errors(state, px, board), drop_percentile)
+    choice, state, covariance = _fit_of_chosen_model(models, state, px, board, inliers, fewest_terms)
+    state, _ = _refine(state, px, board, np.zeros(10, dtype=bool))  # poses of all views, with the intrinsics held
     errors = _view_errors(state, px, board)
-    residuals = (px - _project(state, board)[0])[kept]
-    rms = float(np.sqrt(np.mean(errors[kept] ** 2)))
-    log.info("intrinsics from %d of %d views, %s (%s), RMS %.3f px", kept.sum(), len(views), *_words(choice), rms)
+    residuals = (px - _project(state, board))[inliers]
+    rms = float(np.sqrt(np.mean(errors[inliers] ** 2)))
+    model = str(choice.model)
+    log.info("intrinsics from %d of %d views, %s (%s), RMS %.3f px", inliers.sum(), len(px), model, choice.reason, rms)
     return IntrinsicsFit(
-        _intrinsics(inner, size),
+        lens_of(state[0], size),
         np.sqrt(np.diag(covariance)),
         errors,
-        kept,
+        inliers,
         rms,
         covariance,
-        *_words(choice),
-        coverage(best, size),
-        residual_distortion(best, residuals, size),
+        model,
+        choice.reason,
+        coverage(px[inliers], size),
+        residual_distortion(px[inliers], residuals, size),
     )
 
 
-def _words(choice: LensModelChoice) -> tuple[str, str]:
-    return str(choice.model), choice.reason
+_State = tuple[Floats, Floats, Floats]  # inner (10,), rotations (views, 3, 3), translations (views, 3) mm
 
 
-State = tuple[Floats, Floats, Floats]  # inner (10,), rotations (views, 3, 3), translations (views, 3)
+def _fit_of_chosen_model(
+    models: list[LensModel], state: _State, px: Pixels, board: Points, inliers: Mask, fewest_terms: bool
+) -> tuple[LensModelChoice, _State, Floats]:
+    """Choose a lens model and fit it to the inlier views.
+
+    state : of the largest model, fitted to all v views. px : (v, n, 2). board : (n, 3) mm. inliers : (v,).
+
+    Returns the choice, the state with the poses of the inlier views refined, and the covariance of the inner parameters
+    (10, 10).
+    """
+    inner, rotations, translations = state
+    fits: dict[LensModel, tuple[_State, Floats]] = {}
+
+    def fit(model: LensModel) -> tuple[float, float]:
+        start = (np.where(model.free | _ALWAYS, inner, 0.0), rotations[inliers], translations[inliers])
+        fits[model] = _refine(start, px[inliers], board, model.free)
+        refined, covariance = fits[model]
+        return _cost(refined, px[inliers], board) / px[inliers].size, float(np.sqrt(covariance[9, 9]))
+
+    N = independent_observations((px - _project(state, board))[inliers], board[:, :2])
+    choice = choose_model(models, fit, N, K3_SIGMA_LIMIT, fewest_terms)
+    if choice.model not in fits:
+        fit(choice.model)
+    (inner, *poses), covariance = fits[choice.model]
+    rotations, translations = rotations.copy(), translations.copy()
+    rotations[inliers], translations[inliers] = poses
+    return choice, (inner, rotations, translations), covariance
 
 
-def _intrinsics(inner: Floats, size: tuple[int, int]) -> Intrinsics:
-    fx, fy, s, cx, cy, k1, k2, p1, p2, k3 = inner
-    return Intrinsics(np.array([[fx, s, cx], [0, fy, cy], [0, 0, 1]]), np.array([k1, k2, p1, p2, k3]), size)
+def _start(px: Pixels, board: Points, size: tuple[int, int]) -> _State:
+    """Start of the fit: focal length from the homographies with the principal point in the middle, and the poses.
 
-
-def _start(px: Floats, board: Floats, size: tuple[int, int]) -> State:
-    """Focal length from the homographies with the centre in the middle, then the pose of each view."""
+    px : (v, n, 2) corners in v views. board : (n, 3) mm.
+    """
     points = [board.astype(np.float32)] * len(px)
     K = cv2.initCameraMatrix2D(points, [view.astype(np.float32) for view in px], size)
     if not np.all(np.isfinite(K)) or not 0.2 * max(size) < K[0, 0] < 20 * max(size):
-        focal = 1.0 * max(size)  # all views parallel to the image: no focal length in them
+        focal = 1.0 * max(size)  # views parallel to the image do not determine the focal length
         K = np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1.0]])
     rotations, translations = [], []
     for view in px:
-        found, rotation, translation = cv2.solvePnP(board, view, K, None)
-        if not found:
+        solved, rotation, translation = cv2.solvePnP(board, view, K, None)
+        if not solved:
             raise ComputationError("the pose of a checkerboard view could not be found; its corners are not a board")
         rotations.append(cv2.Rodrigues(rotation)[0])
         translations.append(translation.ravel())
@@ -224,57 +248,61 @@ def _start(px: Floats, board: Floats, size: tuple[int, int]) -> State:
     return inner, np.array(rotations), np.array(translations)
 
 
-def _project(state: State, board: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Corners (views, n, 2) px, rotated board and points in the camera (views, n, 3), ideal normalised points."""
-    inner, rotations, translations = state
+def _project(state: _State, board: Points) -> Pixels:
+    """Projections of the board's corners (n, 3) mm in all views, (v, n, 2) px."""
+    _, in_camera = _in_cameras(state, board)
+    lens = lens_of(state[0])
+    distorted = lens.distort_normalised(in_camera[..., :2] / in_camera[..., 2:])
+    return distorted @ lens.K[:2, :2].T + lens.K[:2, 2]
+
+
+def _in_cameras(state: _State, board: Points) -> tuple[Points, Points]:
+    """Corners ``R X`` and ``R X + t`` of the board in the camera frames of all views, (v, n, 3) mm each."""
+    _, rotations, translations = state
     rotated = np.einsum("vij,nj->vni", rotations, board)
-    camera = rotated + translations[:, None]
-    xy = camera[..., :2] / camera[..., 2:]
-    lens = _intrinsics(inner, (1, 1))
-    distorted = lens.distort_normalised(xy)
-    return distorted @ lens.K[:2, :2].T + lens.K[:2, 2], rotated, camera, xy
+    return rotated, rotated + translations[:, None]
 
 
-def _cost(state: State, px: Floats, board: Floats) -> float:
-    """Sum of squared residuals; infinite where the state is not a camera."""
+def _cost(state: _State, px: Pixels, board: Points) -> float:
+    """Sum of squared residuals, px²; infinite where the state is not a camera."""
     if min(state[0][:2]) <= 0:
         return float("inf")
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        cost = float(np.sum((px - _project(state, board)[0]) ** 2))
+        cost = float(np.sum((px - _project(state, board)) ** 2))
     return cost if np.isfinite(cost) else float("inf")
 
 
-def _view_errors(state: State, px: Floats, board: Floats) -> Floats:
-    difference = px - _project(state, board)[0]
+def _view_errors(state: _State, px: Pixels, board: Points) -> Floats:
+    """RMS residual of the corners of each view, (v,) px."""
+    difference = px - _project(state, board)
     return np.sqrt(np.mean(np.sum(difference**2, axis=-1), axis=-1))
 
 
-def _views_to_keep(errors: Floats, drop_percentile: float) -> Mask:
-    """Views with a gross error never; above the percentile only where enough views are left."""
-    keep = errors <= np.maximum(5.0 * np.median(errors), 1e-6)
-    if len(errors) >= VIEWS_FOR_DROPPING:
-        keep &= errors <= np.percentile(errors, drop_percentile)
-    return keep if keep.sum() >= VIEWS_NEEDED else np.ones(len(errors), dtype=bool)
+def _inlier_views(errors: Floats, drop_percentile: float) -> Mask:
+    """Views (v,) without gross errors and, where there are many, with an error (v,) px up to the percentile.
 
-
-def _jacobians(state: State, board: Floats) -> tuple[Floats, Floats, Floats]:
-    """Corners (v, n, 2) and their derivatives by the inner parameters (v, n, 2, 10) and the pose (v, n, 2, 6).
-
-    The pose moves as ``R ← exp([ω]×) R``, ``t ← t + τ``, six parameters (ω, τ).
+    All views, where fewer than ``VIEWS_NEEDED`` would be left.
     """
-    _, rotated, camera, xy = _project(state, board)
-    px, inner, by_ideal = lens_jacobians(_intrinsics(state[0], (1, 1)), xy)
-    z = camera[..., 2]
-    by_point = np.zeros((*z.shape, 2, 3))
-    by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / z
-    by_point[..., 0, 2], by_point[..., 1, 2] = -xy[..., 0] / z, -xy[..., 1] / z
-    by_point = by_ideal @ by_point
-    pose = np.concatenate([np.cross(rotated[..., None, :], by_point), by_point], axis=-1)
-    return px, inner, pose
+    inliers = errors <= np.maximum(5.0 * np.median(errors), 1e-6)
+    if len(errors) >= VIEWS_FOR_DROPPING:
+        inliers &= errors <= np.percentile(errors, drop_percentile)
+    return inliers if inliers.sum() >= VIEWS_NEEDED else np.ones(len(errors), dtype=bool)
 
 
-def _refine(state: State, px: Floats, board: Floats, free: Mask) -> tuple[State, Floats]:
-    """Levenberg-Marquardt to convergence; the state and the covariance of the inner parameters (10, 10)."""
+def _jacobians(state: _State, board: Points) -> tuple[Pixels, Floats, Floats]:
+    """Projections of the corners (v, n, 2) px, derivatives by inner parameters (v, n, 2, 10) and pose (v, n, 2, 6).
+
+    The pose is changed as ``R ← exp([ω]×) R``, ``t ← t + τ``, parameters (ω, τ).
+    """
+    px, by_inner, by_pose, _ = pose_jacobians(lens_of(state[0]), *_in_cameras(state, board))
+    return px, by_inner, by_pose
+
+
+def _refine(state: _State, px: Pixels, board: Points, free: Mask) -> tuple[_State, Floats]:
+    """Fit the free inner parameters (10,) and all poses by the Levenberg-Marquardt method, to convergence.
+
+    Returns the state and the covariance of the inner parameters (10, 10), 0 where held.
+    """
     damping = 1e-3
     projected, by_inner, by_pose = _jacobians(state, board)
     cost = float(np.sum((px - projected) ** 2))
@@ -282,13 +310,13 @@ def _refine(state: State, px: Floats, board: Floats, free: Mask) -> tuple[State,
         A, B, C, a, c = _normal_equations(px - projected, by_inner[..., free], by_pose)
         while True:
             step_inner, step_pose = _solve(A, B, C, a, c, damping)
-            trial = _moved(state, free, step_inner, step_pose)
+            trial = _plus(state, free, step_inner, step_pose)
             trial_cost = _cost(trial, px, board)
             if trial_cost <= cost or damping > 1e12:
                 break
             damping *= 10
         if not trial_cost <= cost:
-            break  # round-off: no step lowers the cost any more
+            break  # no step lowers the cost any more, by round-off
         converged = cost - trial_cost <= 1e-12 * cost
         state, cost, damping = trial, trial_cost, max(damping / 10, 1e-12)
         projected, by_inner, by_pose = _jacobians(state, board)
@@ -302,13 +330,16 @@ def _refine(state: State, px: Floats, board: Floats, free: Mask) -> tuple[State,
     S = A - np.einsum("vij,vjk,vlk->il", B, np.linalg.inv(C), B)
     scale = np.sqrt(np.diag(A))
     inverse = np.linalg.pinv(S / np.outer(scale, scale)) / np.outer(scale, scale)
-    # Corners are never exact; without this a perfect world would claim an infinite weight.
+    # Without a least error of corners, exact data would give an infinite weight.
     covariance[np.ix_(free, free)] = inverse * max(cost / degrees, _CORNER_FLOOR**2)
     return state, covariance
 
 
 def _normal_equations(r: Floats, by_inner: Floats, by_pose: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Blocks of JᵀJ and Jᵀr: inner (p, p), inner-pose (v, p, 6), pose (v, 6, 6), and right sides."""
+    """Blocks of JᵀJ and Jᵀr: inner (p, p), inner by pose (v, p, 6), pose (v, 6, 6), right sides (p,) and (v, 6).
+
+    r : (v, n, 2) px residuals. by_inner, by_pose : (v, n, 2, p) and (v, n, 2, 6).
+    """
     v, rows = len(r), r[0].size
     Ji, Jp, r = by_inner.reshape(v, rows, by_inner.shape[-1]), by_pose.reshape(v, rows, 6), r.reshape(v, rows)
     JiT, JpT = np.swapaxes(Ji, 1, 2), np.swapaxes(Jp, 1, 2)
@@ -316,7 +347,7 @@ def _normal_equations(r: Floats, by_inner: Floats, by_pose: Floats) -> tuple[Flo
 
 
 def _solve(A: Floats, B: Floats, C: Floats, a: Floats, c: Floats, damping: float) -> tuple[Floats, Floats]:
-    """One damped step: inner (p,) and poses (v, 6)."""
+    """Solution of the damped normal equations: steps of the inner parameters (p,) and of the poses (v, 6)."""
     A = A + damping * np.diag(np.diag(A))
     C = C + damping * C * np.eye(6)
     BC = np.swapaxes(np.linalg.solve(C, np.swapaxes(B, 1, 2)), 1, 2)  # B C⁻¹
@@ -330,18 +361,10 @@ def _solve(A: Floats, B: Floats, C: Floats, a: Floats, c: Floats, damping: float
     return inner, pose
 
 
-def _moved(state: State, free: Mask, step_inner: Floats, step_pose: Floats) -> State:
+def _plus(state: _State, free: Mask, step_inner: Floats, step_pose: Floats) -> _State:
+    """The state after a step of the free inner parameters (p,) and of the poses (v, 6)."""
     inner, rotations, translations = state
     inner = inner.copy()
     inner[free] += step_inner
     turns = np.array([cv2.Rodrigues(omega)[0] for omega in step_pose[:, :3]])
     return inner, turns @ rotations, translations + step_pose[:, 3:]
-
-
-def _poses_refined(
-    inner: Floats, rotations: Floats, translations: Floats, px: Floats, board: Floats
-) -> tuple[Floats, Floats]:
-    """Poses of all views with the intrinsics held."""
-    state = (inner, rotations, translations)
-    state, _ = _refine(state, px, board, np.zeros(10, dtype=bool))
-    return state[1], state[2]

@@ -1,7 +1,7 @@
-"""The numbers printed above the columns, compared between cameras: they tell which columns are the same ones.
+"""Correspondence of the target's columns between cameras, by the numbers that are printed above them.
 
-No font is known and nothing is read. What is printed above each column is brought to the sheet, what all columns have
-in common is taken off, and the rest is the same picture wherever it is seen.
+The numbers are not read. The image of what is printed above each column is rectified to the sheet, the mean over all
+columns is subtracted, and the rest is correlated between cameras: two views of one number agree.
 """
 
 from __future__ import annotations
@@ -13,37 +13,40 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats
+from ringdic.arrays import Floats, Pixels
 from ringdic.calibration import dlt
-from ringdic.calibration.target import DotObservations
-from ringdic.geometry.camera import Camera
+from ringdic.calibration.patch import cylinder_points
+from ringdic.calibration.target import DotObservations, cylinder_normals
 from ringdic.session.rig import Target
 
-#: What is printed above each column, by the column's number.
+#: Rectified images of what is printed above each column, by the column's number.
 Labels = dict[int, Floats]
 
-#: The strip above the middle of the top row, as parts of the distance of rows and of half the distance of columns.
+#: Strip above the top row: lower and upper edge in row distances, half width in halves of the column distance.
 _LOW, _HIGH, _HALF_WIDTH = 0.25, 1.0, 0.8
-#: Samples a millimetre, and the blur that forgives a place that is not quite right, in samples.
+#: Samples per mm, and standard deviation of the blur that tolerates small displacements, in samples.
 _SAMPLES, _BLUR = 4.0, 1.0
-#: Grey levels spread less than this part of the paper's are no print.
+#: Standard deviation of the grey levels of a print, as a part of the paper's level.
 _PRINT = 0.04
-#: Correlation of the same numbers, and how much better than any other numbering it must be.
+#: Least correlation of equal numbers, and least difference to the second-best numbering.
 _ALIKE, _MARGIN = 0.86, 0.1
-#: Samples by which two pictures of one number may be shifted.
+#: Largest displacement between two images of one number, in samples.
 _SLACK = 3
-#: Columns that both cameras must see well.
+#: Fewest columns that both cameras must see well.
 _FEWEST = 3
 
 
-def read_labels(image: NDArray[np.generic], dots: DotObservations, target: Target, *, below: bool = False) -> Labels:
-    """What is printed above each column that the camera sees well.
+def column_labels(image: NDArray[np.generic], dots: DotObservations, target: Target, *, below: bool = False) -> Labels:
+    """Rectified images of what is printed above each column that the camera sees well.
 
-    image : grey, as the dots were found in it. below : under the lowest row in place of above the highest.
+    image : (height, width) grey, the image in which the dots were found. below : True takes what is printed below the
+    lowest row instead of above the highest.
+
+    Returns for each column an image (rows, columns) in parts of the paper's grey level, (0, 0) at the upper left.
     """
     grey = np.asarray(image, dtype=np.float32)
-    camera = Camera("", dlt.to_projection(dlt.solve_dlt(dots.xyz, dots.px)), (1, 1))
-    bend = _Bend(dots, target, dots.px - camera.project(dots.xyz))
+    camera = dlt.to_camera(dlt.solve_dlt(dots.xyz, dots.px))
+    distortion = _Distortion(dots, target, dots.px - camera.project(dots.xyz))
     half = _HALF_WIDTH * target.column_spacing_mm / 2
     low, high = (each * target.row_spacing_mm for each in (_LOW, _HIGH))
     across = np.arange(-half, half, 1 / _SAMPLES)
@@ -55,12 +58,10 @@ def read_labels(image: NDArray[np.generic], dots: DotObservations, target: Targe
     labels = {}
     for column in np.unique(dots.columns[dots.rows == row]):
         s, zz = np.meshgrid((column - 1) * target.column_spacing_mm + across, z)
-        angle = s / target.radius_mm
-        xyz = np.stack([target.radius_mm * np.cos(angle), target.radius_mm * np.sin(angle), zz], axis=-1)
-        normal = xyz * [1 / target.radius_mm, 1 / target.radius_mm, 0]
-        if camera.incidence_cosine(xyz, normal).min() < 0.6:
+        xyz = cylinder_points(target.radius_mm, s / target.radius_mm, zz)
+        if camera.incidence_cosine(xyz, cylinder_normals(target, xyz)).min() < 0.6:
             continue
-        px = (camera.project(xyz) + bend(s, zz)).astype(np.float32)
+        px = (camera.project(xyz) + distortion(s, zz)).astype(np.float32)
         patch = cv2.remap(grey, px[..., 0], px[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         paper = float(np.percentile(patch, 90))
         if paper > 0:
@@ -69,64 +70,74 @@ def read_labels(image: NDArray[np.generic], dots: DotObservations, target: Targe
 
 
 def has_labels(labels: Labels) -> bool:
-    """Whether something is printed there that differs from column to column."""
+    """Whether the labels are numbers: prints that differ from column to column."""
     if len(labels) < 3:
         return False
     patches = np.stack(list(labels.values()))
     return float(np.median((patches - patches.mean(axis=0)).std(axis=(1, 2)))) > _PRINT
 
 
-def common_part(all_labels: Iterable[Labels]) -> Floats:
-    """The mean over all columns of all cameras: shade and borders, which are no numbers."""
+def mean_label(all_labels: Iterable[Labels]) -> Floats:
+    """Mean of the labels over all columns of all cameras: shading and borders, which are not part of the numbers.
+
+    Returns an image (rows, columns) in parts of the paper's grey level.
+    """
     return np.asarray(np.mean([patch for labels in all_labels for patch in labels.values()], axis=0))
 
 
-def same_numbers(first: Labels, second: Labels, common: Floats, columns: int) -> int | None:
-    """By how much the second camera's numbers of columns must be raised to agree with the first's, modulo columns.
+def column_shift(first: Labels, second: Labels, mean: Floats, columns: int) -> int | None:
+    """Shift that must be added to the second camera's column numbers to agree with those of the first camera.
 
-    None where they have too little in common, or more than one answer is likely.
+    mean : (rows, columns) image, in parts of the paper's grey level, that is subtracted from all labels. columns :
+    number of columns round the target, modulo which the shift is counted.
+
+    Returns None where the cameras have too few columns in common, or more than one shift is likely.
     """
-    a = {column: (patch - common).astype(np.float32) for column, patch in first.items()}
-    b = {
-        column: (patch - common).astype(np.float32)[_SLACK:-_SLACK, _SLACK:-_SLACK] for column, patch in second.items()
-    }
+    a = {column: (patch - mean).astype(np.float32) for column, patch in first.items()}
+    b = {column: (patch - mean).astype(np.float32)[_SLACK:-_SLACK, _SLACK:-_SLACK] for column, patch in second.items()}
     scores = []
     for shift in range(columns):
         pairs = [(a[(c + shift - 1) % columns + 1], p) for c, p in b.items() if (c + shift - 1) % columns + 1 in a]
         if len(pairs) >= _FEWEST:
-            scores.append((float(np.mean([_alike(whole, part) for whole, part in pairs])), shift))
+            scores.append((float(np.mean([_correlation(whole, part) for whole, part in pairs])), shift))
     scores.sort(reverse=True)
     if not scores or scores[0][0] < _ALIKE or (len(scores) > 1 and scores[0][0] - scores[1][0] < _MARGIN):
         return None
     return scores[0][1]
 
 
-def _alike(whole: NDArray[np.float32], inner: NDArray[np.float32]) -> float:
-    """The best correlation over the places where the inner part fits into the whole."""
+def _correlation(whole: NDArray[np.float32], inner: NDArray[np.float32]) -> float:
+    """Largest correlation of an image with a larger one, over all displacements within it."""
     return float(cv2.matchTemplate(whole, np.ascontiguousarray(inner), cv2.TM_CCOEFF_NORMED).max())
 
 
-class _Bend:
-    """A cubic surface through what the camera without a lens leaves over, in arc and height. px."""
+class _Distortion:
+    """Residuals of a camera without lens, fitted by cubic polynomials of arc and height on the target.
 
-    def __init__(self, dots: DotObservations, target: Target, rest: Floats) -> None:
+    residuals : (n, 2) px, of the dots.
+    """
+
+    def __init__(self, dots: DotObservations, target: Target, residuals: Pixels) -> None:
         self._spacing = target.column_spacing_mm
         s: Floats = np.asarray((dots.columns - 1) * self._spacing, dtype=np.float64)
         z: Floats = dots.xyz[:, 2]
-        # Columns beyond the seam continue on the other side.
+        # Arcs are counted from the middle of the dots, so that columns on both sides of the seam are neighbours.
         self._period = target.columns * self._spacing
         self._s0, self._z0 = self._middle(s), float(z.mean())
-        self._coefficients = np.linalg.lstsq(self._terms(s, z), rest, rcond=None)[0]
+        self._coefficients = np.linalg.lstsq(self._terms(s, z), residuals, rcond=None)[0]
 
     def _middle(self, s: Floats) -> float:
+        """Circular mean of arcs (n,), mm."""
         angle = 2 * np.pi * s / self._period
         return float(np.arctan2(np.sin(angle).mean(), np.cos(angle).mean()) / (2 * np.pi) * self._period)
 
     def _terms(self, s: Floats, z: Floats) -> Floats:
+        """Monomials (..., 10) up to the third degree of scaled arcs and heights (...)."""
         x = ((s - self._s0 + self._period / 2) % self._period - self._period / 2) / 50.0
         y = (z - self._z0) / 100.0
         powers: Floats = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=-1)
         return powers
 
-    def __call__(self, s: Floats, z: Floats) -> Floats:
+    def __call__(self, s: Floats, z: Floats) -> Pixels:
+        """Residuals (..., 2) px at arcs and heights (...) mm."""
         return np.asarray(self._terms(s, z) @ self._coefficients)

@@ -1,7 +1,7 @@
-"""Spots of an image joined to a lattice of rows and columns by walking from neighbour to neighbour.
+"""Rows and columns of the dots in an image, by linking neighbouring dots to a lattice.
 
-Scale and perspective are taken from the spots themselves: the target says how many dot sizes the neighbour is away,
-the spot's own width and height say how large a dot is just there.
+Scale and perspective are taken from the dots themselves: the target gives the distance of neighbours in dot sizes, and
+the width and height of a dot give the size at its place in the image.
 """
 
 from __future__ import annotations
@@ -15,19 +15,21 @@ from ringdic.arrays import Indices
 from ringdic.calibration.dots import Dots
 from ringdic.session.rig import Target
 
-#: Neighbours nearer or farther than these parts of the expected distance are not neighbours.
+#: Least and largest distance of neighbours, as parts of the expected one.
 _NEAREST, _FARTHEST = 0.55, 1.5
-#: Directions allowed off the vertical and off the horizontal, as tangents.
+#: Largest deviations of their directions from the vertical and the horizontal, as tangents.
 _VERTICAL_SLOPE, _HORIZONTAL_SLOPE = 0.35, 0.9
-#: A column shorter than this is not trusted; two columns are joined by at least so many rows.
+#: Fewest dots of a column, and fewest rows in which two columns must agree on their relation.
 _SHORTEST_COLUMN, _FEWEST_VOTES = 4, 3
 
 
-def walk(dots: Dots, target: Target) -> tuple[Indices, Indices, Indices]:
-    """The largest lattice among spots of an upright image.
+def dot_lattice(dots: Dots, target: Target) -> tuple[Indices, Indices, Indices]:
+    """The largest lattice of dots in an upright image.
 
-    Returns the indices of its spots, their rows counted upwards and their columns counted to the right, both from 0.
-    Spots seen too obliquely to be linked safely are left to whoever knows the camera.
+    Spots that are seen too obliquely to be linked safely are left out.
+
+    Returns the indices (n,) of its spots, their rows (n,) counted upwards and their columns (n,) counted to the right,
+    both from 0.
     """
     frontal = np.flatnonzero(
         (dots.width > 0.45 * dots.height) & (dots.width < 1.7 * dots.height) & (dots.contrast > 0.35)
@@ -37,22 +39,25 @@ def walk(dots: Dots, target: Target) -> tuple[Indices, Indices, Indices]:
         return (np.zeros(0, dtype=np.intp),) * 3
     above, right = _neighbours(chosen, target)
     columns = [column for column in _columns(above) if len(column) >= _SHORTEST_COLUMN]
-    labels = _label(columns, right)
-    if not labels:
+    positions = _lattice_positions(columns, right)
+    if not positions:
         return (np.zeros(0, dtype=np.intp),) * 3
-    spots = np.array(list(labels), dtype=np.intp)
-    place = np.array([labels[spot] for spot in spots.tolist()], dtype=np.intp)
-    place -= place.min(axis=0)
-    return frontal[spots], place[:, 0], place[:, 1]
+    spots = np.array(list(positions), dtype=np.intp)
+    position = np.array(list(positions.values()), dtype=np.intp)
+    position -= position.min(axis=0)
+    return frontal[spots], position[:, 0], position[:, 1]
 
 
 def _neighbours(dots: Dots, target: Target) -> tuple[Indices, Indices]:
-    """For each spot the one above and the one to the right; −1 where there is none. Only mutual neighbours count."""
+    """Indices of the neighbours above (n,) and to the right (n,) of each dot, -1 where there is none.
+
+    The relation must be mutual: the dot must also be the neighbour below, or to the left, of its neighbour.
+    """
     tall = target.row_spacing_mm / target.dot_size_mm * dots.height
     wide = target.column_spacing_mm / target.dot_size_mm * dots.width
     tree = scipy.spatial.cKDTree(dots.px)
     n = len(dots)
-    found = {name: np.full(n, -1, dtype=np.intp) for name in ("above", "below", "right", "left")}
+    neighbours = {name: np.full(n, -1, dtype=np.intp) for name in ("above", "below", "right", "left")}
     reach = _FARTHEST * np.hypot(np.maximum(tall, wide), _HORIZONTAL_SLOPE * wide)
     for i, near in enumerate(tree.query_ball_point(dots.px, reach)):
         j = np.array([k for k in near if k != i], dtype=np.intp)
@@ -71,17 +76,18 @@ def _neighbours(dots: Dots, target: Target) -> tuple[Indices, Indices]:
             ("left", across & (dx < 0)),
         ):
             if ok.any():
-                found[name][i] = j[ok][np.argmin(np.hypot(dx, dy)[ok])]
-    return _mutual(found["above"], found["below"]), _mutual(found["right"], found["left"])
+                neighbours[name][i] = j[ok][np.argmin(np.hypot(dx, dy)[ok])]
+    return _mutual(neighbours["above"], neighbours["below"]), _mutual(neighbours["right"], neighbours["left"])
 
 
 def _mutual(forth: Indices, back: Indices) -> Indices:
+    """Links (n,) that lead back by the opposite links (n,); -1 for the others."""
     i = np.arange(len(forth))
     return np.where((forth >= 0) & (back[forth] == i), forth, -1)
 
 
 def _columns(above: Indices) -> list[list[int]]:
-    """Chains of spots from the bottom upwards."""
+    """Columns as lists of dots from the bottom upwards, by the links to the neighbours above (n,)."""
     has_below = set(above[above >= 0].tolist())
     chains = []
     for bottom in range(len(above)):
@@ -94,8 +100,8 @@ def _columns(above: Indices) -> list[list[int]]:
     return chains
 
 
-def _label(columns: list[list[int]], right: Indices) -> dict[int, tuple[int, int]]:
-    """(row, column) of each spot of the largest set of columns that hang together."""
+def _lattice_positions(columns: list[list[int]], right: Indices) -> dict[int, tuple[int, int]]:
+    """Row and column of each dot of the largest set of linked columns, by the links to the right neighbours (n,)."""
     where = {spot: (c, r) for c, chain in enumerate(columns) for r, spot in enumerate(chain)}
     links: dict[int, list[tuple[int, int, int]]] = {c: [] for c in range(len(columns))}
     votes: dict[tuple[int, int], Counter[int]] = {}
@@ -113,16 +119,18 @@ def _label(columns: list[list[int]], right: Indices) -> dict[int, tuple[int, int
     for first in links:
         if first in seen:
             continue
-        placed = {first: (0, 0)}
+        origins = {first: (0, 0)}  # row of its lowest dot, and column, of each linked chain
         queue = deque([first])
         while queue:
             c = queue.popleft()
             for other, shift, step in links[c]:
-                if other not in placed:
-                    placed[other] = (placed[c][0] + shift, placed[c][1] + step)
+                if other not in origins:
+                    origins[other] = (origins[c][0] + shift, origins[c][1] + step)
                     queue.append(other)
-        seen |= set(placed)
-        labels = {spot: (row + r, column) for c, (row, column) in placed.items() for r, spot in enumerate(columns[c])}
-        if len(labels) > len(best):
-            best = labels
+        seen |= set(origins)
+        positions = {
+            spot: (row + r, column) for c, (row, column) in origins.items() for r, spot in enumerate(columns[c])
+        }
+        if len(positions) > len(best):
+            best = positions
     return best

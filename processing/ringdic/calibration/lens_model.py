@@ -1,10 +1,10 @@
-"""How many terms a lens gets: as many as the views of the board determine, or as few as explain them.
+"""Choice of the distortion terms of a lens: as many as the views of the board determine, or as few as explain them.
 
-The first is the safe choice: a term that is not needed costs little, and its uncertainty is carried along. For the
-second, models are compared by Akaike's criterion ``N ln(Σ r² / N) + 2 k`` (1974) over the same corners. Neighbouring
-corners share the bend of the board and its blur, and so are not so many observations as they are numbers: with the
-correlation ρ of neighbours' residuals, N = 2 n ((1 − ρ) / (1 + ρ))² for n corners, as for a first-order autoregressive
-process along both edges of the board.
+The first is the safe choice: a needless term costs little, and its uncertainty is propagated. For the second, models
+are compared by Akaike's information criterion ``N ln(Σ r² / N) + 2 k`` (1974) over the same corners, k the number of
+free terms. Residuals of neighbouring corners are correlated by the bend of the board and by blur, so the n corners are
+fewer independent observations: N = 2 n ((1 − ρ) / (1 + ρ))², with the correlation ρ of neighbours, as for a first-order
+autoregressive process along both edges of the board.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from ringdic.arrays import Floats, Mask
+from ringdic.arrays import Floats, Mask, Pixels
 
-#: However alike neighbours are, a view is worth one corner and a half.
+#: Fewest independent observations of a view, however strongly its residuals are correlated: one corner and a half.
 _FEWEST_PER_VIEW = 3.0
 
 
 @dataclass(frozen=True)
 class LensModel:
-    """Which terms of the distortion are free: radial terms 2 or 3, the tangential pair, the skew."""
+    """Free terms of a lens: number of radial terms, 2 or 3, and whether the tangential pair and the skew are free."""
 
     radial: int
     tangential: bool = True
@@ -37,7 +37,7 @@ class LensModel:
 
     @property
     def free(self) -> Mask:
-        """(10,) of fx fy s cx cy k1 k2 p1 p2 k3."""
+        """Which of the parameters fx fy s cx cy k1 k2 p1 p2 k3 are free, (10,) bool."""
         t = self.tangential
         return np.array([True, True, self.skew, True, True, True, True, t, t, self.radial == 3])
 
@@ -48,11 +48,11 @@ class LensModel:
         return ", ".join(parts)
 
 
-def possible(radial: int | None, tangential: bool, skew: bool, fewest: bool) -> list[LensModel]:
-    """Models to choose from, the largest first.
+def candidate_models(radial: int | None, tangential: bool, skew: bool, fewest: bool) -> list[LensModel]:
+    """Lens models to choose from, the one with the most terms first.
 
-    radial : terms, None for 3 or 2. tangential, skew : False excludes them. fewest : also models without the terms
-    that are allowed.
+    radial : number of radial terms, None for 3 or 2. tangential, skew : False excludes these terms. fewest : also
+    models that lack some of the allowed terms.
     """
     radials = (3, 2) if radial is None or (fewest and radial == 3) else (radial,)
     if not fewest:
@@ -66,16 +66,16 @@ def possible(radial: int | None, tangential: bool, skew: bool, fewest: bool) -> 
 
 @dataclass(frozen=True)
 class LensModelChoice:
-    """The model taken and why, as words for the operator."""
+    """The chosen lens model and the reason for it, in words for the operator."""
 
     model: LensModel
     reason: str
 
 
-def independent(residuals: Floats, board_xy: Floats) -> float:
-    """How many independent observations residuals are worth.
+def independent_observations(residuals: Pixels, board_xy: Floats) -> float:
+    """Number of independent observations in correlated residuals of corners.
 
-    residuals : (v, n, 2) of the corners at board_xy (n, 2) in v views.
+    residuals : (v, n, 2) px, of n corners in v views. board_xy : (n, 2) mm, the corners on the board.
     """
     distance, _ = scipy.spatial.cKDTree(board_xy).query(board_xy, k=2)
     pitch = float(np.median(distance[:, 1]))
@@ -89,14 +89,18 @@ def independent(residuals: Floats, board_xy: Floats) -> float:
     return max(worth, _FEWEST_PER_VIEW * len(residuals))
 
 
-def choose(
+def choose_model(
     models: list[LensModel], fit: Callable[[LensModel], tuple[float, float]], N: float, limit: float, fewest: bool
 ) -> LensModelChoice:
-    """The first model that is determined, or of all determined ones that of the smallest criterion.
+    """Choose a lens model: the first one that the views determine, or the one of the least information criterion.
 
-    models : to choose from, the largest first. fit : of a model, the mean square residual a component, px², and the
-    standard error of k3. N : independent observations. limit : a model whose k3 is less certain than this is not
-    determined. fewest : compare all.
+    Parameters
+    ----------
+    models : to choose from, the one with the most terms first.
+    fit : fits a model and returns its mean square residual per component, px², and the standard error of k3.
+    N : number of independent observations.
+    limit : a model whose k3 has a larger standard error is not determined by the views.
+    fewest : True compares all determined models by the criterion, False takes the first.
     """
     if len(models) == 1:
         return LensModelChoice(models[0], "as set")

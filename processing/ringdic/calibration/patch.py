@@ -1,9 +1,9 @@
-"""Where the centroid of a printed dot appears: the dot is a patch of a curved surface, not a point.
+"""Image centroids of printed dots, taken as patches of a cylinder and not as points, with their derivatives.
 
 The centroid of a dot's image is not the projection of its centre: perspective, the curvature of the cylinder and the
-lens weigh its near parts more. With the image ``p(s, z)`` of the sheet's point (s along the arc, z along the axis),
-centroid = ∫∫ p |∂p/∂(s, z)| ds dz / ∫∫ |∂p/∂(s, z)| ds dz over the printed square or disk, here by a rule of sixteen
-nodes. Derivatives by complex steps (Squire & Trapp 1998), exact to round-off.
+lens enlarge some parts of the dot more than others. With the image ``p(s, z)`` of a point of the sheet (s along the
+arc, z along the axis), centroid = ∫∫ p |∂p/∂(s, z)| ds dz / ∫∫ |∂p/∂(s, z)| ds dz over the printed square or disk, here
+by a quadrature rule of sixteen nodes. Derivatives are taken by complex steps (Squire & Trapp 1998), exact to round-off.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats
+from ringdic.arrays import Floats, Indices, Pixels, Points
 from ringdic.session.rig import Target
 
 Values = NDArray[Any]  # float64, or complex128 in a complex step
 
-_STEP = 1e-40
+_STEP = 1e-40  # imaginary step of a derivative; it cannot cancel digits, however small
 
 
 @dataclass(frozen=True)
 class PrintedSheet:
-    """The printed sheet as it lies round the cylinder.
+    """Geometry of the printed sheet on the cylinder.
 
-    radius : of the surface, mm. pitch : of the columns along the arc, mm. tilt : by which the sheet is turned in the
-    surface, rad; positive raises the higher columns.
+    radius : of the printed surface, mm. pitch : distance of the columns along the arc, mm. tilt : rotation of the sheet
+    within the surface, rad; positive raises the columns with the higher numbers.
     """
 
     radius: float
@@ -36,23 +36,29 @@ class PrintedSheet:
 
     @classmethod
     def nominal(cls, target: Target) -> PrintedSheet:
-        """The sheet as the rig describes it."""
+        """The sheet as the rig's description of the target has it, without tilt."""
         return cls(target.radius_mm, target.column_spacing_mm)
 
     def seam(self, target: Target) -> float:
-        """Arc from the last column round to the first, mm."""
+        """Length of the arc from the last column on to the first, mm."""
         return 2 * np.pi * self.radius - (target.columns - 1) * self.pitch
 
 
-def sheet_points(target: Target, sheet: PrintedSheet, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Floats:
-    """Arc and height of dots' centres on the sheet, without print errors. rows, columns : (n,), from 1. (n, 2) mm."""
+def sheet_points(target: Target, sheet: PrintedSheet, rows: Indices, columns: Indices) -> Floats:
+    """Positions of dots' centres on the sheet, without print errors: arc s and height z.
+
+    rows, columns : (n,), from 1. Returns (n, 2) mm.
+    """
     arc, height = _nominal(target, rows, columns)
     s = arc * (sheet.pitch / target.column_spacing_mm) - sheet.tilt * (height - _middle(target)[1])
     return np.column_stack([s, height + sheet.tilt * (arc - _middle(target)[0])])
 
 
-def by_sheet(target: Target, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Floats:
-    """Derivatives of :func:`sheet_points` by pitch and tilt. (n, 2, 2), last axis the parameter."""
+def sheet_jacobians(target: Target, rows: Indices, columns: Indices) -> Floats:
+    """Derivatives of :func:`sheet_points` by pitch (mm) and tilt (rad).
+
+    rows, columns : (n,), from 1. Returns (n, 2, 2), last axis the parameter.
+    """
     arc, height = _nominal(target, rows, columns)
     D = np.zeros((len(arc), 2, 2))
     D[:, 0, 0] = arc / target.column_spacing_mm
@@ -61,29 +67,33 @@ def by_sheet(target: Target, rows: NDArray[np.intp], columns: NDArray[np.intp]) 
     return D
 
 
-def _nominal(target: Target, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> tuple[Floats, Floats]:
+def _nominal(target: Target, rows: Indices, columns: Indices) -> tuple[Floats, Floats]:
+    """Nominal arcs (n,) and heights (n,) of dots, mm."""
     arc = (np.asarray(columns, dtype=np.float64) - 1) * target.column_spacing_mm
     return arc, target.first_row_z_mm + (np.asarray(rows, dtype=np.float64) - 1) * target.row_spacing_mm
 
 
 def _middle(target: Target) -> tuple[float, float]:
+    """Arc and height of the middle of the sheet, about which it is tilted, mm."""
     return (
         0.5 * (target.columns - 1) * target.column_spacing_mm,
         target.first_row_z_mm + 0.5 * (target.rows - 1) * target.row_spacing_mm,
     )
 
 
-def wrapped(sz: Floats, radius: float) -> Floats:
-    """Points of the sheet (..., 2) on the cylinder. (..., 3) mm."""
-    angle = sz[..., 0] / radius
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), sz[..., 1]], axis=-1)
+def cylinder_points(radius: float, angle: Floats, height: Floats) -> Points:
+    """Points on a cylinder round the z axis.
+
+    radius : mm. angle : (...) rad, from +x. height : (...) z in mm. Returns (..., 3) mm, world frame.
+    """
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
 
 
-def nodes(shape: str, size: float) -> tuple[Floats, Floats]:
-    """Points on a dot about its centre (16, 2), mm, and their weights (16,), sum 1.
+def quadrature(shape: str, size: float) -> tuple[Floats, Floats]:
+    """Quadrature rule for means over a printed dot: nodes about its centre (16, 2) mm, and weights (16,) of sum 1.
 
-    square : 4 × 4 Gauss-Legendre points of the edge ``size``. circle : of the diameter ``size``, two radii by Gauss's
-    rule in r² and eight angles, exact to the seventh degree.
+    shape, size : "square" with the edge ``size`` mm, 4 × 4 Gauss-Legendre nodes; or "circle" with the diameter ``size``
+    mm, two radii by Gauss's rule in r² and eight angles, exact to the seventh degree.
     """
     x: Floats
     w: Floats
@@ -97,11 +107,13 @@ def nodes(shape: str, size: float) -> tuple[Floats, Floats]:
 
 
 @dataclass(frozen=True)
-class Views:
-    """One row for each dot in each image: the camera's state and the dot's place. n rows.
+class DotViews:
+    """n observations of dots, each with the parameters of the camera that sees it and the position of the dot.
 
-    inner : (n, 10), fx fy s cx cy k1 k2 p1 p2 k3. rotation : (n, 3, 3) and translation : (n, 3), world to camera.
-    sz : (n, 2) arc and height of the dot's centre on the sheet, mm.
+    inner : (n, 10), fx fy s cx cy k1 k2 p1 p2 k3, px or without unit.
+    rotation, translation : (n, 3, 3) and (n, 3) mm, world to camera.
+    sz : (n, 2) mm, arc and height of the dot's centre on the sheet.
+    radius : of the cylinder, mm.
     """
 
     inner: Floats
@@ -111,24 +123,27 @@ class Views:
     radius: float
 
 
-def project_patches(views: Views, shape: str, size: float) -> Floats:
-    """Centroids of the dots' images. (n, 2) px."""
-    distorted = _centroids(views, nodes(shape, size))
+def project_patches(views: DotViews, shape: str, size: float) -> Pixels:
+    """Centroids of the images of printed dots, (n, 2) px; shape and size (mm) of a dot are those of `quadrature`."""
+    distorted = _centroids(views, quadrature(shape, size))
     return _to_px(views.inner, distorted)
 
 
-def project_centres(views: Views) -> Floats:
-    """Images of the dots' centres. (n, 2) px."""
+def project_centres(views: DotViews) -> Pixels:
+    """Projections of the centres of printed dots, (n, 2) px."""
     return _to_px(views.inner, _centroids(views, (np.zeros((1, 2)), np.ones(1))))
 
 
-def patch_jacobians(views: Views, shape: str, size: float) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Centroids (n, 2) px and their derivatives.
+def patch_jacobians(views: DotViews, shape: str, size: float) -> tuple[Pixels, Floats, Floats, Floats, Floats]:
+    """Centroids of the images of printed dots and their derivatives.
 
-    Returns px, by inner parameters (n, 2, 10), by pose (n, 2, 6), by sz (n, 2, 2), by the radius (n, 2, 1).
-    The pose moves as ``R ← exp([ω]×) R``, ``t ← t + τ``, six parameters (ω, τ).
+    shape, size : of a dot, mm, as for `quadrature`.
+
+    Returns centroids (n, 2) px and their derivatives by the inner parameters (n, 2, 10), by the pose (n, 2, 6), by the
+    position sz (n, 2, 2) and by the radius (n, 2, 1), in px per unit of the parameter. The parameters of the pose are ω
+    (rad) and τ (mm) with ``R ← exp([ω]×) R``, ``t ← t + τ``.
     """
-    rule = nodes(shape, size)
+    rule = quadrature(shape, size)
     distorted = _centroids(views, rule)
     n = len(distorted)
     inner = np.zeros((n, 2, 10))
@@ -146,15 +161,16 @@ def patch_jacobians(views: Views, shape: str, size: float) -> tuple[Floats, Floa
     return _to_px(views.inner, distorted), inner, rest[:, :, 5:11], rest[:, :, 11:13], rest[:, :, 13:]
 
 
-def _to_px(inner: Floats, distorted: Floats) -> Floats:
+def _to_px(inner: Floats, distorted: Floats) -> Pixels:
+    """Image pixels (n, 2) of distorted normalised points (n, 2), by inner parameters (n, 10)."""
     fx, fy, s, cx, cy = inner.T[:5]
     return np.column_stack([fx * distorted[:, 0] + s * distorted[:, 1] + cx, fy * distorted[:, 1] + cy])
 
 
-def _centroids(views: Views, rule: tuple[Floats, Floats], step: Values | None = None) -> Values:
-    """Centroids in distorted normalised coordinates (n, 2).
+def _centroids(views: DotViews, rule: tuple[Floats, Floats], step: Values | None = None) -> Values:
+    """Centroids of the images of dots in distorted normalised coordinates, (n, 2).
 
-    step : (14,) added to k1 k2 p1 p2 k3, ω (3), τ (3), s, z, radius.
+    rule : nodes and weights. step : (14,) complex changes of k1 k2 p1 p2 k3, ω (3), τ (3), s, z and radius.
     """
     offsets, weights = rule
     d: Values = np.zeros(14) if step is None else step
@@ -163,7 +179,9 @@ def _centroids(views: Views, rule: tuple[Floats, Floats], step: Values | None = 
     angle = (views.sz[:, 0, None] + d[11] + offsets[:, 0]) / radius
     height = views.sz[:, 1, None] + d[12] + offsets[:, 1]
     cos, sin = np.cos(angle), np.sin(angle)
-    turn = np.array([[1, -d[7], d[6]], [d[7], 1, -d[5]], [-d[6], d[5], 1]])  # to first order, which is all it needs
+    turn = np.array(
+        [[1, -d[7], d[6]], [d[7], 1, -d[5]], [-d[6], d[5], 1]]
+    )  # exp([ω]×) to first order: enough for a derivative
     R = turn @ views.rotation
     X, Y, Z = (
         radius * (R[:, i, 0, None] * cos + R[:, i, 1, None] * sin)
@@ -175,7 +193,7 @@ def _centroids(views: Views, rule: tuple[Floats, Floats], step: Values | None = 
     Xs, Ys, Zs = (R[:, i, 1, None] * cos - R[:, i, 0, None] * sin for i in range(3))
     Xz, Yz, Zz = (R[:, i, 2, None] for i in range(3))
     x, y = X / Z, Y / Z
-    # |∂(x, y)/∂(s, z)| without its sign, and then the lens's share; fx fy is the same for the whole dot.
+    # det ∂(x, y)/∂(s, z); the lens's determinant follows, and fx fy cancels as it is the same for the whole dot.
     area = ((Xs - x * Zs) * (Yz - y * Zz) - (Xz - x * Zz) * (Ys - y * Zs)) / (Z * Z)
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))

@@ -1,4 +1,4 @@
-"""How good a calibration is: reconstruction error of control points, figures of each camera and each pair."""
+"""Quality of a calibration: reconstruction error of control points, figures of each camera and of each pair."""
 
 from __future__ import annotations
 
@@ -7,30 +7,35 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ringdic.arrays import Floats
+from ringdic.arrays import Points, Vectors
 from ringdic.calibration.camera_calibration import CameraCalibration
 from ringdic.calibration.parameters import lens_jacobians
 from ringdic.errors import ComputationError
+from ringdic.geometry.camera import signed_degrees
 from ringdic.geometry.triangulation import reprojection_residuals, triangulate
 
 
 @dataclass(frozen=True)
 class ReconstructionError:
-    """Control points against their reconstruction (Solav et al. 2018, eq. 10-11).
+    """Error of reconstructed control points (Solav et al. 2018, eq. 10-11).
 
-    mean_vector : (3,) mean of reconstructed minus true position, mm; ``mean`` its length.
-    rms : root mean square of the error's length, mm.
+    mean_vector : (3,) mm, mean of reconstructed minus true positions, world frame.
+    mean : length of this vector, mm.
+    rms : root mean square of the lengths of the errors, mm.
     points : number of points that were reconstructed.
     """
 
-    mean_vector: Floats
+    mean_vector: Vectors
     mean: float
     rms: float
     points: int
 
 
-def reconstruction_error(xyz_true: Floats, xyz_reconstructed: Floats) -> ReconstructionError:
-    """Mean error vector and RMS error of control points (n, 3) mm; points that are NaN are left out."""
+def reconstruction_error(xyz_true: Points, xyz_reconstructed: Points) -> ReconstructionError:
+    """Mean error vector and RMS error of reconstructed control points.
+
+    xyz_true, xyz_reconstructed : (n, 3) mm, world frame; points that are NaN are left out.
+    """
     error = np.asarray(xyz_reconstructed, dtype=float) - np.asarray(xyz_true, dtype=float)
     error = error[np.isfinite(error).all(axis=1)]
     if not len(error):
@@ -42,19 +47,21 @@ def reconstruction_error(xyz_true: Floats, xyz_reconstructed: Floats) -> Reconst
 
 @dataclass(frozen=True)
 class CameraQuality:
-    """One camera's row in the table of the calibration.
+    """Figures of one camera's calibration, a row of the calibration's table.
 
-    dots, columns : how many dots were used, and the columns they stand in.
-    residual_rms : RMS distance of the dots from their projection, undistorted px.
-    left_out : dots recognised but left out as gross errors.
-    azimuth_deg, azimuth_off_deg : where the camera stands, and that minus what rig.toml says.
-    board_views, board_views_used, board_rms : views of the checkerboard and RMS distance of their corners, px;
-        0, 0 and None where the lens was not calibrated from views.
-    board_coverage : part of the image that the views used cover, 0 to 1. residual_distortion : px, what corners seen at
-        one place of the image are off in common, RMS. lens_error : px, how far the standard errors of the lens shift
-        the dots' images, RMS, beyond what a turn of the camera and its distance take up. All None without views.
-    lens_terms, lens_reason : the terms of the lens, and why these.
-    focal, focal_sigma, centre, centre_sigma : px, along x and y; sigma None where it is not known.
+    dots, columns : number of dots used, and the columns in which they are.
+    residual_rms : RMS length of the dots' residuals, undistorted px.
+    left_out : number of dots that were identified but left out as gross errors.
+    azimuth_deg, azimuth_off_deg : azimuth of the camera about +z from +x, and its difference from that in rig.toml.
+    board_views, board_views_used, board_rms : number of views of the checkerboard, how many of them the lens rests on,
+        and RMS length of their residuals, px; 0, 0 and None where the lens was not calibrated from views.
+    board_coverage : part of the image that the board covers in these views, 0 to 1, or None without views.
+    residual_distortion : RMS over cells of the image of the mean residual in a cell, px, or None without views.
+    lens_error : RMS displacement of the dots' images by the standard errors of the lens, px, less the part that a
+        change of the pose would compensate; None without views.
+    lens_terms, lens_reason : free terms of the lens, and why these; None without views.
+    focal, centre : focal lengths and principal point along x and y, px, None without a lens.
+    focal_sigma, centre_sigma : their standard errors, px, None where not known.
     """
 
     camera: str
@@ -79,10 +86,10 @@ class CameraQuality:
 
 
 def camera_quality(calibration: CameraCalibration, nominal_azimuth_deg: float | None = None) -> CameraQuality:
-    """The figures of one calibrated camera."""
+    """Figures of one calibrated camera; nominal_azimuth_deg : its azimuth in rig.toml, None for no comparison."""
     fit, lens = calibration.fit, calibration.camera.intrinsics
-    azimuth = _azimuth(calibration)
-    off = 0.0 if nominal_azimuth_deg is None else (azimuth - nominal_azimuth_deg + 180.0) % 360.0 - 180.0
+    azimuth = calibration.camera.azimuth_deg % 360.0
+    off = 0.0 if nominal_azimuth_deg is None else signed_degrees(azimuth - nominal_azimuth_deg)
     row = CameraQuality(
         camera=calibration.camera.id,
         dots=len(calibration.dots),
@@ -100,8 +107,8 @@ def camera_quality(calibration: CameraCalibration, nominal_azimuth_deg: float | 
     sigma = [float(value) for value in fit.sigma]
     return replace(
         row,
-        board_views=len(fit.kept),
-        board_views_used=int(fit.kept.sum()),
+        board_views=len(fit.inliers),
+        board_views_used=int(fit.inliers.sum()),
         board_rms=fit.rms,
         board_coverage=_finite(fit.coverage),
         residual_distortion=_finite(fit.residual_distortion),
@@ -115,10 +122,10 @@ def camera_quality(calibration: CameraCalibration, nominal_azimuth_deg: float | 
 
 @dataclass(frozen=True)
 class PairQuality:
-    """How well two cameras agree.
+    """Figures of the agreement of two calibrated cameras.
 
-    points : dots of the target that both see. mean, rms : mm, of their reconstruction. angle_deg : between their lines
-    of sight at the target. epipolar_rms : px, RMS distance of the dots' images from the reprojected points.
+    points : number of dots of the target that both see. mean, rms : reconstruction error of these dots, mm. angle_deg :
+    angle between the cameras' lines of sight to the target. epipolar_rms : RMS reprojection error of the dots, px.
     """
 
     pair: tuple[str, str]
@@ -130,10 +137,10 @@ class PairQuality:
 
 
 def pair_quality(first: CameraCalibration, second: CameraCalibration) -> tuple[ReconstructionError, PairQuality]:
-    """Reconstruction error of the dots that two cameras both see, and the figures of the pair.
+    """Reconstruction error of the dots that two cameras both see, and figures of the pair.
 
-    True are the places that the calibration takes the dots to have: after a bundle adjustment the print errors found
-    are in them. Raises ComputationError where no dot is seen by both.
+    The true positions are those of the calibrations' dots: after a bundle adjustment they contain the estimated print
+    errors. Raises ComputationError where no dot is seen by both.
     """
     seen = [
         {(int(row), int(column)): i for i, (row, column) in enumerate(zip(dots.rows, dots.columns, strict=True))}
@@ -145,7 +152,7 @@ def pair_quality(first: CameraCalibration, second: CameraCalibration) -> tuple[R
             f"cameras {first.camera.id} and {second.camera.id} have no dot of the target in common; "
             "check that nothing hides the target, and their azimuths in rig.toml"
         )
-    chosen = [[places[dot] for dot in common] for places in seen]
+    chosen = [[index[dot] for dot in common] for index in seen]
     px = np.stack([first.dot_centres[chosen[0]], second.dot_centres[chosen[1]]])
     cameras = [first.camera, second.camera]
     xyz = triangulate(cameras, px)
@@ -163,13 +170,11 @@ def pair_quality(first: CameraCalibration, second: CameraCalibration) -> tuple[R
     )
 
 
-def _azimuth(calibration: CameraCalibration) -> float:
-    centre = calibration.camera.centre
-    return math.degrees(math.atan2(centre[1], centre[0])) % 360.0
-
-
 def _lens_error(calibration: CameraCalibration) -> float:
-    """RMS shift of the dots' images by one standard error of the lens, less what turn and distance take up. px."""
+    """RMS displacement of the dots' images by the standard errors of the lens, px.
+
+    The part that a rotation of the camera and a change of its distance would compensate is projected out.
+    """
     lens, fit = calibration.camera.intrinsics, calibration.fit
     assert lens is not None
     assert fit is not None
@@ -184,4 +189,5 @@ def _lens_error(calibration: CameraCalibration) -> float:
 
 
 def _finite(value: float) -> float | None:
+    """The value, or None where it is NaN or infinite."""
     return value if math.isfinite(value) else None

@@ -1,9 +1,8 @@
-"""Cameras that move between the steps: their poses found again at each step from the points that all of them follow.
+"""Refinement of the poses at steps at which cameras have moved, from the points that are tracked in all cameras.
 
-Only where three cameras and more see a point do lines of sight tell the motion of one from that of the surface: of two
-cameras, what moves a match along the epipolar line looks like depth. A motion of all cameras together cannot be told
-from ringdic.arrays import Floats
-from one of the body; the least motion that fits is taken.
+Three cameras or more must see a point for the motion of one of them to be separated from that of the surface: with two
+cameras, a motion that shifts matches along the epipolar lines looks like a change of depth. A common motion of all
+cameras cannot be separated from a rigid motion of the body; the smallest motion that fits is taken.
 """
 
 from __future__ import annotations
@@ -14,28 +13,31 @@ from typing import Any
 
 import numpy as np
 
-from ringdic.arrays import Floats
-from ringdic.calibration.pose_refinement import Refinement, refine_poses
+from ringdic.arrays import Pixels
+from ringdic.calibration.pose_refinement import PoseRefinement, refine_poses
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.triangulation import reprojection_residuals, triangulate
 
-#: Mean residual of a camera beyond which one has moved, px; of thousands of points it is known to a tenth of that.
+#: Mean reprojection residual beyond which a camera has moved, px; thousands of points give it to a tenth of that.
 LIMIT = 0.03
 
 
 @dataclass
 class RefinedCameras:
-    """The cameras of a rig, and where they stood at the steps at which they were seen to have moved.
+    """The cameras of a rig at every step, with refined poses where they have moved since the calibration.
 
-    cameras : as calibrated. found : by step.
+    cameras : as calibrated. refinements : by step, for the steps at which a camera was found to have moved.
     """
 
     cameras: Sequence[Camera]
-    found: dict[int, Refinement] = field(default_factory=dict)
+    refinements: dict[int, PoseRefinement] = field(default_factory=dict)
 
-    def __call__(self, step: int, px: Floats, sigma: Floats) -> Sequence[Camera]:
-        """The cameras of a step, by the points that they saw: px, sigma (C, n, 2), NaN where a camera did not."""
+    def __call__(self, step: int, px: Pixels, sigma: Pixels) -> Sequence[Camera]:
+        """The cameras of a step: as calibrated, or with refined poses where one has moved.
+
+        px, sigma : (C, n, 2) px, points tracked in the cameras and their standard deviations, NaN where not seen.
+        """
         residuals = reprojection_residuals(self.cameras, triangulate(self.cameras, px), px)
         count = np.isfinite(residuals[..., 0]).sum(axis=1)
         mean = np.nansum(residuals, axis=1) / np.maximum(count, 1)[:, None]
@@ -43,15 +45,18 @@ class RefinedCameras:
             return self.cameras
         try:
             refined = refine_poses(self.cameras, px, sigma)
-        except ComputationError:  # too few points are left: the step is as good as its cameras
+        except ComputationError:  # too few points for a refinement
             return self.cameras
-        self.found[step] = refined
+        self.refinements[step] = refined
         return refined.cameras
 
     def figures(self, steps: Sequence[str]) -> list[dict[str, Any]]:
-        """Each step with moved cameras, as JSON values: residuals before and after, px, and turns and shifts."""
+        """Figures of the steps at which cameras had moved, as JSON values: residuals (px), rotations and translations.
+
+        steps : names of all steps.
+        """
         rows = []
-        for step, refined in sorted(self.found.items()):
+        for step, refined in sorted(self.refinements.items()):
             turn, shift = (np.linalg.norm(part, axis=1) for part in np.split(refined.motion, 2, axis=1))
             rows.append(
                 {
@@ -67,7 +72,7 @@ class RefinedCameras:
         return rows
 
     def sentences(self, steps: Sequence[str]) -> list[str]:
-        """What the operator should know: where cameras moved."""
+        """A sentence for the operator that names the steps at which cameras had moved; none where all stood still."""
         rows = self.figures(steps)
         if not rows:
             return []

@@ -7,7 +7,6 @@ that is called with the :class:`typer.Typer` application and adds its commands t
 
 from __future__ import annotations
 
-import json
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -16,11 +15,10 @@ from typing import Annotated
 import typer
 
 import ringdic
-from ringdic.cli.console import narrated, print_json, say, show_table
+from ringdic.cli.console import print_json, say, show_table
 from ringdic.cli.measuring import measure_app, strain_command
 from ringdic.cli.options import AsJson, Reference, Run, Session, SethHill, Window, WithoutRigidMotion
 from ringdic.cli.reporting import animate_command, overlay_command, report_command
-from ringdic.progress import Progress
 
 PLUGINS = "ringdic.commands"
 
@@ -78,9 +76,7 @@ def import_command(
     as_json: AsJson = False,
 ) -> None:
     """Make a session of a folder of images."""
-    from ringdic.session.importing import import_folder
-
-    import_folder(source, session)
+    ringdic.import_folder(source, session)
     if as_json:
         print_json({"session": str(session)})
     else:
@@ -95,28 +91,11 @@ def process_command(
     as_json: AsJson = False,
 ) -> None:
     """Calibrate, correlate, triangulate and compute strain, with nothing to click."""
-    from ringdic.session.folder import open_session
-    from ringdic.settings import load_settings
-
-    chosen = load_settings(settings, set_ or [])
-    from ringdic.jobs.pipeline import process_session  # takes a while: what was typed is checked first
-
-    executor = None
-    if cluster is not None:
-        from ringdic.jobs.cluster import ClusterExecutor
-
-        executor = ClusterExecutor(cluster)
-        session = open_session(session.resolve()).path  # the workers' working folders are others
-    with narrated() as report:
-        if executor is not None:
-            report(Progress("prepare", 0.0, f"asking the workers of {cluster}"))
-            executor.check(session)
-        run = process_session(session, chosen, report, executor)
-    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    finished = ringdic.process(session, settings, set=set_ or (), cluster=cluster)
     if as_json:
-        print_json({"run": str(run), **summary})
+        print_json({"run": str(finished.path), **finished.summary})
     else:
-        show_table(f"{session}: results in {run}", summary["table"])
+        show_table(f"{session}: results in {finished.path}", finished.summary["table"])
 
 
 def correlate_command(

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ringdic.cli.console import narrated, print_json, say
+from ringdic.cli.console import print_json, say
 from ringdic.cli.options import AsJson, Reference, Run, Session, Window, WithoutRigidMotion, results_of
 from ringdic.errors import InputError
-from ringdic.progress import Progress
+from ringdic.progress import Progress, progress_bar
 
 if TYPE_CHECKING:
     from ringdic.pictures.scale import Scale
@@ -33,7 +33,7 @@ def report_command(
     """One self-contained HTML page of a run: reporting tables, calibration, noise floor, maps."""
     from ringdic.report import write_report
 
-    with narrated() as show:
+    with progress_bar() as show:
         written = write_report(session, out, run, lambda done: show(Progress("report", done)))
     _tell_written([written], as_json)
 

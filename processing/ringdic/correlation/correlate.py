@@ -109,7 +109,7 @@ def correlate_points(
 
     Raises InputError if there is no point or no start value, or if the images were prepared for other settings.
     """
-    xy = _checked(reference, current, xy, settings)
+    xy = _check_points(reference, current, xy, settings)
     with on_threads(threads):
         load_kernels()
         began = time.perf_counter()
@@ -119,7 +119,7 @@ def correlate_points(
         if start is None:
             _match_automatically(points, seconds)
         else:
-            _match_from(points, _parameters(start, len(xy)), seconds, prefer_neighbour)
+            _match_from_start_values(points, _kernel_parameters(start, len(xy)), seconds, prefer_neighbour)
     seconds["prepare"] += points.filtering
     seconds["refine"] -= points.filtering
     return _result(points, seconds)
@@ -138,19 +138,19 @@ def correlate_independently(
     xy : (n, 2) float64, px, points of the reference image.
     start : (n, 6) or (n, 12) float64, px and derivatives, as for :func:`correlate_points`; NaN leaves a point out.
     """
-    xy = _checked(reference, current, xy, settings)
+    xy = _check_points(reference, current, xy, settings)
     load_kernels()
     textureless = np.zeros(len(xy), bool)  # the kernel tests each subset
     points = Propagation(reference, current, xy, settings, region=current, textureless=textureless, independent=True)
     given = np.flatnonzero(np.isfinite(start).all(axis=1))
     began = time.perf_counter()
     if len(given):
-        points.refine_from(given, _parameters(start, len(xy))[given])
+        points.refine_from(given, _kernel_parameters(start, len(xy))[given])
     seconds = {"prepare": points.filtering, "start": 0.0, "refine": time.perf_counter() - began - points.filtering}
     return _result(points, seconds)
 
 
-def _checked(reference: Reference, current: Current, xy: Pixels, settings: CorrelationSettings) -> Floats:
+def _check_points(reference: Reference, current: Current, xy: Pixels, settings: CorrelationSettings) -> Pixels:
     """The points (n, 2) px as the kernels take them. Raises InputError where they or the images do not fit the
     settings.
     """
@@ -178,17 +178,16 @@ def load_kernels() -> None:
 
 
 def _match_automatically(points: Propagation, seconds: dict[str, float]) -> None:
-    """Match the points from start values that are found in the images, by one method after the other until enough are
-    matched.
+    """Match the points from start values found in the images, by one method after the other until enough are matched.
 
-    Each method gives start values at a sample of the points still open. Where most of them lead to matches, the method
-    suits the pair: its matches are adopted and propagated at once. The few matches of an unsuitable method may be
-    false: they wait until the other methods have been tried and then serve only points that none of these reached.
+    Each method gives start values at a sample of the points still unmatched. Where most of them lead to matches, the
+    method suits the pair: its matches are adopted and propagated at once. The few matches of an unsuitable method may
+    be false: they wait until the other methods have been tried and then serve only points that none of these reached.
     """
     doubtful = []
     for name, method, dense in _METHODS:
-        open_points = _open(points)
-        if len(open_points) <= (1.0 - _ENOUGH) * _worth(points):
+        open_points = _unmatched_points(points)
+        if len(open_points) <= (1.0 - _ENOUGH) * _textured_count(points):
             break
         began = time.perf_counter()
         sample = even_sample(points.xy[open_points])
@@ -205,19 +204,19 @@ def _match_automatically(points: Propagation, seconds: dict[str, float]) -> None
             continue
         points.adopt(seeds, trial)
         points.region = points.region or trial.region
-        _carry_on(points, seconds, index[~points.good[index]], start[~points.good[index]])
+        _propagate(points, seconds, index[~points.good[index]], start[~points.good[index]])
     for _, seeds, trial in sorted(doubtful, key=lambda entry: -entry[0]):
-        if len(_open(points)) > (1.0 - _ENOUGH) * _worth(points):
+        if len(_unmatched_points(points)) > (1.0 - _ENOUGH) * _textured_count(points):
             points.adopt(seeds, trial)
-            _carry_on(points, seconds)
+            _propagate(points, seconds)
 
 
-def _open(points: Propagation) -> Indices:
+def _unmatched_points(points: Propagation) -> Indices:
     """Indices of the points that have texture and no match."""
     return np.flatnonzero(~points.good & (points.status != Status.NO_TEXTURE))
 
 
-def _worth(points: Propagation) -> int:
+def _textured_count(points: Propagation) -> int:
     """Number of points with enough texture to be matched."""
     return int((points.status != Status.NO_TEXTURE).sum())
 
@@ -238,7 +237,9 @@ def _try_seeds(points: Propagation, seeds: Indices, start: Floats) -> Propagatio
     return trial
 
 
-def _match_from(points: Propagation, start: Floats, seconds: dict[str, float], prefer_neighbour: bool) -> None:
+def _match_from_start_values(
+    points: Propagation, start: Floats, seconds: dict[str, float], prefer_neighbour: bool
+) -> None:
     """Refine the points that have a start value (n, 12), then propagate to all others."""
     began = time.perf_counter()
     given = np.flatnonzero(np.isfinite(start).all(axis=1))
@@ -246,10 +247,10 @@ def _match_from(points: Propagation, start: Floats, seconds: dict[str, float], p
         raise InputError("no point has a start value; leave them out to have them found")
     points.refine_from(given, start[given], prefer_neighbour=prefer_neighbour)
     seconds["refine"] += time.perf_counter() - began
-    _carry_on(points, seconds)
+    _propagate(points, seconds)
 
 
-def _carry_on(
+def _propagate(
     points: Propagation, seconds: dict[str, float], index: Indices | None = None, start: Floats | None = None
 ) -> None:
     """Refine points (k,) from start values (k, 12), if given, propagate to all others and reject outliers."""
@@ -269,7 +270,7 @@ def _carry_on(
     seconds["refine"] += time.perf_counter() - began
 
 
-def _parameters(start: Floats, n: int) -> Floats:
+def _kernel_parameters(start: Floats, n: int) -> Floats:
     """Start values (n, 6) or (n, 12) in the order of the kernels' parameters. (n, 12)."""
     start = np.asarray(start, dtype=np.float64)
     if start.shape not in ((n, 6), (n, 12)):

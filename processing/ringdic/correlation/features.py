@@ -88,9 +88,8 @@ def _local_affine(d: Pixels, uv: Pixels) -> Floats:
     """Affine map that most of the feature matches around a point agree on, as parameters (12,) at the point.
 
     d : (k, 2) px, reference positions of the features from the point. uv : (k, 2) px, their displacements. The map with
-        the
-    most votes among those through random triples is refined by least squares. NaN if fewer than five matches agree with
-    it.
+    the most votes among those through random triples is refined by least squares. NaN if fewer than five matches agree
+    with it.
     """
     out = np.full(12, np.nan)
     k = len(d)

@@ -137,8 +137,7 @@ def _search(
     """Allocate the results, run the kernel over all points and return what it finds.
 
     mask : (h, w) bool, the pixels of ``image`` that count in a box whose upper left corner is at ``corner`` (x, y) px;
-        an
-    empty mask lets all count.
+    an empty mask lets all count.
     """
     n = len(xy)
     best = BestWarps(np.full((n, 6), np.nan), np.full(n, -1.0), np.full(n, -1.0), np.zeros(n, np.int64))

@@ -28,12 +28,12 @@ from ringdic.correlation.lanes import (
     LANES,
     WINDOW,
     absolute,
+    blend,
     floor,
-    gather,
     load,
     load_one,
+    lookup,
     ramp,
-    select,
     store,
     store_one,
 )
@@ -75,29 +75,29 @@ def _quintic(t):  # type: ignore[no-untyped-def]
 def _cubic_across(t):  # type: ignore[no-untyped-def]
     """Weights of the cubic B-spline at five taps for t in [0, 2), which may lie in either of two pixel intervals."""
     k, zero = t >= _F(1), _F(0)
-    a, b, c, d = _cubic(select(k, t - _F(1), t))
-    return select(k, zero, a), select(k, a, b), select(k, b, c), select(k, c, d), select(k, d, zero)
+    a, b, c, d = _cubic(blend(k, t - _F(1), t))
+    return blend(k, zero, a), blend(k, a, b), blend(k, b, c), blend(k, c, d), blend(k, d, zero)
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _quintic_across(t):  # type: ignore[no-untyped-def]
     """Weights of the quintic B-spline at seven taps for t in [0, 2), which may lie in either of two pixel intervals."""
     k, zero = t >= _F(1), _F(0)
-    a, b, c, d, e, f = _quintic(select(k, t - _F(1), t))
-    first, second, third = select(k, zero, a), select(k, a, b), select(k, b, c)
-    return first, second, third, select(k, c, d), select(k, d, e), select(k, e, f), select(k, f, zero)
+    a, b, c, d, e, f = _quintic(blend(k, t - _F(1), t))
+    first, second, third = blend(k, zero, a), blend(k, a, b), blend(k, b, c)
+    return first, second, third, blend(k, c, d), blend(k, d, e), blend(k, e, f), blend(k, f, zero)
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def maximum(one, other):  # type: ignore[no-untyped-def]
     """The larger of two vectors ``one`` and ``other``, lane by lane."""
-    return select(one >= other, one, other)
+    return blend(one >= other, one, other)
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _positive(t):  # type: ignore[no-untyped-def]
     """Each lane of t, or 0 where it is negative."""
-    return select(t >= _F(0), t, _F(0))
+    return blend(t >= _F(0), t, _F(0))
 
 
 @nb.njit(forceinline=True, fastmath=FAST)
@@ -196,16 +196,16 @@ def _wide(c, p, stride, tx, sx, qx, ty, sy, qy, rows, quintic, g):  # type: igno
     if quintic:
         w, row = _quintic(t), y + _F(2)
         for _ in range(rows + _U(6)):
-            taps = w[0] * gather(c, p, whole) + w[1] * gather(c, p, whole + _F(1)) + w[2] * gather(c, p, whole + _F(2))
-            taps += w[3] * gather(c, p, whole + _F(3)) + w[4] * gather(c, p, whole + _F(4))
-            out += _quintic_at(row) * (taps + w[5] * gather(c, p, whole + _F(5)))
+            taps = w[0] * lookup(c, p, whole) + w[1] * lookup(c, p, whole + _F(1)) + w[2] * lookup(c, p, whole + _F(2))
+            taps += w[3] * lookup(c, p, whole + _F(3)) + w[4] * lookup(c, p, whole + _F(4))
+            out += _quintic_at(row) * (taps + w[5] * lookup(c, p, whole + _F(5)))
             row -= _F(1)
             p += stride
     else:
         v, row = _cubic(t), y + _F(1)
         for _ in range(rows + _U(4)):
-            taps = v[0] * gather(c, p, whole) + v[1] * gather(c, p, whole + _F(1))
-            taps += v[2] * gather(c, p, whole + _F(2)) + v[3] * gather(c, p, whole + _F(3))
+            taps = v[0] * lookup(c, p, whole) + v[1] * lookup(c, p, whole + _F(1))
+            taps += v[2] * lookup(c, p, whole + _F(2)) + v[3] * lookup(c, p, whole + _F(3))
             out += _cubic_at(row) * taps
             row -= _F(1)
             p += stride

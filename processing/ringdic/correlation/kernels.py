@@ -18,7 +18,7 @@ Precision. With float32 images, fractions of pixels resolve 1e-7 px; f and g are
 lanes are summed in single precision over a strip of the subset, everything after that in double. With float64 images
 all of it is double.
 
-``kernels.md`` beside this file says why it is built so and what each part gains.
+The page ``docs/pages/kernels.md`` says why it is built so and what each part gains.
 """
 
 # Numba's cache follows the file of the compiled function alone: after a change in what it imports, remove __pycache__.
@@ -43,13 +43,13 @@ from ringdic.correlation.interpolation import (
 from ringdic.correlation.lanes import (
     BITS,
     LANES,
+    blend,
     floor,
     lane_sum,
     load,
     mask_from_bits,
     pointer,
     ramp,
-    select,
     store,
     store_integers,
 )
@@ -115,13 +115,13 @@ def _locate_vectors(fx, fy, p, corner, n, place, cell):  # type: ignore[no-untyp
         x_far, y_far = far * (sx + far * qx) + x, far * (sy + far * qy) + y
         j, i = floor(_minimum(x, x_far) - bend_x), floor(_minimum(y, y_far) - bend_y)
         wide, high = floor(maximum(x, x_far) + bend_x) - j, floor(maximum(y, y_far) + bend_y) - i
-        window = select(
+        window = blend(
             maximum(x, x_far + far) + bend_x - j >= kind(REACH_OF_WINDOW), kind(SCATTERED), high + kind(WIDE)
         )
         store_integers(number, v, j + dx)
         store_integers(number, v + step, i + dy)
         near = wide * kind(ACROSS_X) + high * kind(ACROSS_Y)
-        store_integers(number, v + step + step, select(maximum(wide, high) >= one + one, window, near))
+        store_integers(number, v + step + step, blend(maximum(wide, high) >= one + one, window, near))
         store(shape, v, x - j)
         store(shape, v + step, sx)
         store(shape, v + step + step, y - i)
@@ -131,7 +131,7 @@ def _locate_vectors(fx, fy, p, corner, n, place, cell):  # type: ignore[no-untyp
 @nb.njit(forceinline=True, fastmath=FAST)
 def _minimum(one, other):  # type: ignore[no-untyped-def]
     """The smaller of two vectors, lane by lane."""
-    return select(one >= other, other, one)
+    return blend(one >= other, other, one)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -190,9 +190,8 @@ def _make_pass(quintic: bool, second: bool) -> Any:
         """Interpolate the subset in the current image, g about ``level``, and sum what a step needs.
 
         coef : flat coefficients; origin : index of the centre's first tap; place, cell : of the vectors; bend : (2,),
-            their
-        quadratic terms; px, bits, corner, strips : the packed subset; scratch : (17, LANES). sums : (16,), filled: Σg,
-        Σg², Σfg, unused, then Σ g ∂f/∂x φ_k (6) and Σ g ∂f/∂y φ_k (6) with φ = 1 dx dy dx²/2 dxdy dy²/2.
+        their quadratic terms; px, bits, corner, strips : the packed subset; scratch : (17, LANES). sums : (16,),
+        filled: Σg, Σg², Σfg, unused, then Σ g ∂f/∂x φ_k (6) and Σ g ∂f/∂y φ_k (6) with φ = 1 dx dy dx²/2 dxdy dy²/2.
         """
         ref, gx, gy = pointer(px[REF]), pointer(px[GX]), pointer(px[GY])
         c, at_sum, spare, qx, qy = pointer(coef), pointer(scratch), pointer(scratch[16]), bend[0], bend[1]
@@ -204,7 +203,7 @@ def _make_pass(quintic: bool, second: bool) -> Any:
                 p = _U(origin + np.int64(cell[1, v]) * np.int64(stride) + np.int64(cell[0, v]))
                 tx, sx, ty, sy = place[0, v], place[1, v], place[2, v], place[3, v]
                 g = interpolate(c, p, stride, cell[2, v], tx, sx, qx, ty, sy, qy, spare)
-                g = select(mask_from_bits(bits[v]), g - level, _F(0))
+                g = blend(mask_from_bits(bits[v]), g - level, _F(0))
                 sg += g
                 sgg += g * g
                 sfg += g * load(ref, at)
@@ -302,14 +301,14 @@ def _refine_point(  # type: ignore[no-untyped-def]
     corner, corner_f, offset, uncut, strips, radius, terms, quintic, tolerance, max_iterations, texture, noise,
     cache, cached, cache_row, convergence, px, bits, place, cell, bend, lanes, H, moment, vectors, A, B,
 ):  # fmt: skip
-    """IC-GN of one subset from the parameters p (12,), refined in place; returns status, ZNCC, iterations, sigma of u,
-    of v.
+    """Refine the parameters p (12,) of one subset in place by IC-GN.
 
     (x_ref, y_ref) and (x_cur, y_cur) : the centre in the two images' own crops. corner, uncut, strips : the template;
     corner_f the same as floats, filled up to a multiple of LANES. offset : (n,), of lane 0 from the centre in the
     reference's crop. cache, cached, cache_row : rows of values that ``write_cache`` stored, which of them are filled,
-    and this subset's row, -1 for none. convergence : (3,), see ``_next_step_square``. The rest is scratch. Sigma is in
-    px.
+    and this subset's row, -1 for none. convergence : (3,), see ``_next_step_square``. The rest is scratch.
+
+    Returns status, ZNCC, iterations, and sigma of u and of v in px.
 
     One function of more than a screen on purpose: it is inlined into the loop over the points (a call would hand over
     some forty arrays, a twentieth of a point's time), and its parts share nearly all of their variables.
@@ -424,8 +423,9 @@ def _start_from_previous(source, offset, reach, p):  # type: ignore[no-untyped-d
 
 @nb.njit(cache=True, nogil=True)
 def _scratch(rows, columns, kind):  # type: ignore[no-untyped-def]
-    """Scratch array (rows, columns) of the type of ``kind``, aligned to 64 bytes so that a vector is one line of the
-    cache.
+    """Scratch array (rows, columns) of the type of ``kind``, aligned to 64 bytes.
+
+    A vector is then one line of the cache.
     """
     raw = np.empty(rows * columns + 64 // kind.itemsize, kind.dtype)
     skip = (-raw.ctypes.data % 64) // kind.itemsize

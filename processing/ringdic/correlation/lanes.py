@@ -2,7 +2,7 @@
 
 Where numba vectorises a loop over pixels, sums do not stay in registers from one row to the next, and the optimiser
 decides which loads become gathers. With the vector as a value both are certain, and the code of an equation still reads
-as the equation: + - * with vectors and scalars, ``>=``, ``select``, ``load``, ``lane_sum``. LANES is 16 where the
+as the equation: + - * with vectors and scalars, ``>=``, ``blend``, ``load``, ``lane_sum``. LANES is 16 where the
 processor computes 512 bits at once, else 8: AMD's Zen 4 takes 512 bits in two halves, so that they gain nothing there,
 and narrower vectors waste fewer pixels at the rim of a subset.
 
@@ -33,7 +33,7 @@ def _avx512() -> bool:
 
 _AVX512 = _avx512()
 LANES = 16 if _AVX512 and get_host_cpu_name() != "znver4" else 8
-WINDOW = 32  # numbers that ``gather`` reaches
+WINDOW = 32  # numbers that ``lookup`` reaches
 BITS = np.uint16 if LANES == 16 else np.uint8  # one bit a lane
 _BITS = types.uint16 if LANES == 16 else types.uint8
 intrinsic: Any = extending.intrinsic  # typed Any: its declared type hides the arguments of the functions it defines
@@ -243,7 +243,7 @@ def ramp(typingctx, start):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def select(typingctx, choice, one, other):  # type: ignore[no-untyped-def]
+def blend(typingctx, choice, one, other):  # type: ignore[no-untyped-def]
     """Lane by lane ``one`` where the mask ``choice`` is true, else ``other``; either may be a scalar."""
     lanes = one if isinstance(one, Lanes) else other
 
@@ -302,7 +302,7 @@ def lane_sum(typingctx, value):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def gather(typingctx, start, index, which):  # type: ignore[no-untyped-def]
+def lookup(typingctx, start, index, which):  # type: ignore[no-untyped-def]
     """Load start[index + which] for each lane, ``which`` holding whole numbers below WINDOW."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]

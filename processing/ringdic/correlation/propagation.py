@@ -152,10 +152,9 @@ class Propagation:
             status[outside], zncc[outside], iterations[outside], sigma[outside], parameters[outside] = second
         self.region = part
         limit = self.settings.zncc_min if zncc_min is None else zncc_min
-        distance = np.hypot(parameters[:, 0] - start[:, 0], parameters[:, 6] - start[:, 6])
         status = np.where((status == Status.GOOD) & ~(zncc >= limit), Status.LOW_ZNCC, status)
-        far = (status == Status.GOOD) & (distance > max(self.settings.step, 5))
-        status = np.where(far | ((status == Status.GOOD) & _degenerate(parameters)), Status.INCONSISTENT, status)
+        false = (status == Status.GOOD) & (self._far_from_start(parameters, start) | _degenerate(parameters))
+        status = np.where(false, Status.INCONSISTENT, status)
         good = status == Status.GOOD
         repeated = self.iterations[index] > 0
         self.non_convergent[index] = repeated & (status == Status.NO_CONVERGENCE) & (zncc > _DRIFT_ZNCC)
@@ -167,6 +166,11 @@ class Propagation:
         if self.progress is not None:
             self.progress(int(self.good.sum()), len(self.xy))
         return good
+
+    def _far_from_start(self, parameters: Floats, start: Floats) -> Mask:
+        """Matches (k, 12) that lie farther than a grid step, or 5 px, from their start values (k, 12). (k,) bool."""
+        distance = np.hypot(parameters[:, 0] - start[:, 0], parameters[:, 6] - start[:, 6])
+        return np.asarray(distance > max(self.settings.step, 5))
 
     def _cache_rows(self, index: Indices) -> tuple[SubsetCache, Indices] | None:
         """The cache of the reference's subsets with the rows of points (k,) in it; None if there is no cache."""

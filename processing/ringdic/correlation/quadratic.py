@@ -145,8 +145,7 @@ def _within(centres, xy, window, cell, columns, by_cell, starts):  # type: ignor
     """Neighbourhoods of ``neighbours_within``: where each begins (n + 1,), and the members (k,) of all.
 
     cell : (n,), square of side ``window`` that holds each centre, row by row; by_cell : the points in the order of
-        their
-    cells; starts : where each cell begins among them.
+    their cells; starts : where each cell begins among them.
     """
     n = len(centres)
     first = np.zeros(n + 1, np.int64)

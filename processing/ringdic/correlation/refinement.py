@@ -26,7 +26,7 @@ _SAMPLE = 500  # points by which the steepness is judged
 _TRANSPOSED = [6, 8, 7, 11, 10, 9, 0, 2, 1, 5, 4, 3]  # order of the parameters with x and y, u and v exchanged
 
 
-class Refinement(NamedTuple):
+class SubsetMatches(NamedTuple):
     """Results of the inverse-compositional Gauss-Newton refinement of n points.
 
     status : (n,) int64. zncc : (n,) float64. iterations : (n,) int64.
@@ -81,7 +81,7 @@ def refine(
     settings: CorrelationSettings,
     prefer_neighbour: bool = False,
     cache: tuple[SubsetCache, Indices] | None = None,
-) -> Refinement:
+) -> SubsetMatches:
     """Refine points by inverse-compositional Gauss-Newton (IC-GN) from start values.
 
     Parameters
@@ -128,7 +128,7 @@ def _refine(
     settings: CorrelationSettings,
     prefer_neighbour: bool,
     cache: tuple[SubsetCache, Indices] | None,
-) -> Refinement:
+) -> SubsetMatches:
     """Refinement of ``refine`` on the images as they are, without transposing them."""
     n, xy, parameters = len(xy), np.ascontiguousarray(xy, dtype=np.float64), np.array(start, dtype=np.float64)
     known = np.isfinite(parameters).all(axis=1)
@@ -166,7 +166,7 @@ def _refine(
         iterations,
         sigma,
     )
-    return Refinement(status, zncc, iterations, sigma, parameters)
+    return SubsetMatches(status, zncc, iterations, sigma, parameters)
 
 
 def _tiles(xy: Pixels, settings: CorrelationSettings) -> Indices:

@@ -22,6 +22,7 @@ from ringdic.correlation.lanes import (
     BITS,
     LANES,
     bit_count,
+    blend,
     lane_sum,
     load,
     load_one,
@@ -29,7 +30,6 @@ from ringdic.correlation.lanes import (
     nonzero_bits,
     pointer,
     ramp,
-    select,
     store,
     store_one,
 )
@@ -48,8 +48,8 @@ def template(radius, circle):  # type: ignore[no-untyped-def]
     """Layout of a subset before the mask cuts it: n vectors in s strips.
 
     radius : px. circle : whether it is a circle, else a square. Returns corner (2, n) int64, dx and dy of lane 0 of
-        each
-    vector; bits (n,) BITS, the lanes that belong to the subset; strips (s + 1,), the first vector of each strip and n.
+    each vector; bits (n,) BITS, the lanes that belong to the subset; strips (s + 1,), the first vector of each strip
+    and n.
     """
     half = np.empty(2 * radius + 1, np.int64)
     for row in range(2 * radius + 1):
@@ -119,18 +119,17 @@ def pack(  # type: ignore[no-untyped-def]
             here_f, here_x, here_y = value_and_gradient(c, first, stride, tx, ty, quintic)
         else:
             here_f, here_x, here_y = load(f, at), load(fx, at), load(fy, at)
-        store(f, at, select(w, here_f - level, _F(0)))
-        store(fx, at, select(w, here_x, _F(0)))
-        store(fy, at, select(w, here_y, _F(0)))
+        store(f, at, blend(w, here_f - level, _F(0)))
+        store(fx, at, blend(w, here_x, _F(0)))
+        store(fy, at, blend(w, here_y, _F(0)))
 
 
 @nb.njit(fastmath=FAST, nogil=True, cache=True)
 def pack_interior(image, gx, gy, mask, at_centre, offset, level, uncut, px, bits):  # type: ignore[no-untyped-def]
     """Pack a subset whose centre is a pixel and that lies inside the crop: fills px (3, LANES n) and bits (n,).
 
-    image, gx, gy, mask : flat. at_centre : index of the centre. offset : (n,), of lane 0 of each vector from it. level
-        : that
-    f is taken about. uncut : (n,), bits of the template.
+    image, gx, gy, mask : flat. at_centre : index of the centre. offset : (n,), of lane 0 of each vector from it.
+    level : that f is taken about. uncut : (n,), bits of the template.
     """
     source, slope_x, slope_y, region = pointer(image), pointer(gx), pointer(gy), pointer(mask)
     f, fx, fy = pointer(px[REF]), pointer(px[GX]), pointer(px[GY])
@@ -138,9 +137,9 @@ def pack_interior(image, gx, gy, mask, at_centre, offset, level, uncut, px, bits
         at, begin = v * _L, _U(at_centre + offset[v])
         inside_bits = uncut[v] & nonzero_bits(region, begin)
         bits[v], w = inside_bits, mask_from_bits(inside_bits)
-        store(f, at, select(w, load(source, begin) - level, _F(0)))
-        store(fx, at, select(w, load(slope_x, begin), _F(0)))
-        store(fy, at, select(w, load(slope_y, begin), _F(0)))
+        store(f, at, blend(w, load(source, begin) - level, _F(0)))
+        store(fx, at, blend(w, load(slope_x, begin), _F(0)))
+        store(fy, at, blend(w, load(slope_y, begin), _F(0)))
 
 
 @nb.njit(forceinline=True)
@@ -171,8 +170,9 @@ def add_to_row(at, row, value):  # type: ignore[no-untyped-def]
 
 @nb.njit(forceinline=True, fastmath=FAST)
 def _by_power(at, row, x, q0, q1):  # type: ignore[no-untyped-def]
-    """Add a strip's sums of q, q dx and q dy to three rows of scratch; q_k : Σ q dy^k of each lane, x : dx of each
-    lane.
+    """Add a strip's sums of q, q dx and q dy to three rows of scratch.
+
+    q_k : Σ q dy^k of each lane. x : dx of each lane.
     """
     add_to_row(at, row, q0)
     add_to_row(at, row + 1, q0 * x)
@@ -232,11 +232,10 @@ def _third_and_fourth(last, s0, s1, s2, s3, s4):  # type: ignore[no-untyped-def]
 
 
 def _make_moments(second: bool, direct: bool) -> Any:
-    """Compile the sums over a subset for one order, with packing on the way (``direct``) or from px as ``pack`` left
-    it.
+    """Compile the sums over a subset for one order, with or without packing the subset on the way.
 
-    Long on purpose: one pass over the vectors keeps its twenty-three sums in registers, which needs them as variables
-    of one function.
+    direct : whether to pack it; else px holds it, as ``pack`` left it. Long on purpose: one pass over the vectors keeps
+    its twenty-three sums in registers, which needs them as variables of one function.
     """
 
     @nb.njit(fastmath=FAST, nogil=True)
@@ -262,8 +261,8 @@ def _make_moments(second: bool, direct: bool) -> Any:
                     begin = _U(at_centre + offset[v])
                     inside_bits = uncut[v] & nonzero_bits(region, begin)
                     bits[v], w = inside_bits, mask_from_bits(inside_bits)
-                    f, fx = select(w, load(source, begin) - level, _F(0)), select(w, load(slope_x, begin), _F(0))
-                    fy = select(w, load(slope_y, begin), _F(0))
+                    f, fx = blend(w, load(source, begin) - level, _F(0)), blend(w, load(slope_x, begin), _F(0))
+                    fy = blend(w, load(slope_y, begin), _F(0))
                     store(ref, at, f)
                     store(ref_x, at, fx)
                     store(ref_y, at, fy)
@@ -361,13 +360,15 @@ _packed_first, _packed_second = _make_moments(False, False), _make_moments(True,
 
 @nb.njit(nogil=True, cache=True)
 def moments(direct, second, *given):  # type: ignore[no-untyped-def]
-    """Moments Σ q dx^i dy^k of a subset, in the order 1 x y xx xy yy, for second order also those of third and fourth
-    power.
+    """Moments Σ q dx^i dy^k of a subset, up to second power, for second order up to fourth.
+
+    Their order is 1 x y xx xy yy xxx xxy xyy yyy xxxx xxxy xxyy xyyy yyyy.
 
     direct : the subset is packed on the way, as by ``pack_interior``; else px and bits are as ``pack`` left them.
     second : whether the shape functions are of second order. given : the arguments of the compiled ``sums``, among them
-    scratch (MOMENTS, LANES) and out (7, 15), which is filled: rows q = gx², gx gy, gy², gx, gy, f gx, f gy. Returns Σ
-    f, Σ f² and the number of pixels.
+    scratch (MOMENTS, LANES) and out (7, 15), which is filled: rows q = gx², gx gy, gy², gx, gy, f gx, f gy.
+
+    Returns Σ f, Σ f² and the number of pixels.
     """
     if direct:
         if second:
@@ -406,8 +407,7 @@ def write_cache(cache, size, H, sum_J, sum_fJ, mean_f, norm_f, pixels):  # type:
     """Write what does not depend on the current image into cache, a row of ``width_of_subset`` numbers.
 
     size : of the normal matrix. H : its Cholesky factor (size, size). sum_J, sum_fJ : (size,). mean_f, norm_f, pixels :
-        mean
-    of f, norm of f about it, and number of pixels.
+    mean of f, norm of f about it, and number of pixels.
     """
     at = 3
     cache[0], cache[1], cache[2] = mean_f, norm_f, pixels

@@ -1,29 +1,49 @@
-"""Notice of the kernels being compiled, which happens once on a machine: afterwards they are loaded from a cache."""
+"""Notice of kernels being compiled. It happens once on a machine; afterwards they are loaded from a cache on disk."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 from numba.core import event
 
+from ringdic.progress import COMPILING, Progress, Report
+
 
 class _Listener(event.Listener):
-    def __init__(self, tell: Callable[[], None]) -> None:
-        self._tell = tell
-        self._told = False
+    def __init__(self, notify: Callable[[], None]) -> None:
+        self._notify = notify
+        self._notified = False
 
     def on_start(self, _: event.Event) -> None:
-        if not self._told:
-            self._told = True
-            self._tell()
+        if not self._notified:
+            self._notified = True
+            self._notify()
 
     def on_end(self, _: event.Event) -> None:
         return
 
 
 @contextmanager
-def on_compiling(tell: Callable[[], None]) -> Iterator[None]:
-    """Call ``tell`` once if a kernel is compiled inside; not if all are loaded."""
-    with event.install_listener("numba:compile", _Listener(tell)):
+def on_compiling(notify: Callable[[], None]) -> Iterator[None]:
+    """Call ``notify`` once if a kernel is compiled inside; not if all are loaded from the cache."""
+    with event.install_listener("numba:compile", _Listener(notify)):
         yield
+
+
+@contextmanager
+def compiling_reported(report: Report) -> Iterator[Report]:
+    """Pass reports of progress on, and report by name when kernels begin to be compiled inside.
+
+    report : receives everything. Yields the function for the computation to report to.
+    """
+    last = Progress("prepare", 0.0)
+
+    def passed_on(progress: Progress) -> None:
+        nonlocal last
+        last = progress
+        report(progress)
+
+    with on_compiling(lambda: report(replace(last, message=COMPILING))):
+        yield passed_on

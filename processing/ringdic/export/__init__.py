@@ -42,11 +42,11 @@ _WRITERS: dict[str, Callable[[EvaluatedResults, Path], None]] = {
     "ply": export_ply,
     "glb": export_glb,
 }
-_FOLDERS = ("vtp", "csv", "ply", "glb")
+FOLDERS = ("vtp", "csv", "ply", "glb")
 _COLOURED: dict[str, Callable[[EvaluatedResults, Path, str], None]] = {"ply": export_ply, "glb": export_glb}
 FORMATS = tuple(_WRITERS)
 
-__all__ = ["FORMATS", "Evaluation", "export"]
+__all__ = ["FOLDERS", "FORMATS", "Evaluation", "export"]
 
 
 def export(
@@ -90,13 +90,13 @@ def export(
         raise InputError(f"format '{format}' has no colours; {' and '.join(_COLOURED)} have")
     results_path = newest_results(Path(session_path), run)
     if out is None:
-        out = results_path.with_name(format if format in _FOLDERS else f"results.{format}")
+        out = results_path.with_name(format if format in FOLDERS else f"results.{format}")
     out = Path(out)
     _check_place(out, format)
     results = evaluate_results(results_path, evaluation)
     if format in _COLOURED:
         results.field(colour or DEFAULT_COLOUR)
-    if format in _FOLDERS:
+    if format in FOLDERS:
         out.mkdir(exist_ok=True)
         if format in _COLOURED:
             _COLOURED[format](results, out, colour or DEFAULT_COLOUR)
@@ -115,7 +115,7 @@ def export(
 def _check_place(out: Path, format: str) -> None:
     if not out.parent.is_dir():
         raise InputError(f"{out.parent}: no such folder to export into")
-    if format in _FOLDERS:
+    if format in FOLDERS:
         if out.exists() and not out.is_dir():
             raise InputError(f"{out}: is a file; format '{format}' writes a folder with one file a step")
     elif out.is_dir():

@@ -49,7 +49,7 @@ class Intrinsics:
 
         xy : (..., 2) ideal points x/z, y/z in the camera frame, without unit. Returns the distorted points (..., 2).
         """
-        return np.asarray(lens.distort(_rows(xy), self.distortion)).reshape(np.shape(xy))
+        return np.asarray(lens.distort_points(_rows(xy), self.distortion)).reshape(np.shape(xy))
 
     def jacobian_normalised(self, xy: Floats) -> Floats:
         """Jacobian d(distorted)/d(ideal) of the distortion at ideal normalised points.
@@ -67,7 +67,7 @@ class Intrinsics:
         (fx, s, cx), (_, fy, cy) = self.K[0], self.K[1]
         y_d = (px[..., 1] - cy) / fy
         target = np.stack([(px[..., 0] - cx - s * y_d) / fx, y_d], axis=-1)
-        xy = np.asarray(lens.undistort(_rows(target), self.distortion)).reshape(px.shape)
+        xy = np.asarray(lens.undistort_points(_rows(target), self.distortion)).reshape(px.shape)
         return xy * np.array([fx, fy]) + np.array([cx, cy])
 
     def to_distorted(self, px: Pixels) -> Pixels:

@@ -40,7 +40,7 @@ def jacobian_of_point(x, y, c):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def distort(xy, c):  # type: ignore[no-untyped-def]
+def distort_points(xy, c):  # type: ignore[no-untyped-def]
     """Distorted points (n, 2) of ideal points xy (n, 2), by the coefficients c (5,)."""
     out = np.empty_like(xy)
     for i in range(len(xy)):
@@ -74,7 +74,7 @@ def pixel_jacobians(px, K, c):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def undistort(target, c):  # type: ignore[no-untyped-def]
+def undistort_points(target, c):  # type: ignore[no-untyped-def]
     """Ideal points (n, 2) whose images by the distortion c (5,) are the distorted points target (n, 2).
 
     Newton's method to round-off; NaN where it diverges and beyond the radius where the polynomial folds the image over.

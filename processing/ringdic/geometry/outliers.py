@@ -11,7 +11,7 @@ from ringdic.arrays import Floats, Indices, Mask, Pixels, Points
 from ringdic.geometry import kernels
 
 _OPPOSITE = ((1, 0), (0, 1), (1, 1), (1, -1))  # half of a grid point's eight neighbours; the others lie opposite
-_SIGMA_OF_MAD = 1.4826  # of a normal distribution
+SIGMA_OF_MAD = 1.4826  # standard deviation by median absolute deviation, of a normal distribution
 
 
 class LostPoint(IntEnum):
@@ -32,7 +32,7 @@ def crossing_outliers(residuals: Pixels, factor: float = 8.0, floor: float = 0.3
     """
     with np.errstate(invalid="ignore"):
         about = np.abs(residuals - _medians(residuals)[:, None])
-        limit = np.maximum(factor * _SIGMA_OF_MAD * _medians(about), floor)
+        limit = np.maximum(factor * SIGMA_OF_MAD * _medians(about), floor)
         return np.asarray((about > limit[:, None]).any(axis=(0, 2)))
 
 

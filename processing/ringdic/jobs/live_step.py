@@ -15,7 +15,7 @@ from pathlib import Path
 from ringdic.calibration.calibrated_rig import CalibratedRig, calibrate_rig
 from ringdic.errors import InputError
 from ringdic.jobs.pipeline import match_session
-from ringdic.pairs.merging import Merged, merge
+from ringdic.pairs.merging import MergedSurface, merge
 from ringdic.pairs.surfaces import PairSurface
 from ringdic.progress import Report, Stages, silent
 from ringdic.results.writer import write_series
@@ -45,8 +45,8 @@ def process_step(
     settings = settings.model_copy(update={"surface": settings.surface.model_copy(update={"method": "pairs"})})
     steps = _with_reference(session, capture_id)
 
-    def merging(pairs: Sequence[PairSurface], heuristic: str) -> Merged:
-        surfaces = [pair.sheet_at_reference for pair in pairs]
+    def merging(pairs: Sequence[PairSurface], heuristic: str) -> MergedSurface:
+        surfaces = [pair.part_at_reference for pair in pairs]
         key = digest("live surface", heuristic, [(each.vertices, each.faces, each.correlation) for each in surfaces])
         return process_memory.get(key, lambda: merge(surfaces, heuristic), _bytes)
 
@@ -78,6 +78,6 @@ def _with_reference(session: Session, capture_id: str) -> tuple[Capture, ...]:
     return (specimen[0], *chosen) if chosen[0] is not specimen[0] else (specimen[0],)
 
 
-def _bytes(merged: Merged) -> int:
+def _bytes(merged: MergedSurface) -> int:
     """Size of a merged surface, bytes."""
     return int(merged.vertex.nbytes + merged.faces.nbytes + merged.pair.nbytes)

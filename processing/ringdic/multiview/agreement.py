@@ -10,7 +10,7 @@ from ringdic.arrays import Floats, Indices, Mask, Pixels, Points
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.weighted_triangulation import WeightedPoints, triangulate_weighted
 
-_LIMIT = 25.0  # χ² for each degree of freedom, in units of the usual one
+_LIMIT = 25.0  # χ² for each degree of freedom, in units of its median over the points
 _ROUNDS = 2
 
 
@@ -33,9 +33,9 @@ def triangulate_agreeing(
     """
     px = px.copy()
     points = triangulate_weighted(cameras, px, sigma)
-    usual = _usual(points)
+    median_chi2 = _median_chi2(points)
     for _ in range(_ROUNDS):
-        bad = np.flatnonzero(_contradicted(points, usual))
+        bad = np.flatnonzero(_contradicted(points, median_chi2))
         if not len(bad):
             break
         px[_worst(cameras, points.xyz[bad], px[:, bad], sigma[:, bad], None if fixed is None else fixed[bad]), bad] = (
@@ -44,20 +44,20 @@ def triangulate_agreeing(
         again = triangulate_weighted(cameras, px[:, bad], sigma[:, bad])
         points.xyz[bad], points.covariance[bad] = again.xyz, again.covariance
         points.chi2[bad], points.degrees[bad] = again.chi2, again.degrees
-    bad = np.flatnonzero(_contradicted(points, usual))
+    bad = np.flatnonzero(_contradicted(points, median_chi2))
     points.xyz[bad], points.covariance[bad], points.chi2[bad], points.degrees[bad] = np.nan, np.nan, np.nan, 0
     return points, np.asarray(np.isfinite(px[..., 0]) & np.isfinite(points.chi2))
 
 
-def _usual(points: WeightedPoints) -> float:
+def _median_chi2(points: WeightedPoints) -> float:
     """Median over the points of χ² for each degree of freedom, at least one."""
     known = points.degrees > 0
     return max(1.0, float(np.median(points.chi2[known] / points.degrees[known]))) if known.any() else 1.0
 
 
-def _contradicted(points: WeightedPoints, usual: float) -> Mask:
+def _contradicted(points: WeightedPoints, median_chi2: float) -> Mask:
     """Points (n,) whose χ² is far beyond the usual: some view contradicts the others."""
-    return np.asarray((points.degrees > 0) & (np.nan_to_num(points.chi2) > _LIMIT * usual * points.degrees))
+    return np.asarray((points.degrees > 0) & (np.nan_to_num(points.chi2) > _LIMIT * median_chi2 * points.degrees))
 
 
 def _worst(cameras: Sequence[Camera], xyz: Points, px: Pixels, sigma: Floats, fixed: Indices | None) -> Indices:

@@ -70,7 +70,10 @@ class SurfaceLattice:
         return column, np.clip(row, 0, len(self.z) - 1), inside
 
     def arc(self, theta: Floats, theta_0: Floats) -> Floats:
-        """Arc R (θ - θ₀) the short way round, mm. theta, theta_0 : (...) rad, of shapes that broadcast."""
+        """Arc R (θ - θ₀) the short way round, mm.
+
+        theta, theta_0 : (n,) rad, or other shapes that broadcast.
+        """
         return self.radius * ((theta - theta_0 + math.pi) % TURN - math.pi)
 
 

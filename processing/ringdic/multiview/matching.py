@@ -62,8 +62,8 @@ class ReferenceImages:
         return matches
 
     def current(self, k: int) -> Current:
-        """Image of camera number k, filtered as a current image about the pixels of ``look_at``; the latest ones are
-        cached.
+        """Image of camera number k as a current image, filtered about the pixels of ``look_at``; the latest
+        are cached.
         """
         if k not in self._filtered:
             while len(self._filtered) >= _CACHED:
@@ -139,7 +139,7 @@ def match_nodes(
     order: int,
     curved: bool = True,
 ) -> NodeMatches:
-    """Match nodes of the surface from the image of their reference camera to those of their partners.
+    """Match nodes of the surface from the image of their reference camera in the images of partner cameras.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def match_nodes(
     pieces : the surface, which gives the start values.
     nodes : columns (n,) int and rows (n,) int.
     reference : (n,) int, index of the camera that each node is matched from.
-    partners : (C, n) bool, cameras that each node is matched to.
+    partners : (C, n) bool, cameras that each node is matched in.
     order : of the subsets, 1 or 2.
     curved : whether second derivatives are taken from the shape, as start values of the second order and as fixed
     values of the first; otherwise they are zero.
@@ -222,8 +222,9 @@ class _Parts:
 
 
 def _of_order(settings: CorrelationSettings, order: int) -> CorrelationSettings:
-    """Settings of subsets of an order; those of second order serve the smooth pieces and need not converge to the last
-    digit.
+    """Settings of subsets of an order.
+
+    Those of second order serve the smooth pieces alone and need not converge to the last digit.
     """
     iterations = min(settings.max_iterations, _PATIENCE)
     tolerance = settings.tolerance if order == 1 or settings.order == 2 else max(settings.tolerance, _LOOSE)

@@ -54,8 +54,8 @@ class Motion:
     """Positions of the n points of a surface at F steps.
 
     xyz : (F, n, 3) mm, world frame, NaN where lost. covariance : (F, n, 3, 3) mm², of the displacement since the
-    reference. chi2, degrees : (F, n), of the triangulation. c_ls : (F, n), the largest over the cameras used. status
-    : (F, n) int, 0 where measured. tracks : of the cameras. drift : (F, C) px, mean vertical residual of each
+    reference. chi2, degrees : (F, n), of the triangulation. c_ls : (F, n), the largest over the cameras used.
+    status : (F, n) int, 0 where measured. tracks : of the cameras. drift : (F, C) px, mean vertical residual of each
     camera, not zero for one that has moved between the steps.
     """
 
@@ -88,13 +88,13 @@ def vertex_track(
     status = np.where(uncertain, LostPoint.UNCERTAIN, track.status).astype(np.int8)
     texture = shape.textures[camera].part(vertex)
     variance = camera_noise(float(shape.grey_noise[camera]), track.c_ls[1:], texture.contrast)
-    noise, sigma = _parted(track, texture, variance)
+    noise, sigma = _displacement_sigma(track, texture, variance)
     weight = np.stack([smooth_sigma(x0, np.maximum(one, _LEAST_SIGMA), _CELL * step) for one in sigma])
     used = np.zeros(status.shape, bool)
     return VertexTrack(camera, vertex, track.px, sigma, noise, weight, variance, track.c_ls, status, used)
 
 
-def _parted(track: CameraTrack, texture: Texture, variance: float) -> tuple[Floats, Floats]:
+def _displacement_sigma(track: CameraTrack, texture: Texture, variance: float) -> tuple[Floats, Floats]:
     """Standard deviations (F, k, 2) px of the displacements: by noise alone and by all causes.
 
     variance : of the noise, grey levels².

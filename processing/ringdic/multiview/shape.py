@@ -71,8 +71,8 @@ class ReferenceShape:
 
     xyz : (n, 3) mm, world frame. node : (n, 2) int, column and row on the lattice. reference : (n,) int, index of the
     camera that each point was matched from and in which it lies on a whole pixel. px : (C, n, 2) px, NaN for a
-    camera that was not used. sigma : (C, n, 2) px, standard deviation by all causes, smoothed over the image. noise
-    : (C, n, 2) px, by the noise of each image alone. textures : of each camera's image at px. grey_noise : (C,),
+    camera that was not used. sigma : (C, n, 2) px, standard deviation by all causes, smoothed over the image.
+    noise : (C, n, 2) px, by the noise of each image alone. textures : of each camera's image at px. grey_noise : (C,),
     variance of each camera's noise, grey levels², NaN where it has no image. covariance : (n, 3, 3) mm². chi2,
     degrees : (n,), of the triangulation. c_ls : (n,), the largest over the cameras. faces : (M, 3) int, normals
     outwards. pieces : the fitted surface. status : (columns, rows) of all nodes, 0 where measured, NOT_REACHED also
@@ -97,7 +97,10 @@ class ReferenceShape:
     match_count: int
 
     def arrays(self) -> dict[str, NDArray]:
-        """Arrays of the shape by name, of any shape and unit as listed for the class, as a task's output holds them."""
+        """Arrays of the shape by name, as a task's output holds them.
+
+        Shapes and units are those of the class: (n, ...) mm or px for the points, (M, 3) indices for the faces.
+        """
         lattice = self.pieces.lattice
         parts = {
             "lattice": np.array([lattice.radius, lattice.columns, *lattice.z]),
@@ -111,7 +114,10 @@ class ReferenceShape:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray]) -> ReferenceShape:
-        """Shape from the arrays, (...) of any unit, that :meth:`arrays` gave."""
+        """Shape from its arrays by name.
+
+        arrays : as from :meth:`arrays`, (n, ...) mm or px for the points, (M, 3) indices for the faces.
+        """
         radius, columns, *z = arrays["lattice"].tolist()
         lattice = SurfaceLattice(radius, int(columns), np.array(z))
         textures = tuple(
@@ -178,7 +184,7 @@ def _samples(images: ReferenceImages, pairs: Sequence[tuple[int, int]], search: 
         radii = search_radii(cameras, search)
         depths = sweep_depths(cameras, images.grey(a), images.current(b), mask, radii, search, images.settings, _PIECE)
         samples.append(depths.xyz[depths.good])
-        log.debug("cameras %s, %s: %d places of the surface", cameras[0].id, cameras[1].id, len(samples[-1]))
+        log.debug("cameras %s, %s: %d positions on the surface", cameras[0].id, cameras[1].id, len(samples[-1]))
     samples_of_all = np.concatenate(samples)
     if len(samples_of_all) < 12:
         raise ComputationError(

@@ -1,5 +1,4 @@
-"""Matches of the same points in two images of one camera: whole-pixel subsets in two passes, with the field's
-curvature.
+"""Matches of a camera's points in a later image: whole-pixel subsets in two passes, with the field's curvature.
 
 A first-order subset in a curved displacement field is biased; one of second order is not, but is nearly twice as noisy.
 So there are two passes. The first is of second order, at the knots, a part of the points. A quadratic fitted to its
@@ -92,14 +91,17 @@ def match_tracked_points(
     ----------
     reference, current : the two images, filtered.
     points : n points of the reference image.
-    start : (n, 12) float64, warps at the points, NaN rows where unknown; None: start values are sought in the images.
+    start : (n, 12) float64, warps at the points in px and its powers, NaN rows where unknown; None: start values are
+        sought in the images.
     settings : of the correlation; order 2 with ``two_pass`` False leaves the second derivatives to each subset.
-    two_pass : second derivatives of the neighbours' displacement are held fixed in a second, first-order pass.
+    two_pass : whether second derivatives of the neighbours' displacement are held fixed in a second, first-order pass.
     search : whether start values are sought in the images where too few of those given hold.
     """
     start_at_pixels = None if start is None else shift_warps(start, points.shift)
     if not two_pass:
-        return _judged(_match_pixels(reference, current, points.pixels, start_at_pixels, settings, search), points)
+        return _reject_outliers(
+            _match_pixels(reference, current, points.pixels, start_at_pixels, settings, search), points
+        )
     part = (
         current
         if start_at_pixels is None
@@ -111,7 +113,7 @@ def match_tracked_points(
     warp = _predicted_warps(first, points, settings.radius)
     part = _about(points.pixels + warp[:, :2], settings.radius, part, current)
     second = correlate_independently(reference, part, points.pixels, settings, warp)
-    return _judged(_unbiased(first, second, points), points)
+    return _reject_outliers(_subtract_bias(first, second, points), points)
 
 
 def shift_warps(warp: Floats, shift: Floats) -> Floats:
@@ -250,10 +252,10 @@ def _predicted_warps(first: Correlation, points: TrackedPoints, radius: int) -> 
 
 
 def _fixed_curvature(fit: QuadraticFit, first: Correlation, points: TrackedPoints, radius: int) -> Floats:
-    """Second derivatives (n, 6) to be held fixed: where a knot's own are too uncertain, as at the rim, the nearest
-    knot's.
+    """Second derivatives (n, 6) that the second pass holds fixed, from the quadratics of the first pass.
 
-    A wrong second derivative δ moves a round first-order subset of radius r by δ r²/8, the mean of δ x²/2 over it.
+    Where a knot's own are too uncertain, as at the rim, those of the nearest knot are taken. A wrong second
+    derivative δ moves a round first-order subset of radius r by δ r²/8, the mean of δ x²/2 over it.
     """
     size = np.hypot(*first.sigma.T)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -267,9 +269,9 @@ def _fixed_curvature(fit: QuadraticFit, first: Correlation, points: TrackedPoint
     return np.asarray(curvature[points.nearest(known)])
 
 
-def _unbiased(first: Correlation, second: Correlation, points: TrackedPoints) -> Correlation:
-    """Subtract from the second pass the smooth part of its difference from the first, as far as it exceeds
-    the noise.
+def _subtract_bias(first: Correlation, second: Correlation, points: TrackedPoints) -> Correlation:
+    """Subtract the bias of the second pass: the smooth part of its difference from the first, where it
+    exceeds noise.
     """
     second_sigma = second.sigma[points.knots]
     with np.errstate(invalid="ignore"):
@@ -314,14 +316,14 @@ def _lost(points: TrackedPoints, status: Indices) -> ImageMatches:
     return ImageMatches(np.full((n, 12), np.nan), np.full((n, 2), np.nan), lost, lost.copy(), status)
 
 
-def _judged(matches: Correlation, points: TrackedPoints) -> ImageMatches:
+def _reject_outliers(matches: Correlation, points: TrackedPoints) -> ImageMatches:
     """Matches at the points themselves; those unlike the reference or contradicting their neighbours are lost."""
     status = matches.status.copy()
     mean_square = _mean_square(matches, points)
     with np.errstate(invalid="ignore"):
         status[mean_square > points.largest_difference(mean_square)] = Status.LOW_ZNCC
-    alike = status == Status.GOOD
-    uv = np.where(alike[:, None], matches.uv, np.nan)
+    plausible = status == Status.GOOD
+    uv = np.where(plausible[:, None], matches.uv, np.nan)
     status[points.contradict(uv, np.hypot(*matches.sigma.T))] = Status.INCONSISTENT
     good = status == Status.GOOD
     warp = shift_warps(_warp(matches), -points.shift)

@@ -67,7 +67,8 @@ def surface_of_tracks(
 
     Raises ComputationError where the shape has no triangle.
     """
-    _require_faces(shape)
+    if not len(shape.faces):
+        raise ComputationError("too few neighbouring points of the surface were measured to make a triangle")
     step, sigma_max = settings.correlation.step_px, settings.surface.sigma_max_px
     vertex_tracks = []
     for k, track in tracks.items():
@@ -76,7 +77,13 @@ def surface_of_tracks(
     poses = RefinedCameras(cameras)
     refine_poses = poses if settings.calibration.refine_poses else None
     motion = surface_motion(cameras, shape, vertex_tracks, len(steps), refine_poses)
-    return _assembled(rig, cameras, pairs, steps, shape, motion, poses, settings)
+    residuals = reprojection_residuals(cameras, shape.xyz, shape.px)
+    return MultiviewSurface(
+        _results(rig, cameras, pairs, steps, shape, motion, settings),
+        _drift(cameras, residuals, motion),
+        {**_agreement(shape, residuals), "moved_cameras": poses.figures(steps)},
+        _idle(cameras, shape) + poses.sentences(steps),
+    )
 
 
 def reference_pixels(camera: Camera, shape: ReferenceShape, k: int) -> tuple[Indices, Pixels]:
@@ -101,32 +108,6 @@ def shape_settings(settings: Settings) -> ShapeSettings:
         spacing=settings.surface.spacing_mm,
         curvature=settings.surface.curvature,
         sigma_max=settings.surface.sigma_max_px,
-    )
-
-
-def _require_faces(shape: ReferenceShape) -> None:
-    """Raise ComputationError where a shape has no triangle."""
-    if not len(shape.faces):
-        raise ComputationError("too few neighbouring points of the surface were measured to make a triangle")
-
-
-def _assembled(
-    rig: str,
-    cameras: Sequence[Camera],
-    pairs: Sequence[tuple[str, str]],
-    steps: Sequence[str],
-    shape: ReferenceShape,
-    motion: Motion,
-    poses: RefinedCameras,
-    settings: Settings,
-) -> MultiviewSurface:
-    """Assemble the results, the agreement of the cameras and the warnings."""
-    residuals = reprojection_residuals(cameras, shape.xyz, shape.px)
-    return MultiviewSurface(
-        _results(rig, cameras, pairs, steps, shape, motion, settings),
-        _drift(cameras, residuals, motion),
-        {**_agreement(shape, residuals), "moved_cameras": poses.figures(steps)},
-        _idle(cameras, shape) + poses.sentences(steps),
     )
 
 

@@ -116,7 +116,7 @@ def shape_task(
     pairs: tuple[tuple[int, int], ...],
     search: DepthSearch,
     correlation: CorrelationSettings,
-    how: ShapeSettings,
+    shape_options: ShapeSettings,
     images: Mapping[str, Path],
     masks: Mapping[str, Path],
     *,
@@ -134,7 +134,7 @@ def shape_task(
     def image(id_: str) -> Image | None:
         return step_image(images[id_], by_id[id_]) if id_ in images else None
 
-    shape = reference_shape(cameras, image, mask_images, pairs, search, correlation, how)
+    shape = reference_shape(cameras, image, mask_images, pairs, search, correlation, shape_options)
     return {**shape.arrays(), "points": np.array(shape.match_count)}
 
 

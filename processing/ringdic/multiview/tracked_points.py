@@ -1,4 +1,4 @@
-"""Points that are tracked in a camera's images, and what about them is the same in every image.
+"""Points that are tracked through a camera's images, with what is computed once for all images.
 
 What is smooth over the image, the field's curvature and the bias that subsets leave, is computed at a part of the
 points only, the knots: one in each square not quite a subset's radius wide.
@@ -28,7 +28,7 @@ _UNLIKE = 3.0  # times the usual mean square difference that noise alone, which 
 
 @dataclass(frozen=True)
 class TrackedPoints:
-    """n points of a reference image, m of them knots.
+    """Points of a reference image that are tracked through later images: n points, of which m are knots.
 
     positions : (n, 2) float64, px. pixels : (n, 2) float64, px, the whole pixels next to them, on which their
     subsets lie. variance : (n,), of the grey levels there, grey levels². least : mean square difference that
@@ -70,8 +70,7 @@ class TrackedPoints:
         return out
 
     def quadratics(self, values: Pixels, sigma: Floats) -> QuadraticFit:
-        """Fit local quadratics of a displacement field about the knots, without the knots that contradict their
-        neighbours.
+        """Fit local quadratics of a displacement field about the knots, without those that contradict their neighbours.
 
         values : (n, 2) px, at the points. sigma : (n,) px.
         """

@@ -92,7 +92,7 @@ class CameraTrack:
 
 @dataclass(frozen=True)
 class TrackState:
-    """State that a block of steps leaves to the next: for each of k points the last step at which it was matched.
+    """State at the end of a block of steps: where and when each of k points was last matched.
 
     Only points inside the reference image are counted. warp : (k, 12), since the reference, in px and its powers.
     before : (k, 12), at the step before that, NaN if lost there. sigma : (k, 2) px. c_ls : (k,). last : (k,) int,
@@ -136,12 +136,16 @@ def track_block(
     Parameters
     ----------
     reference_image : (h, w) grey levels.
-    image_of_step : gives the image of a step, None where there is none, in which case all points are lost there; it
-    may be called twice for a step, and for earlier steps. steps : of the block. x0 : (n, 2) float64, px, anywhere in
-    the reference image, about ``settings.step`` apart; NaN where the camera does not see the point. mask : (h, w)
-    bool, pixels that belong to the surface and may be part of a subset; None: all within a step of a point. settings
-    : of the correlation; its order is replaced by that of ``options``. options : of the tracking. state : at the end
-    of the previous block; None before step 1.
+    image_of_step : gives the image of a step, or None, and then all points are lost there. It may be called twice for a
+        step, and for earlier steps.
+    steps : of the block.
+    x0 : (n, 2) float64, px, anywhere in the reference image, about ``settings.step`` apart; NaN where the camera does
+        not see the point.
+    mask : (h, w) bool, pixels that belong to the surface and may be part of a subset; None: all within a step of a
+        point.
+    settings : of the correlation; its order is replaced by that of ``options``.
+    options : of the tracking.
+    state : at the end of the previous block; None before step 1.
 
     Returns
     -------
@@ -155,7 +159,7 @@ def track_block(
     if not len(index):
         return result, state
     settings = replace(settings, order=options.order)
-    points = _Points.of(reference_image, image_of_step, x0[index], mask, settings, options, state)
+    points = _CameraTracker.of(reference_image, image_of_step, x0[index], mask, settings, options, state)
     for k, step in enumerate(steps):
         matches = points.advance(step)
         if matches is not None:
@@ -168,7 +172,7 @@ def track_block(
 
 
 def at_reference(x0: Pixels, shape: tuple[int, ...]) -> CameraTrack:
-    """Track of points in the reference image alone, one step.
+    """Track of points at the reference, as a track of one step.
 
     x0 : (n, 2) float64, px. shape : (h, w) of the image.
     """
@@ -196,7 +200,7 @@ def _lost(steps: int, x0: Floats, inside: Mask) -> CameraTrack:
 
 
 def mask_about(xy: Pixels, shape: tuple[int, ...], reach: float) -> Mask:
-    """Pixels of an image within ``reach`` px of any of some points.
+    """Mask of the pixels of an image that lie within ``reach`` px of any of some points.
 
     xy : (n, 2) px. shape : (h, w). Returns (h, w) bool.
     """
@@ -208,7 +212,7 @@ def mask_about(xy: Pixels, shape: tuple[int, ...], reach: float) -> Mask:
 
 
 @dataclass
-class _Points:
+class _CameraTracker:
     """The points of one camera, the state of their track, and the images that they are tracked through."""
 
     reference: Reference
@@ -223,7 +227,7 @@ class _Points:
     def of(
         cls, image: Image, image_of_step: Callable[[int], Image | None], x0: Pixels, mask: Mask | None,
         settings: CorrelationSettings, options: Tracking, state: TrackState,
-    ) -> _Points:  # fmt: skip
+    ) -> _CameraTracker:  # fmt: skip
         """Points x0 (n, 2) px of a reference image, in the state in which the previous block left them."""
         region = mask_about(x0, image.shape, settings.step) if mask is None else mask
         reference = prepare_reference(image, region, settings)
@@ -257,7 +261,7 @@ class _Points:
             reference, current, points, start, self.settings, two_pass=self.options.two_pass, search=search
         )
 
-    def _prepared(self, reference: Reference, at: Floats) -> TrackedPoints:
+    def _tracked_points(self, reference: Reference, at: Floats) -> TrackedPoints:
         """Points (n, 2) px of a reference image, prepared for tracking with the options of this track."""
         return tracked_points(reference, at, self.settings, self.options.window, thin=self.options.two_pass)
 
@@ -288,9 +292,7 @@ class _Points:
         return [int(step[k]) for k in order if count[k] >= _FEW * len(self.x0)]
 
     def _match_by_way(self, step: int, matches: ImageMatches, current: Current, by_way: Indices) -> ImageMatches:
-        """Match points that are lost now and were last matched at a step from the image of that step; fills by_way
-        (n,).
-        """
+        """Match lost points that were last matched at a step from the image of that step. Fills by_way (n,)."""
         image, last, warp = self.image_of_step(step), self.state.last, self.state.warp
         lost = np.flatnonzero(~matches.good & (last == step))
         if image is None:
@@ -302,36 +304,34 @@ class _Points:
             steady = steady[np.isfinite(near)]
         chosen = np.concatenate([lost, steady])
         start = np.full((len(chosen), 12), np.nan)
-        start[len(lost) :] = _between(warp[steady], matches.warp[steady])
+        start[len(lost) :] = _warps_between(warp[steady], matches.warp[steady])
         changed = bool(matches.good.mean() < _CHANGED)
         if not len(steady) and not changed:  # hidden or worn, with nothing about it that gives a start value
             return matches
         reference = prepare_reference(image, mask_about(at[chosen], image.shape, self.settings.step), self.settings)
-        points = self._prepared(reference, at[chosen])
+        points = self._tracked_points(reference, at[chosen])
         since = self._match(reference, current, points, start, search=changed).part(np.arange(len(lost)))
         limit = self.points.largest_difference(matches.mean_square)[lost]
         accepted = since.good & ~(since.mean_square > limit)
-        log.debug("%d of %d lost points found from the image of step %d", accepted.sum(), len(lost), step)
+        log.debug("%d of %d lost points matched from the image of step %d", accepted.sum(), len(lost), step)
         if not accepted.any():
             return matches
-        composed = self._composed(lost[accepted], since.part(accepted))
+        composed = self._compose(lost[accepted], since.part(accepted))
         # Perhaps only the start value was missing: a match from the reference itself is better, as no errors add up.
-        points = self._prepared(self.reference, self.x0[lost[accepted]])
+        points = self._tracked_points(self.reference, self.x0[lost[accepted]])
         direct = self._match(self.reference, current, points, composed.warp, search=False)
         agree = direct.good & ~(direct.mean_square > limit[accepted])
         agree &= np.hypot(*(direct.warp - composed.warp)[:, :2].T) < _AGREE
         by_way[lost[accepted]] = np.where(agree, 0, step)
-        return self._accepted(
-            matches, lost[accepted], _with_matches(composed, np.flatnonzero(agree), direct.part(agree))
-        )
+        return self._accept(matches, lost[accepted], _with_matches(composed, np.flatnonzero(agree), direct.part(agree)))
 
-    def _accepted(self, matches: ImageMatches, index: Indices, other: ImageMatches) -> ImageMatches:
+    def _accept(self, matches: ImageMatches, index: Indices, other: ImageMatches) -> ImageMatches:
         """Matches with the points ``index`` (k,) replaced by others where these agree with their neighbours."""
         both = _with_matches(matches, index, other)
         odd = self.points.contradict(both.warp[:, :2], np.hypot(*both.sigma.T))[index]
         return _with_matches(matches, index[~odd], other.part(~odd))
 
-    def _composed(self, index: Indices, since: ImageMatches) -> ImageMatches:
+    def _compose(self, index: Indices, since: ImageMatches) -> ImageMatches:
         """Compose the motion of points ``index`` (k,) until they were last matched with their motion since."""
         state = self.state
         G = np.eye(2) + since.warp[:, 2:6].reshape(-1, 2, 2)
@@ -358,7 +358,7 @@ class _Points:
         )
 
 
-def _between(first: Floats, second: Floats) -> Floats:
+def _warps_between(first: Floats, second: Floats) -> Floats:
     """First-order warps (n, 12) from the ends of the warps ``first`` to the ends of the warps ``second``."""
     G1 = np.eye(2) + first[:, 2:6].reshape(-1, 2, 2)
     G2 = np.eye(2) + second[:, 2:6].reshape(-1, 2, 2)

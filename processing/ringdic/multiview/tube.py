@@ -145,9 +145,7 @@ def _holes(nodes: _Nodes) -> tuple[Indices, Indices]:
 
 
 def _beside(nodes: _Nodes, edges: Indices) -> Indices:
-    """A lost node (k, 2), column and row, in the cell on the open side of each border edge (k, 2); row -1 if there is
-    none.
-    """
+    """Lost node (k, 2), column and row, in the cell on the open side of each border edge (k, 2); row -1 for none."""
     index = nodes.index
     columns, rows = index.shape
     start, end = nodes.coordinates(edges[:, 0]), nodes.coordinates(edges[:, 1])
@@ -167,9 +165,7 @@ def _beside(nodes: _Nodes, edges: Indices) -> Indices:
 
 
 def _loop(edges: Indices) -> Indices | None:
-    """Nodes (k,) of directed border edges (k, 2) that form one closed loop, counter-clockwise round the hole; None if
-    not.
-    """
+    """Nodes (k,) of directed border edges (k, 2), counter-clockwise round the hole; None if not one closed loop."""
     onward = {int(b): int(a) for a, b in edges}  # against the triangles' sense, so that the hole lies to the left
     if len(onward) != len(edges):
         return None

@@ -56,7 +56,7 @@ def surface_uncertainty(
     position[0] = _sigma(reference_covariance(reference_gain, image_noise, reference, label))
     displacement[0], stretches[0] = 0.0, 0.0
     pixels = np.stack([camera.project(shape.xyz) for camera in cameras])
-    alike = corner_correlations(pixels, shape.faces, radius, order)
+    corner_correlation = corner_correlations(pixels, shape.faces, radius, order)
     for step in range(1, steps):
         sigma, noise = _of_step(len(cameras), motion, step)
         gain = position_gain(cameras, motion.xyz[step], sigma)
@@ -64,16 +64,14 @@ def surface_uncertainty(
         displacement[step] = _sigma(covariance(gain, noise))
         position[step] = _sigma(step_covariance((reference_gain, gain), image_noise, (half, half), reference, label))
         strains = deformation(shape.xyz, motion.xyz[step], shape.faces)
-        stretches[step] = stretch_sigma(strains, shape.xyz, shape.faces, gain, alike, noise)
+        stretches[step] = stretch_sigma(strains, shape.xyz, shape.faces, gain, corner_correlation, noise)
         lost = ~np.isfinite(motion.xyz[step]).all(axis=1)
         position[step, lost], displacement[step, lost] = np.nan, np.nan
     return SurfaceUncertainty(position, displacement, stretches)
 
 
 def _of_step(count: int, motion: Motion, step: int) -> tuple[Floats, Floats]:
-    """Standard deviations (C, n, 2) px of the pixels that the positions of a step rest on: of all causes, and of noise
-    alone.
-    """
+    """Standard deviations (C, n, 2) px of the pixels that a step's positions rest on: by all causes, by noise alone."""
     n = motion.status.shape[1]
     sigma, noise = np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan)
     for one in motion.tracks:

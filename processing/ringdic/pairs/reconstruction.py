@@ -1,4 +1,4 @@
-"""From the matches of a camera pair to points in space and triangles, a step at a time."""
+"""Reconstruction of a camera pair's surface: from its matches to points in space and triangles, one step at a time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Pixels, Points
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.outliers import LostPoint, crossing_outliers, grid_neighbours, surface_outliers
 from ringdic.geometry.triangulation import LinearSystem, reprojection_residuals
@@ -18,33 +18,39 @@ from ringdic.uncertainty.position import linear_sigma
 
 
 class PairMatches(Protocol):
-    """A pair's n points in both images of one step.
-
-    px, sigma : (2, n, 2) px, NaN where a camera has no match. c_ls : (n,). status : (n,), 0 good in both. seconds :
-    time spent by stage.
-    """
+    """Matches of a pair's n points in both images of one step, as the reconstruction needs them."""
 
     @property
-    def px(self) -> Floats: ...
+    def px(self) -> Floats:
+        """Pixels (2, n, 2) px in both images, NaN where a camera has no match."""
+
     @property
-    def sigma(self) -> NDArray[Any]: ...
+    def sigma(self) -> NDArray[Any]:
+        """Standard deviations (2, n, 2) px of the pixels."""
+
     @property
-    def c_ls(self) -> NDArray[Any]: ...
+    def c_ls(self) -> NDArray[Any]:
+        """Correlation coefficients C_LS (n,), the largest over the images used."""
+
     @property
-    def status(self) -> NDArray[np.int8]: ...
+    def status(self) -> NDArray[np.int8]:
+        """Status (n,) int, 0 where good in both images."""
+
     @property
-    def seconds(self) -> Mapping[str, float]: ...
+    def seconds(self) -> Mapping[str, float]:
+        """Time spent on the match, by stage."""
 
 
 @dataclass(frozen=True)
 class PairStep:
-    """One step of a pair's surface: N points in space, of n matches.
+    """Surface of a pair at one step: N points in space, of n matches.
 
-    vertices : (N, 3) mm, NaN where lost. correlation : (N,). sigma : (N, 3) mm. status : (n,), of the matches, with
-    those dropped that cannot be right in space. drift : px, mean vertical reprojection residual of the first camera.
+    vertices : (N, 3) mm, world frame, NaN where lost. correlation : (N,) C_LS. sigma : (N, 3) mm. status : (n,) int, of
+    the matches, with the reasons of those that cannot be right in space. drift : px, mean vertical reprojection
+    residual of the first camera.
     """
 
-    vertices: Floats
+    vertices: Points
     correlation: NDArray[np.float32]
     sigma: NDArray[np.float32]
     status: NDArray[np.int8]
@@ -53,83 +59,93 @@ class PairStep:
 
 @dataclass(frozen=True)
 class PairShape:
-    """A pair's surface at the reference, and what each of its steps is found from. n matches, N vertices, M triangles.
+    """Surface of a pair at the reference: n matches, N vertices, M triangles, and what later steps are computed from.
 
-    xy : (n, 2) px. rows : (N,) matches that are vertices. faces : (M, 3), normals outwards. at_first : the reference.
-    beside : of the matches, of :func:`neighbours`. xyz : (n, 3) mm, NaN where lost. scatter : (2, n, 2) px, of the
-    match between the cameras. sigma_max_px : least certain match that is believed.
+    xy : (n, 2) px, the grid. rows : (N,) int, the matches that are vertices. faces : (M, 3) int, normals outwards.
+    reference : the step of the reference. neighbours : (n, 4, 2) int, of the matches on the grid, from
+    ``grid_neighbours``. xyz : (n, 3) mm, world frame, NaN where lost. scatter : (2, n, 2) px, standard deviations of
+    the match between the cameras. sigma_max_px : greatest standard deviation of a match that is believed.
     """
 
     cameras: tuple[Camera, Camera]
-    xy: Floats
+    xy: Pixels
     rows: Indices
     faces: Indices
-    at_first: PairStep
-    beside: Indices
-    xyz: Floats
+    reference: PairStep
+    neighbours: Indices
+    xyz: Points
     scatter: NDArray[Any]
     sigma_max_px: float
 
     @property
     def ids(self) -> tuple[str, str]:
-        """The cameras' names, the one of the reference image first."""
+        """Ids of the cameras, the one of the reference image first."""
         return self.cameras[0].id, self.cameras[1].id
 
     @property
     def vertex(self) -> Indices:
-        """The vertex of each match, (n,), -1 where it has none."""
-        found = np.full(len(self.xy), -1)
-        found[self.rows] = np.arange(len(self.rows))
-        return found
+        """Index of the vertex of each match, (n,) int, -1 where it has none."""
+        vertex = np.full(len(self.xy), -1)
+        vertex[self.rows] = np.arange(len(self.rows))
+        return vertex
 
-    def step(self, found: PairMatches) -> PairStep:
-        """The points at a later step, by its matches."""
-        # The second camera's place rests on the match between the cameras and on that in time. The noise of its
-        # reference image is in both, the other way round, and goes out: the larger deviation holds.
-        scatter = np.fmax(self.scatter, found.sigma)
-        xyz, sigma, status, drift = _placed(self.cameras, found, scatter, self.sigma_max_px)
-        _drop(surface_outliers(self.beside, xyz - self.xyz), xyz, status)
+    def step(self, matches: PairMatches) -> PairStep:
+        """Surface at a later step, from the matches of that step."""
+        # The second camera's pixel rests on the match between the cameras and on that in time. The noise of its
+        # reference image enters both with opposite signs and cancels, so the larger deviation of the two holds.
+        scatter = np.fmax(self.scatter, matches.sigma)
+        xyz, sigma, status, drift = _triangulate_step(self.cameras, matches, scatter, self.sigma_max_px)
+        _drop(surface_outliers(self.neighbours, xyz - self.xyz), xyz, status)
         # A point without a reference cannot be tracked.
         unknown = np.isnan(self.xyz).any(axis=1) & (status == 0)
-        status[unknown] = self.at_first.status[unknown]
+        status[unknown] = self.reference.status[unknown]
         xyz[unknown] = np.nan
-        return _of_rows(self.rows, xyz, sigma, status, found, drift)
+        return _step_of_rows(self.rows, xyz, sigma, status, matches, drift)
 
 
 def pair_shape(
     cameras: tuple[Camera, Camera],
-    xy: Floats,
+    xy: Pixels,
     faces: NDArray[np.int32],
-    found: PairMatches,
+    matches: PairMatches,
     step_px: int,
     sigma_max_px: float,
 ) -> PairShape:
-    """Triangulate a pair's reference, drop what cannot be right, and keep the triangles between measured points.
+    """Triangulate a pair's reference matches, drop those that cannot be right in space, and lay triangles between them.
 
-    xy : (n, 2) px, the grid in the first camera's image, of spacing ``step_px``. faces : (m, 3) over it. found : its
-    matches. sigma_max_px : least certain match that is believed.
+    Parameters
+    ----------
+    cameras : of the pair.
+    xy : (n, 2) float64, px, the grid in the first camera's image.
+    faces : (m, 3) int, triangles over the grid.
+    matches : at the reference.
+    step_px : spacing of the grid.
+    sigma_max_px : greatest standard deviation of a match that is believed.
     """
-    beside = grid_neighbours(xy, step_px)
-    xyz, sigma, status, drift = _placed(cameras, found, found.sigma, sigma_max_px)
-    _drop(surface_outliers(beside, xyz), xyz, status)
-    whole = _whole_faces(xyz, faces, cameras)
+    neighbours = grid_neighbours(xy, step_px)
+    xyz, sigma, status, drift = _triangulate_step(cameras, matches, matches.sigma, sigma_max_px)
+    _drop(surface_outliers(neighbours, xyz), xyz, status)
+    whole = _faces_without_steps(xyz, faces, cameras)
     rows = np.unique(whole)
-    at_first = _of_rows(rows, xyz, sigma, status, found, drift)
-    return PairShape(cameras, xy, rows, np.searchsorted(rows, whole), at_first, beside, xyz, found.sigma, sigma_max_px)
+    reference = _step_of_rows(rows, xyz, sigma, status, matches, drift)
+    return PairShape(
+        cameras, xy, rows, np.searchsorted(rows, whole), reference, neighbours, xyz, matches.sigma, sigma_max_px
+    )
 
 
-def _placed(
-    cameras: tuple[Camera, Camera], found: PairMatches, scatter: NDArray[Any], sigma_max_px: float
+def _triangulate_step(
+    cameras: tuple[Camera, Camera], matches: PairMatches, scatter: NDArray[Any], sigma_max_px: float
 ) -> tuple[Floats, Floats, NDArray[np.int8], float]:
-    """Places (n, 3) mm and their standard deviations, status (n,) and drift px, by where the lines of sight cross.
+    """Triangulate the matches of a step.
 
-    scatter : (2, n, 2) px, of the places in the images.
+    scatter : (2, n, 2) px, standard deviations of the pixels. Returns positions (n, 3) mm, their standard deviations
+    (n, 3) mm, status (n,) and drift, px.
     """
     with np.errstate(invalid="ignore"):
-        uncertain = (found.sigma > sigma_max_px).any(axis=(0, 2))
-    status = np.where((found.status == 0) & uncertain, LostPoint.UNCERTAIN, found.status).astype(np.int8)
+        uncertain = (matches.sigma > sigma_max_px).any(axis=(0, 2))
+    status = np.where((matches.status == 0) & uncertain, LostPoint.UNCERTAIN, matches.status).astype(np.int8)
     good = status == 0
-    px = np.where(good[None, :, None], found.px, np.nan)
+    px = np.where(good[None, :, None], matches.px, np.nan)
     system = LinearSystem.of(cameras, px)
     xyz, sigma = system.solution, linear_sigma(cameras, system, scatter)
     residuals = reprojection_residuals(cameras, xyz, px)
@@ -139,24 +155,26 @@ def _placed(
     return xyz, sigma, status, drift
 
 
-def _drop(lost: Mask, xyz: Floats, status: NDArray[np.int8], why: LostPoint = LostPoint.SURFACE) -> None:
+def _drop(lost: Mask, xyz: Points, status: NDArray[np.int8], why: LostPoint = LostPoint.SURFACE) -> None:
+    """Mark some points (n,) as lost for a reason, in place."""
     status[lost] = why
     xyz[lost] = np.nan
 
 
-def _of_rows(
-    rows: Indices, xyz: Floats, sigma: Floats, status: NDArray[np.int8], found: PairMatches, drift: float
+def _step_of_rows(
+    rows: Indices, xyz: Points, sigma: Floats, status: NDArray[np.int8], matches: PairMatches, drift: float
 ) -> PairStep:
+    """Step of a pair's surface, whose vertices are the rows (N,) of the matches."""
     lost = status[rows] != 0
-    correlation, scatter = found.c_ls[rows].astype(np.float32), sigma[rows].astype(np.float32)
+    correlation, scatter = matches.c_ls[rows].astype(np.float32), sigma[rows].astype(np.float32)
     correlation[lost], scatter[lost] = np.nan, np.nan
     return PairStep(xyz[rows], correlation, scatter, status, drift)
 
 
-def _whole_faces(xyz: Floats, faces: NDArray[np.int32], cameras: Sequence[Camera]) -> Indices:
-    """Triangles between measured points, turned towards the cameras; none across a step in depth.
+def _faces_without_steps(xyz: Points, faces: NDArray[np.int32], cameras: Sequence[Camera]) -> Indices:
+    """Triangles (M, 3) between measured points, turned towards the cameras, without those across a step in depth.
 
-    A triangle whose longest edge is far longer than the grid's usual one joins two surfaces.
+    A triangle whose longest edge is far longer than is usual on the grid joins two surfaces.
     """
     mesh = Mesh(xyz, faces.astype(np.int64)).without_lost()
     corners = mesh.vertices[mesh.faces]

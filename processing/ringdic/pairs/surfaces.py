@@ -1,4 +1,4 @@
-"""The surfaces of the camera pairs in one set of arrays, merged into one surface or side by side, a step at a time."""
+"""Surfaces of all camera pairs in one set of arrays, merged into one surface or side by side, one step at a time."""
 
 from __future__ import annotations
 
@@ -11,21 +11,22 @@ from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices
 from ringdic.geometry.camera import Camera
-from ringdic.pairs.merging import Merged, Mismatch, Seam, SurfacePart, merge, mismatches
+from ringdic.pairs.merging import MergedSurface, Mismatch, Seam, SurfacePart, merge, mismatches
 from ringdic.pairs.reconstruction import PairMatches, PairShape, PairStep
 from ringdic.results.results import Matches, Results
 from ringdic.results.series import StepCache, median_deviations
 from ringdic.settings import Settings
 
-_MOST = 0.5  # a step at which fewer points of a pair were measured says nothing about single points
+_MOST = 0.5  # share of a pair's points that a step must have measured to tell good points from bad ones
 
 
 @dataclass(frozen=True)
 class PairSurface:
-    """A pair's surface through F steps, which are read again when they are asked for.
+    """Surface of a pair through F steps, each read from a cache when it is needed.
 
-    correlation : (N,) of each point the worst over the steps, NaN if it was lost at one. drift : (F,) px, of
-    `PairStep`. noise : (F, 2) px, of `Series`.
+    shape : at the reference. at : gives the surface and the matches of a step. correlation : (N,) C_LS, of each
+    point the largest over the steps, NaN if it was lost at one. drift : (F,) px, of `PairStep`. noise : (F, 2) px,
+    median standard deviation of each camera's matches.
     """
 
     shape: PairShape
@@ -35,41 +36,45 @@ class PairSurface:
     noise: Floats
 
     @property
-    def sheet(self) -> SurfacePart:
-        """The reference shape, with the worst correlation over the steps."""
-        return self._sheet(self.correlation)
+    def part(self) -> SurfacePart:
+        """Reference shape, with the largest correlation coefficients over the steps."""
+        return self._part(self.correlation)
 
     @property
-    def sheet_at_reference(self) -> SurfacePart:
-        """The same as if there were no other step."""
-        return self._sheet(self.shape.at_first.correlation)
+    def part_at_reference(self) -> SurfacePart:
+        """Reference shape, with the correlation coefficients of the reference alone."""
+        return self._part(self.shape.reference.correlation)
 
-    def _sheet(self, correlation: NDArray[Any]) -> SurfacePart:
-        return SurfacePart(self.shape.at_first.vertices, self.shape.faces, correlation.astype(float))
+    def _part(self, correlation: NDArray[Any]) -> SurfacePart:
+        """Reference shape with correlation coefficients (N,)."""
+        return SurfacePart(self.shape.reference.vertices, self.shape.faces, correlation.astype(float))
 
 
-Merging = Callable[[Sequence[PairSurface], str], Merged]
+Merging = Callable[[Sequence[PairSurface], str], MergedSurface]
 
 
 def reconstruct_pair(
-    shape: PairShape, matched: Callable[[int], PairMatches], steps: int, shelf: StepCache
+    shape: PairShape, matches_at: Callable[[int], PairMatches], steps: int, cache: StepCache
 ) -> PairSurface:
-    """A pair's surface through its steps. matched : of each. shelf : where the points in space are laid aside."""
-    worst = shape.at_first.correlation.astype(float)
+    """Reconstruct a pair's surface at all steps.
+
+    matches_at : gives the matches of a step. steps : their number. cache : for the points in space of every step.
+    """
+    worst = shape.reference.correlation.astype(float)
     drift, noise = np.full(steps, np.nan), np.full((steps, 2), np.nan)
     for k in range(steps):
-        found = matched(k)
-        step = shape.step(found) if k else shape.at_first
-        shelf.put((shape.ids, k), (step, found))
-        drift[k], noise[k] = step.drift, median_deviations(found.sigma, step.status)
+        matches = matches_at(k)
+        step = shape.step(matches) if k else shape.reference
+        cache.put((shape.ids, k), (step, matches))
+        drift[k], noise[k] = step.drift, median_deviations(matches.sigma, step.status)
         if np.mean(step.status[shape.rows] == 0) >= _MOST:
             worst = np.maximum(worst, step.correlation)
-    return PairSurface(shape, lambda k: shelf.get((shape.ids, k)), worst, drift, noise)
+    return PairSurface(shape, lambda k: cache.get((shape.ids, k)), worst, drift, noise)
 
 
-def merge_surfaces(pairs: Sequence[PairSurface], heuristic: str) -> Merged:
-    """One surface of the pairs' surfaces."""
-    return merge([pair.sheet for pair in pairs], heuristic)
+def merge_surfaces(pairs: Sequence[PairSurface], heuristic: str) -> MergedSurface:
+    """Merge the pairs' surfaces into one, by a heuristic of ``merging``."""
+    return merge([pair.part for pair in pairs], heuristic)
 
 
 def pairs_surface(
@@ -80,88 +85,102 @@ def pairs_surface(
     settings: Settings,
     merging: Merging = merge_surfaces,
 ) -> tuple[PairsSeries, dict[str, Any]]:
-    """The results of all pairs, and how well the pairs agree and how they were merged, as JSON values.
+    """Combine the pairs' surfaces into a series of results, with figures of how well they agree, as JSON values.
 
-    With surface.merge "none" the surfaces stay side by side, one over the other where several pairs saw the body.
-    rig : its name. cameras : all that were calibrated. names : of the steps, the reference first. merging : what merges
-    them otherwise, by that name.
+    With the setting surface.merge "none" the surfaces stay side by side, one over the other where several pairs saw the
+    body.
+
+    Parameters
+    ----------
+    rig : its name.
+    cameras : all that were calibrated.
+    pairs : their surfaces.
+    names : of the steps, the reference first.
+    settings : of the run.
+    merging : merges the surfaces otherwise, by the heuristic that the setting names.
     """
     names = tuple(names)
     beside = _side_by_side(rig, cameras, pairs, names[0], settings)
     heuristic = settings.surface.merge
     if heuristic == "none":
-        sheets = [pair.sheet for pair in pairs]
-        found = mismatches(sheets, Seam().layers * Seam.mean_edge(sheets))
+        parts = [pair.part for pair in pairs]
+        distances = mismatches(parts, Seam().layers * Seam.mean_edge(parts))
         series = PairsSeries(names, beside, tuple(pairs), np.arange(len(beside.vertices_ref)))
-        return series, {"heuristic": heuristic, **_agreement(beside, found)}
+        return series, {"heuristic": heuristic, **_agreement(beside, distances)}
     merged = merging(pairs, heuristic)
     figures = {"heuristic": heuristic, "removed": len(merged.removed), "added": merged.added}
-    series = PairsSeries(names, _of_merged(beside, merged), tuple(pairs), merged.vertex)
+    series = PairsSeries(names, _over_merged_vertices(beside, merged), tuple(pairs), merged.vertex)
     return series, {**figures, **_agreement(beside, merged.mismatch)}
 
 
 @dataclass(frozen=True)
 class PairsSeries:
-    """The steps of the pairs' surfaces in one set of arrays: see `Series`.
+    """Series of results of the pairs' surfaces, in one set of arrays.
 
-    kept : (N,) vertices that are used, of all the pairs' numbered one pair after the other.
+    names : of the steps. reference : results of the reference alone. pairs : their surfaces. vertex : (N,) int,
+    vertices that are used, of those of all pairs numbered one pair after the other.
     """
 
     names: tuple[str, ...]
     reference: Results
     pairs: tuple[PairSurface, ...]
-    kept: Indices
+    vertex: Indices
 
     @property
     def noise(self) -> list[Floats]:
-        """See `Series`."""
+        """Median standard deviations of the matches of each pair, (F, 2) px for each."""
         return [pair.noise for pair in self.pairs]
 
     def without_matches(self) -> PairsSeries:
-        """See `Series`."""
+        """Series of the same steps without the matches in the images."""
         return replace(self, reference=replace(self.reference, matches=()))
 
     def at(self, step: int) -> Results:
-        """See `Series`."""
+        """Results of the reference and a later step; of step 0 those of the reference alone."""
         if not step:
             return self.reference
-        first, laid = self.reference, [pair.at(step) for pair in self.pairs]
-        found = [one for one, _ in laid]
+        reference, steps_and_matches = self.reference, [pair.at(step) for pair in self.pairs]
+        steps = [one for one, _ in steps_and_matches]
         vertices, correlation, sigma = (
-            np.concatenate([getattr(one, name) for one in found])[self.kept]
+            np.concatenate([getattr(one, name) for one in steps])[self.vertex]
             for name in ("vertices", "correlation", "sigma")
         )
-        status = np.concatenate([one.status[p.shape.rows] for one, p in zip(found, self.pairs, strict=True)])[self.kept]
+        status = np.concatenate([one.status[p.shape.rows] for one, p in zip(steps, self.pairs, strict=True)])[
+            self.vertex
+        ]
         return replace(
-            first,
+            reference,
             steps=(self.names[0], self.names[step]),
-            vertices=np.stack([first.vertices[0], vertices]),
-            correlation=np.stack([first.correlation[0], correlation]),
-            sigma_xyz=np.stack([first.sigma_xyz[0], sigma]),
-            status=np.stack([first.status[0], status]),
-            matches=tuple(_with_step(own, *each) for own, each in zip(first.matches, laid, strict=False)),
+            vertices=np.stack([reference.vertices[0], vertices]),
+            correlation=np.stack([reference.correlation[0], correlation]),
+            sigma_xyz=np.stack([reference.sigma_xyz[0], sigma]),
+            status=np.stack([reference.status[0], status]),
+            matches=tuple(
+                _with_step(at_reference, *each)
+                for at_reference, each in zip(reference.matches, steps_and_matches, strict=False)
+            ),
         )
 
 
-def _with_step(at_first: Matches, step: PairStep, found: PairMatches) -> Matches:
-    """A pair's matches at the reference and at a step."""
+def _with_step(at_reference: Matches, step: PairStep, matches: PairMatches) -> Matches:
+    """Matches of a pair at the reference and at a step."""
     return replace(
-        at_first,
-        px=np.stack([at_first.px[0], found.px]),
-        c_ls=np.stack([at_first.c_ls[0], found.c_ls]),
-        sigma=np.stack([at_first.sigma[0], found.sigma]),
-        status=np.stack([at_first.status[0], step.status]),
+        at_reference,
+        px=np.stack([at_reference.px[0], matches.px]),
+        c_ls=np.stack([at_reference.c_ls[0], matches.c_ls]),
+        sigma=np.stack([at_reference.sigma[0], matches.sigma]),
+        status=np.stack([at_reference.status[0], step.status]),
     )
 
 
 def _side_by_side(
     rig: str, cameras: Sequence[Camera], pairs: Sequence[PairSurface], reference: str, settings: Settings
 ) -> Results:
-    """The results of the reference alone."""
+    """Results of the reference alone, of all pairs' surfaces side by side."""
     shapes = [pair.shape for pair in pairs]
     counts = [len(shape.rows) for shape in shapes]
     offsets = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int)
-    vertices = np.concatenate([shape.at_first.vertices for shape in shapes])
+    vertices = np.concatenate([shape.reference.vertices for shape in shapes])
     return Results(
         rig=rig,
         steps=(reference,),
@@ -172,60 +191,64 @@ def _side_by_side(
         faces=np.concatenate([shape.faces + offset for shape, offset in zip(shapes, offsets, strict=True)]),
         pair=np.repeat(np.arange(len(shapes)), [len(shape.faces) for shape in shapes]),
         vertex_pair=np.repeat(np.arange(len(shapes)), counts),
-        correlation=np.concatenate([shape.at_first.correlation for shape in shapes])[None].astype(float),
-        sigma_xyz=np.concatenate([shape.at_first.sigma for shape in shapes])[None].astype(float),
-        status=np.concatenate([shape.at_first.status[shape.rows] for shape in shapes])[None],
+        correlation=np.concatenate([shape.reference.correlation for shape in shapes])[None].astype(float),
+        sigma_xyz=np.concatenate([shape.reference.sigma for shape in shapes])[None].astype(float),
+        status=np.concatenate([shape.reference.status[shape.rows] for shape in shapes])[None],
         matches=tuple(_at_reference(pair, int(offset)) for pair, offset in zip(pairs, offsets, strict=True)),
         settings=settings.to_toml(),
     )
 
 
 def _at_reference(pair: PairSurface, offset: int) -> Matches:
-    shape, found = pair.shape, pair.at(0)[1]
+    """Matches of a pair at the reference, whose vertices are numbered from an offset on."""
+    shape, matches = pair.shape, pair.at(0)[1]
     vertex = shape.vertex
     return Matches(
         cameras=shape.ids,
         xy=shape.xy,
-        px=found.px[None],
-        c_ls=found.c_ls[None].astype(float),
-        sigma=found.sigma[None].astype(float),
-        status=shape.at_first.status[None],
+        px=matches.px[None],
+        c_ls=matches.c_ls[None].astype(float),
+        sigma=matches.sigma[None].astype(float),
+        status=shape.reference.status[None],
         vertex=np.where(vertex >= 0, vertex + offset, -1),
-        seconds=dict(found.seconds),
+        seconds=dict(matches.seconds),
     )
 
 
-def _of_merged(results: Results, merged: Merged) -> Results:
-    """The merged surface with its own vertices only; a match whose point was taken out has no vertex."""
-    kept = merged.vertex
+def _over_merged_vertices(results: Results, merged: MergedSurface) -> Results:
+    """Results over the vertices of the merged surface alone; a match whose point was taken out has no vertex."""
+    used = merged.vertex
     number = np.full(len(results.vertices_ref) + 1, -1, dtype=np.int64)  # the last one for what has no vertex
-    number[kept] = np.arange(len(kept))
+    number[used] = np.arange(len(used))
     return replace(
         results,
-        vertices_ref=results.vertices_ref[kept],
-        vertices=results.vertices[:, kept],
+        vertices_ref=results.vertices_ref[used],
+        vertices=results.vertices[:, used],
         faces=number[merged.faces],
         pair=merged.pair,
-        vertex_pair=results.vertex_pair[kept],
-        correlation=results.correlation[:, kept],
-        sigma_xyz=results.sigma_xyz[:, kept],
-        status=results.status[:, kept],
+        vertex_pair=results.vertex_pair[used],
+        correlation=results.correlation[:, used],
+        sigma_xyz=results.sigma_xyz[:, used],
+        status=results.status[:, used],
         matches=tuple(replace(matches, vertex=number[matches.vertex]) for matches in results.matches),
     )
 
 
-def _agreement(results: Results, found: Sequence[Mismatch]) -> dict[str, Any]:
-    """Distances between the surfaces of pairs, and their mean and standard deviation over pairs that share a camera."""
+def _agreement(results: Results, distances: Sequence[Mismatch]) -> dict[str, Any]:
+    """Figures of the distances between the pairs' surfaces, as JSON values.
+
+    They are given for every two pairs, and as mean and standard deviation over those that share a camera.
+    """
     rows = []
-    for one in found:
+    for one in distances:
         figures = {"mean_mm": one.mean, "std_mm": one.std, "bias_mm": one.bias, "rms_mm": one.rms}
         pairs = ["-".join(results.pairs[k]) for k in (one.first, one.second)]
         rows.append({"pairs": pairs, "points": one.points, **figures, "largest_mm": one.largest})
-    beside = [one for one in found if set(results.pairs[one.first]) & set(results.pairs[one.second])]
-    if not beside:
+    sharing = [one for one in distances if set(results.pairs[one.first]) & set(results.pairs[one.second])]
+    if not sharing:
         return {"mismatch_mm": None, "mismatch_std_mm": None, "mismatches": rows}
-    weights: Floats = np.array([one.points for one in beside], dtype=float)
+    weights: Floats = np.array([one.points for one in sharing], dtype=float)
     weights /= weights.sum()
-    mean = float(weights @ [one.mean for one in beside])
-    square = float(weights @ [one.mean**2 + one.std**2 for one in beside])
+    mean = float(weights @ [one.mean for one in sharing])
+    square = float(weights @ [one.mean**2 + one.std**2 for one in sharing])
     return {"mismatch_mm": mean, "mismatch_std_mm": float(np.sqrt(square - mean**2)), "mismatches": rows}

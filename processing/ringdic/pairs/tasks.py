@@ -1,7 +1,7 @@
-"""The matching of all camera pairs as tasks: one for each pair's reference images, one for each camera and later step.
+"""Tasks of the matching of all camera pairs: one for each pair's reference images, one for each camera and later step.
 
-The steps of a camera are independent of one another: each is matched from the reference. So one more capture, or the
-newest step alone, makes no other step anew.
+The steps of a camera are independent of one another, as each is matched from the reference. So one more capture, or
+the newest step alone, leaves the outputs of all other steps valid.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ from pathlib import Path
 
 import numpy as np
 
-from ringdic.arrays import Floats
+from ringdic.arrays import Pixels
 from ringdic.correlation import CorrelationSettings, Reference, prepare_reference, reference_bytes
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
-from ringdic.pairs.matching import Grid, StepMatches, Stereo, at_step, match_reference
+from ringdic.pairs.matching import PairGrid, StepMatches, Stereo, match_reference, step_matches
 from ringdic.pairs.tracking import (
     CameraGrid,
     CameraMatches,
     CameraPixels,
-    Own,
-    Shared,
+    FirstCameraView,
+    SecondCameraView,
     camera_grid,
+    interpolate_matches,
     match_camera,
-    places,
 )
 from ringdic.session.folder import Capture, Session
 from ringdic.session.images import read_mask
@@ -33,49 +33,55 @@ from ringdic.sweep.sweep import DepthSearch
 from ringdic.tasks import Arrays, Task, code_stamp, digest, process_memory, read_output, work_folder
 from ringdic.tasks.step_images import Digests, step_image
 
-_REFERENCE_COST = 2.0  # of a pair, in steps of a camera
+_REFERENCE_COST = 2.0  # of a pair's reference, in units of one camera's step
 _SECONDS = "seconds_"  # before the names of stages in an output
-_FOLLOWED = ("xy", "uv", "gradient", "sigma", "c_ls", "status")
+_MATCHES = ("xy", "uv", "gradient", "sigma", "c_ls", "status")
 
 
 @dataclass(frozen=True)
 class CameraJob:
-    """The tasks of one camera: one for each later step, None where it has no image."""
+    """Tasks of one camera: one for each later step, None where it has no image."""
 
     steps: tuple[Task | None, ...]
 
-    def places(self, step: int, xy: Floats) -> CameraPixels | None:
-        """Where places xy (n, 2) px of the reference image lie at a step from 1 on; None without an image."""
+    def pixels(self, step: int, xy: Pixels) -> CameraPixels | None:
+        """Pixels of some points of the reference image at a step from 1 on; None where the camera has no image.
+
+        xy : (n, 2) float64, px, in the reference image.
+        """
         task = self.steps[step - 1]
         if task is None:
             return None
-        # Cached, since two pairs use it.
-        found = process_memory.get(("followed", str(task.output)), lambda: _followed(task.output), _bytes)
-        return places(found, xy)
+        # In memory for both pairs of the camera.
+        key = ("camera matches", str(task.output))
+        matches = process_memory.get(key, lambda: _camera_matches(task.output), _bytes)
+        return interpolate_matches(matches, xy)
 
 
 @dataclass(frozen=True)
 class PairJob:
-    """The task of one pair's reference images, and those of its cameras."""
+    """Task of one pair's reference images, and the tasks of its two cameras."""
 
     cameras: tuple[Camera, Camera]
     reference: Task
-    followed: tuple[CameraJob, CameraJob]
+    camera_jobs: tuple[CameraJob, CameraJob]
 
     @property
     def name(self) -> str:
-        """The pair's name."""
+        """Name of the pair."""
         return f"{self.cameras[0].id}-{self.cameras[1].id}"
 
-    def at_reference(self) -> tuple[Grid, StepMatches]:
-        """The pair's points and their matches at the reference. Raises the ComputationError that this ended with."""
+    def at_reference(self) -> tuple[PairGrid, StepMatches]:
+        """Grid of the pair and its matches at the reference. Raises the ComputationError with which the task ended."""
         arrays = read_output(self.reference.output)
         return _grid(arrays), _step_matches(arrays)
 
     def step(self, k: int, at_reference: StepMatches) -> StepMatches:
-        """The matches at a later step k."""
-        first, second = self.followed
-        return at_step(at_reference, (first.places(k, at_reference.px[0]), second.places(k, at_reference.second)))
+        """Matches of the pair at a later step k."""
+        first, second = self.camera_jobs
+        return step_matches(
+            at_reference, (first.pixels(k, at_reference.px[0]), second.pixels(k, at_reference.second_px))
+        )
 
 
 def pair_jobs(
@@ -86,7 +92,11 @@ def pair_jobs(
     search: DepthSearch,
     correlation: CorrelationSettings,
 ) -> list[PairJob]:
-    """The tasks of all pairs over these steps, the reference first."""
+    """Lay out the tasks of all pairs over a session's steps.
+
+    cameras : by id. pairs : ids of the cameras. steps : captures, the reference first. search : where the surface
+    may lie.
+    """
     digests, folder = Digests(session), work_folder(session.path)
     references: dict[tuple[str, str], Task] = {}
     for first, second in pairs:
@@ -95,24 +105,24 @@ def pair_jobs(
         key = digest(
             code_stamp(), "pair reference", stereo.cameras, search, correlation, images, digests.mask(first)
         )  # fmt: skip
-        given = (stereo, tuple(steps[0].images[id_] for id_ in stereo.ids), mask)
+        arguments = (stereo, tuple(steps[0].images[id_] for id_ in stereo.ids), mask)
         name = f"pair {first}-{second}"
-        references[first, second] = Task(key, name, reference_task, given, folder, cost=_REFERENCE_COST)
+        references[first, second] = Task(key, name, reference_task, arguments, folder, cost=_REFERENCE_COST)
 
-    def followed(id_: str) -> CameraJob:
-        own = [pair for pair in references if id_ in pair]
-        is_first, needs = tuple(pair[0] == id_ for pair in own), tuple(references[pair].key for pair in own)
+    def camera_job(id_: str) -> CameraJob:
+        own_pairs = [pair for pair in references if id_ in pair]
+        is_first, needs = tuple(pair[0] == id_ for pair in own_pairs), tuple(references[pair].key for pair in own_pairs)
 
         def task(step: Capture) -> Task | None:
             if id_ not in step.images:
                 return None
             key = digest("camera step", is_first, needs, [digests.image(each, id_) for each in (steps[0], step)])
-            given = (cameras[id_], correlation, is_first, steps[0].images[id_], step.images[id_])
-            return Task(key, f"camera {id_}, {step.id}", camera_task, given, folder, needs)
+            arguments = (cameras[id_], correlation, is_first, steps[0].images[id_], step.images[id_])
+            return Task(key, f"camera {id_}, {step.id}", camera_task, arguments, folder, needs)
 
         return CameraJob(tuple(task(step) for step in steps[1:]))
 
-    jobs = {id_: followed(id_) for id_ in dict.fromkeys(id_ for pair in pairs for id_ in pair)}
+    jobs = {id_: camera_job(id_) for id_ in dict.fromkeys(id_ for pair in pairs for id_ in pair)}
     return [
         PairJob((cameras[first], cameras[second]), reference, (jobs[first], jobs[second]))
         for (first, second), reference in references.items()
@@ -120,21 +130,25 @@ def pair_jobs(
 
 
 def ordered_tasks(jobs: Sequence[PairJob]) -> list[Task]:
-    """All tasks, camera by camera: what the steps of one need is read while it is still in memory."""
-    followed = {id(each): each for job in jobs for each in job.followed}
-    later = [task for each in followed.values() for task in each.steps if task is not None]
+    """All tasks, camera by camera, so that what the steps of a camera share is read while it is still in memory."""
+    camera_jobs = {id(each): each for job in jobs for each in job.camera_jobs}
+    later = [task for each in camera_jobs.values() for task in each.steps if task is not None]
     return [*(job.reference for job in jobs), *later]
 
 
 def reference_task(stereo: Stereo, images: tuple[Path, Path], mask: Path | None, *, inputs: tuple[Path, ...]) -> Arrays:
-    """A pair's region, points and matches at the reference. mask : drawn for the first camera."""
+    """Determine a pair's region and grid and match them at the reference.
+
+    images : files of the two cameras. mask : file of the region drawn for the first camera. Returns the arrays of
+    grid and matches, and "points", the number of points.
+    """
     first, second = stereo.cameras
-    drawn = None if mask is None else read_mask(mask, (first.size[1], first.size[0]))
-    grid, found = match_reference(stereo, step_image(images[0], first), step_image(images[1], second), drawn)
-    seconds = {f"{_SECONDS}{name}": np.array(value) for name, value in found.seconds.items()}
+    mask_image = None if mask is None else read_mask(mask, (first.size[1], first.size[0]))
+    grid, matches = match_reference(stereo, step_image(images[0], first), step_image(images[1], second), mask_image)
+    seconds = {f"{_SECONDS}{name}": np.array(value) for name, value in matches.seconds.items()}
     return {
         "region": np.packbits(grid.region), "shape": np.array(grid.region.shape), "xy": grid.xy, "faces": grid.faces,
-        "px": found.px, "sigma": found.sigma, "c_ls": found.c_ls, "status": found.status,
+        "px": matches.px, "sigma": matches.sigma, "c_ls": matches.c_ls, "status": matches.status,
         "points": np.array(len(grid.xy)), **seconds,
     }  # fmt: skip
 
@@ -148,37 +162,41 @@ def camera_task(
     *,
     inputs: tuple[Path, ...],
 ) -> Arrays:
-    """A camera's points in its image of one step. is_first : whether it is the first camera of each pair in inputs."""
-    grid, prepared = _prepared(camera, settings, is_first, reference, inputs)
-    found = match_camera(prepared, step_image(image, camera), grid, settings)
-    arrays = {name: getattr(found, name) for name in _FOLLOWED}
-    return {**arrays, "step": np.array(found.step), "points": np.array(len(grid.xy))}
+    """Match a camera's grid in its image of one step.
+
+    is_first : whether it is the first camera of each pair whose output is in ``inputs``. reference, image : files.
+    Returns the arrays of the matches, and "points", the number of points.
+    """
+    grid, prepared = _grid_and_reference(camera, settings, is_first, reference, inputs)
+    matches = match_camera(prepared, step_image(image, camera), grid, settings)
+    arrays = {name: getattr(matches, name) for name in _MATCHES}
+    return {**arrays, "step": np.array(matches.step), "points": np.array(len(grid.xy))}
 
 
-def _prepared(
+def _grid_and_reference(
     camera: Camera, settings: CorrelationSettings, is_first: tuple[bool, ...], image: Path, pairs: tuple[Path, ...]
 ) -> tuple[CameraGrid, Reference]:
-    """A camera's points and its prepared reference image, kept in memory for all its steps."""
+    """Grid of a camera and its prepared reference image, kept in memory for all its steps."""
 
     def make() -> tuple[CameraGrid, Reference]:
-        own: list[Own] = []
-        shared: list[Shared] = []
+        first_views: list[FirstCameraView] = []
+        second_views: list[SecondCameraView] = []
         for path, first in zip(pairs, is_first, strict=True):
             try:
                 arrays = read_output(path)
-            except ComputationError:  # told where the pair is left out
+            except ComputationError:  # reported where the pair is left out
                 continue
-            grid, found = _grid(arrays), _step_matches(arrays)
+            grid, matches = _grid(arrays), _step_matches(arrays)
             if first:
-                own.append((grid.region, grid.xy[found.good]))
+                first_views.append((grid.region, grid.xy[matches.good]))
             else:
-                shared.append((found.second, grid.faces))
-        followed = camera_grid(camera.size, settings.step, own, shared)
-        if not len(followed.xy):
+                second_views.append((matches.second_px, grid.faces))
+        grid_of_camera = camera_grid(camera.size, settings.step, first_views, second_views)
+        if not len(grid_of_camera.xy):
             raise ComputationError(f"camera {camera.id}: none of its pairs gave a surface")
-        reference = prepare_reference(step_image(image, camera), followed.region, settings)
-        assert reference.gradient  # computed when first asked for
-        return followed, reference
+        reference = prepare_reference(step_image(image, camera), grid_of_camera.region, settings)
+        assert reference.gradient  # computed here once, when first used
+        return grid_of_camera, reference
 
     def size(value: tuple[CameraGrid, Reference]) -> int:
         grid, reference = value
@@ -187,22 +205,26 @@ def _prepared(
     return process_memory.get(("reference", camera.id, *map(str, pairs)), make, size)
 
 
-def _followed(output: Path) -> CameraMatches:
+def _camera_matches(output: Path) -> CameraMatches:
+    """Matches of a camera from a task's output file."""
     arrays = read_output(output)
-    return CameraMatches(step=int(arrays["step"]), **{name: arrays[name] for name in _FOLLOWED})
+    return CameraMatches(step=int(arrays["step"]), **{name: arrays[name] for name in _MATCHES})
 
 
-def _bytes(found: CameraMatches) -> int:
-    return sum(int(getattr(found, name).nbytes) for name in _FOLLOWED)
+def _bytes(matches: CameraMatches) -> int:
+    """Size of matches in memory."""
+    return sum(int(getattr(matches, name).nbytes) for name in _MATCHES)
 
 
-def _grid(arrays: Arrays) -> Grid:
+def _grid(arrays: Arrays) -> PairGrid:
+    """Grid of a pair from the arrays of a task's output."""
     height, width = (int(side) for side in arrays["shape"])
     region = np.unpackbits(arrays["region"], count=height * width).reshape(height, width).astype(bool)
-    return Grid(region, arrays["xy"], arrays["faces"])
+    return PairGrid(region, arrays["xy"], arrays["faces"])
 
 
 def _step_matches(arrays: Arrays) -> StepMatches:
-    told = [name for name in arrays if name.startswith(_SECONDS)]
-    seconds = {name.removeprefix(_SECONDS): float(arrays[name]) for name in told}
+    """Matches of a pair at the reference from the arrays of a task's output."""
+    names = [name for name in arrays if name.startswith(_SECONDS)]
+    seconds = {name.removeprefix(_SECONDS): float(arrays[name]) for name in names}
     return StepMatches(arrays["px"], arrays["sigma"], arrays["c_ls"], arrays["status"], seconds)

@@ -1,8 +1,9 @@
-"""One camera followed in time: its own grid over what its pairs see, matched from its reference image in a later one.
+"""Tracking of one camera in time: a grid of its own over what its pairs see, matched from its reference image.
 
-A pair's first camera has its points on that grid; those of the second lie between, where the pair's reference images
-were matched, and are read from it. So every image is matched once, between images that differ by the motion alone, and
-what the match between the cameras left over is the same at every step.
+The points of a pair's first camera lie on that grid. Those of its second camera, at the pixels where the pair's
+reference images were matched, lie between the grid's points, and their displacement is interpolated. So every image is
+matched once, with an image that differs from it by the motion alone, and what remains of the error between the cameras
+is the same at every step.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Image, Mask
+from ringdic.arrays import Floats, Image, Mask, Pixels
 from ringdic.correlation import (
     Correlation,
     CorrelationSettings,
@@ -29,38 +30,41 @@ from ringdic.correlation.lattice_field import interpolate_lattice
 from ringdic.correlation.seeds import flow_start_values
 from ringdic.correlation.start_field import lattice_spacing, match_from_lattice, on_lattice
 
-_HELD = 0.6  # ZNCC under the warp that optical flow tells, from which on it is a start value
-_ENOUGH = 0.8  # share of the points that must be matched, or start values are looked for in other ways
-_SOME = 0.2  # share of the lattice that must hold for the rest of it to be reached from there
-_LEAST = 0.02  # weight of the matched corners about a place below which nothing is said there
-_DIGITS = 4  # binary digits after the point of the pixels that triangles are drawn with
+_START_ZNCC = 0.6  # least ZNCC under the warp by optical flow that makes it a start value
+_ENOUGH = 0.8  # share of the points that must be matched, or start values are sought in other ways
+_SOME = 0.2  # share of the sparse lattice with start values from which the rest can be reached
+_LEAST = 0.02  # least weight of the matched corners about a point for an interpolated value
+_DIGITS = 4  # binary digits after the point of the corners of drawn triangles
 
-#: Of a pair whose first camera it is: the region (height, width) and the grid points (n, 2) px that were matched.
-Own = tuple[Mask, Floats]
-#: Of a pair whose second camera it is: places (n, 2) px of the points, NaN where not matched, and triangles (m, 3).
-Shared = tuple[Floats, NDArray[np.int32]]
+#: View of a pair's first camera: region of interest (height, width) and matched points of the grid (n, 2) px.
+FirstCameraView = tuple[Mask, Pixels]
+#: View of a pair's second camera: pixels of the points (n, 2), NaN where not matched, and triangles (m, 3) over them.
+SecondCameraView = tuple[Pixels, NDArray[np.int32]]
 
 
 @dataclass(frozen=True)
 class CameraGrid:
-    """What is followed of a camera: a region (height, width) of its reference image and points xy (n, 2) px in it,
-    multiples of ``step`` px."""
+    """Region of interest and grid of one camera in its reference image, over what all its pairs see.
+
+    region : (height, width) bool. xy : (n, 2) float64, px, points of the grid. step : px, of which they are multiples.
+    """
 
     region: Mask
-    xy: Floats
+    xy: Pixels
     step: int
 
 
 @dataclass(frozen=True)
 class CameraMatches:
-    """The n points xy (n, 2) px of a camera's grid in its image of one step, NaN where lost.
+    """Matches of the n points of a camera's grid in its image of one step, NaN where lost.
 
-    step : px, of the grid. uv : (n, 2) px. gradient : (n, 2, 2). sigma : (n, 2) px. c_ls, status : (n,).
+    xy : (n, 2) int, px, the grid. step : px, of the grid. uv : (n, 2) px, displacement. gradient : (n, 2, 2),
+    du_i/dx_j. sigma : (n, 2) px. c_ls : (n,). status : (n,) int, 0 where good.
     """
 
     xy: NDArray[np.int32]
     step: int
-    uv: Floats
+    uv: Pixels
     gradient: NDArray[np.float32]
     sigma: NDArray[np.float32]
     c_ls: NDArray[np.float32]
@@ -69,33 +73,36 @@ class CameraMatches:
 
 @dataclass(frozen=True)
 class CameraPixels:
-    """What a camera's images of one step say of places in its reference image, NaN where nothing is known.
+    """Pixels of some points of a camera's reference image in its image of one step, NaN where unknown.
 
-    px : (n, 2) there now. sigma : (n, 2) px. c_ls : (n,). status : (n,), 0 good.
+    px : (n, 2) px. sigma : (n, 2) px. c_ls : (n,). status : (n,) int, 0 where good.
     """
 
-    px: Floats
-    sigma: Floats
+    px: Pixels
+    sigma: Pixels
     c_ls: Floats
     status: NDArray[np.int8]
 
 
-def camera_grid(size: tuple[int, int], step: int, own: Sequence[Own], shared: Sequence[Shared]) -> CameraGrid:
-    """The grid over what a camera's pairs see of it.
+def camera_grid(
+    size: tuple[int, int], step: int, first: Sequence[FirstCameraView], second: Sequence[SecondCameraView]
+) -> CameraGrid:
+    """Lay the grid of a camera over what its pairs see.
 
-    size : (width, height). own : of each pair whose first camera it is, shared : of each whose second it is.
+    size : (width, height) of its images, px. step : px, of the grid. first : views of the pairs of which it is the
+    first camera. second : views of the pairs of which it is the second camera.
     """
     width, height = size
     region = np.zeros((height, width), np.uint8)
     wanted = np.zeros((width // step + 2, height // step + 2), bool)
-    for mask, xy in own:
+    for mask, xy in first:
         region |= mask.view(np.uint8)
         column, row = np.rint(xy / step).astype(np.int64).T
         wanted[column, row] = True
-    for px, faces in shared:
+    for px, faces in second:
         corners = px[faces]
-        drawn = corners[np.isfinite(corners).all(axis=(1, 2))]
-        cv2.fillPoly(region, list(np.rint(drawn * 2**_DIGITS).astype(np.int32)), 1, shift=_DIGITS)
+        triangles = corners[np.isfinite(corners).all(axis=(1, 2))]
+        cv2.fillPoly(region, list(np.rint(triangles * 2**_DIGITS).astype(np.int32)), 1, shift=_DIGITS)
         column, row = np.floor(px[np.isfinite(px).all(axis=1)] / step).astype(np.int64).T
         for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
             wanted[column + i, row + j] = True
@@ -105,56 +112,68 @@ def camera_grid(size: tuple[int, int], step: int, own: Sequence[Own], shared: Se
 
 
 def match_camera(reference: Reference, image: Image, grid: CameraGrid, settings: CorrelationSettings) -> CameraMatches:
-    """The camera's points in its image of a step. reference : its reference image with the grid's region."""
-    found = match_in_time(reference, prepare_current(image, settings=settings), grid.xy, settings)
+    """Match the points of a camera's grid in its image of a step.
+
+    reference : its reference image, prepared with the grid's region. image : (height, width) grey levels. grid : (n,
+    2) px.
+    """
+    matches = match_in_time(reference, prepare_current(image, settings=settings), grid.xy, settings)
     return CameraMatches(
         grid.xy.astype(np.int32),
         grid.step,
-        found.uv,
-        found.gradient.astype(np.float32),
-        found.sigma.astype(np.float32),
-        found.c_ls.astype(np.float32),
-        found.status.astype(np.int8),
+        matches.uv,
+        matches.gradient.astype(np.float32),
+        matches.sigma.astype(np.float32),
+        matches.c_ls.astype(np.float32),
+        matches.status.astype(np.int8),
     )
 
 
-def places(found: CameraMatches, xy: Floats) -> CameraPixels:
-    """Where places xy (n, 2) px of the camera's reference image lie in its image of a step."""
-    values = np.column_stack([found.uv, found.gradient.reshape(-1, 4), found.sigma, found.c_ls]).astype(np.float64)
-    told, weight = interpolate_lattice(found.xy, values, found.step, xy)
-    lost = ~(weight >= _LEAST)
-    told[lost] = np.nan
-    status = np.zeros(len(xy), np.int8)
-    status[lost] = _beside(found, xy[lost])
-    return CameraPixels(xy + told[:, :2], told[:, 6:8], told[:, 8], status)
+def interpolate_matches(matches: CameraMatches, xy: Pixels) -> CameraPixels:
+    """Interpolate a camera's matches at points of its reference image, for their pixels in the image of the step.
 
-
-def match_in_time(reference: Reference, current: Current, xy: Floats, settings: CorrelationSettings) -> Correlation:
-    """Points xy (n, 2) px of a camera's reference image in a later one, from where optical flow puts some of them.
-
-    Where that leads to few matches the correlation looks for start values in its own ways.
+    xy : (n, 2) float64, px, in the reference image.
     """
-    chosen = np.flatnonzero(on_lattice(xy, lattice_spacing(settings)))
-    flow = flow_start_values(reference, current, xy[chosen], settings.radius)[:, [0, 6, 1, 2, 7, 8]]
+    values = np.column_stack([matches.uv, matches.gradient.reshape(-1, 4), matches.sigma, matches.c_ls]).astype(
+        np.float64
+    )
+    interpolated, weight = interpolate_lattice(matches.xy, values, matches.step, xy)
+    lost = ~(weight >= _LEAST)
+    interpolated[lost] = np.nan
+    status = np.zeros(len(xy), np.int8)
+    status[lost] = _status_nearby(matches, xy[lost])
+    return CameraPixels(xy + interpolated[:, :2], interpolated[:, 6:8], interpolated[:, 8], status)
+
+
+def match_in_time(reference: Reference, current: Current, xy: Pixels, settings: CorrelationSettings) -> Correlation:
+    """Match points of a camera's reference image in a later image, with start values from optical flow.
+
+    Where these lead to few matches, the correlation seeks start values in its own ways. xy : (n, 2) float64, px.
+    """
+    sparse = np.flatnonzero(on_lattice(xy, lattice_spacing(settings)))
+    flow = flow_start_values(reference, current, xy[sparse], settings.radius)[:, [0, 6, 1, 2, 7, 8]]
     known = np.flatnonzero(np.isfinite(flow).all(axis=1))
-    warps, zncc, _ = search_warps(reference, current, xy[chosen[known]], flow[known][:, None], settings.radius)
-    held = zncc > _HELD
-    if held.sum() < _SOME * max(len(chosen), 1):
+    warps, zncc, _ = search_warps(reference, current, xy[sparse[known]], flow[known][:, None], settings.radius)
+    holds = zncc > _START_ZNCC
+    if holds.sum() < _SOME * max(len(sparse), 1):
         return correlate_points(reference, current, xy, settings)
     start = np.full((len(xy), 6), np.nan)
-    start[chosen[known[held]]] = warps[held]
-    found = match_from_lattice(reference, current, xy, settings, start, lattice_spacing(settings))
-    if found.good.mean() >= _ENOUGH:
-        return found
+    start[sparse[known[holds]]] = warps[holds]
+    matches = match_from_lattice(reference, current, xy, settings, start, lattice_spacing(settings))
+    if matches.good.mean() >= _ENOUGH:
+        return matches
     searched = correlate_points(reference, current, xy, settings)
-    return searched if searched.good.sum() > found.good.sum() else found
+    return searched if searched.good.sum() > matches.good.sum() else matches
 
 
-def _beside(found: CameraMatches, xy: Floats) -> NDArray[np.int8]:
-    """Why nothing is known at places xy (k, 2) px: what befell the grid's point nearest to each."""
-    cells = found.xy // found.step
-    told = np.full((found.xy.max(axis=0, initial=0) // found.step + 2), Status.NOT_REACHED, np.int8)
-    told[tuple(cells.T)] = np.where(found.status == Status.GOOD, Status.NOT_REACHED, found.status)
-    nearest = np.rint(np.nan_to_num(xy, nan=-1.0) / found.step).astype(np.int64)
-    within: Mask = ((nearest >= 0) & (nearest < told.shape)).all(axis=1)
-    return np.where(within, told[tuple(np.where(within[:, None], nearest, 0).T)], np.int8(Status.NOT_REACHED))
+def _status_nearby(matches: CameraMatches, xy: Pixels) -> NDArray[np.int8]:
+    """Reasons (k,) why points have no pixel in the image: the status of the grid's point nearest to each.
+
+    xy : (k, 2) px, in the reference image.
+    """
+    cells = matches.xy // matches.step
+    status = np.full((matches.xy.max(axis=0, initial=0) // matches.step + 2), Status.NOT_REACHED, np.int8)
+    status[tuple(cells.T)] = np.where(matches.status == Status.GOOD, Status.NOT_REACHED, matches.status)
+    nearest = np.rint(np.nan_to_num(xy, nan=-1.0) / matches.step).astype(np.int64)
+    within: Mask = ((nearest >= 0) & (nearest < status.shape)).all(axis=1)
+    return np.where(within, status[tuple(np.where(within[:, None], nearest, 0).T)], np.int8(Status.NOT_REACHED))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask, Points
-from ringdic.calibration.parameters import PER_CAMERA, Parameters, projection_jacobians
+from ringdic.calibration.parameters import PER_CAMERA, CameraParameters, projection_jacobians
 from ringdic.geometry.camera import Camera
 from ringdic.strain.deformation import Deformation
 from ringdic.uncertainty.strain import stretch_slopes
@@ -92,7 +92,7 @@ def position_sensitivity(
         follows = np.zeros((len(moved), 3, 3))
         for k, camera in enumerate(cameras):
             index = np.flatnonzero(visible[k, part])
-            parameters = Parameters.of(camera)
+            parameters = CameraParameters.of(camera)
             by_camera = -projection_jacobians(parameters, xyz[part][index])[1]
             if tracked_from is not None:
                 _, at_first, by_place = projection_jacobians(parameters, tracked_from[0][part][index])

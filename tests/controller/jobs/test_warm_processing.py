@@ -21,8 +21,8 @@ orders, stop = queue.SimpleQueue(), set()
 def say(**what): print(json.dumps(what), flush=True)
 def read():
     for line in sys.stdin:
-        told = json.loads(line)
-        stop.add(told["stop"]) if "stop" in told else orders.put(told)
+        message = json.loads(line)
+        stop.add(message["stop"]) if "stop" in message else orders.put(message)
     orders.put(None)
 threading.Thread(target=read, daemon=True).start()
 say(worker="warming"); say(worker="warming", compiling=True); say(worker="ready", seconds=1.5)
@@ -68,9 +68,9 @@ class Station:
 
 @pytest.fixture
 def station(tmp_path: Path) -> Iterator[Station]:
-    made = Station(tmp_path)
-    yield made
-    made.jobs.close()
+    station = Station(tmp_path)
+    yield station
+    station.jobs.close()
 
 
 def test_it_warms_before_there_is_work_and_tells_how_long_that_took(station: Station) -> None:

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ringdic_controller.rig import capture as round_
-from ringdic_controller.rig.capture import MS, SECOND, CaptureRound, Timing, judge
+from ringdic_controller.rig.capture import MS, SECOND, CaptureRound, Timing
+from ringdic_controller.rig.judgement import judge
 from ringdic_node import agent as node_
 from ringdic_node.agent import Agent
 from ringdic_node.clock import Instant
@@ -77,7 +78,7 @@ class SimulatedNode:
         self.world, self.name, self.controller = world, name, controller
         self.spool: dict[CaptureKey, tuple[Manifest, bytes]] = {}
         self.freed: dict[CaptureKey, str] = {}
-        self.taken: dict[CaptureKey, bytes] = {}
+        self.images: dict[CaptureKey, bytes] = {}
         self.born = 0
         self.questions: dict[int, Callable] = {}
         self.numbers = itertools.count()
@@ -139,7 +140,7 @@ class SimulatedNode:
                 self.later(20 * MS, lambda: node_.CameraLocked(reply))
             case node_.TakeFrame():
                 key = action.trigger.key
-                assert key not in self.taken, "a capture is taken at most once"
+                assert key not in self.images, "a capture is taken at most once"
                 wait = key.fire_at_ns - world.now + world.random.randrange(200 * MS)
                 if world.random.random() < 0.1:
                     self.later(wait, lambda: node_.FrameLost(key, "the camera timed out"))
@@ -168,7 +169,7 @@ class SimulatedNode:
 
     def spooled(self, trigger: Trigger) -> node_.Event:
         image = f"{self.name} {trigger.key} {self.world.random.random()}".encode()
-        self.taken[trigger.key] = image
+        self.images[trigger.key] = image
         manifest = Manifest(
             node=self.name,
             key=trigger.key,
@@ -257,9 +258,9 @@ class SimulatedController:
         if self.world.random.random() < self.world.weather.damage:
             image = image[:-1]
         archived = dict.fromkeys(self.nodes)
-        known = self.archive.get((manifest.key.capture_id, manifest.node))
-        if known is not None:
-            archived[manifest.node] = hashlib.sha256(known).hexdigest()
+        image_here = self.archive.get((manifest.key.capture_id, manifest.node))
+        if image_here is not None:
+            archived[manifest.node] = hashlib.sha256(image_here).hexdigest()
         verdict = judge(
             manifest,
             hashlib.sha256(image).hexdigest(),
@@ -281,7 +282,7 @@ class SimulatedController:
         """What must hold at every moment."""
         for (capture_id, name), image in self.archive.items():
             key = CaptureKey("s", capture_id, self.records[capture_id])
-            assert self.nodes[name].taken[key] == image, "only what the node took is archived"
+            assert self.nodes[name].images[key] == image, "only what the node took is archived"
         for name, node in self.nodes.items():
             for key, sha256 in node.freed.items():
                 image = self.archive[key.capture_id, name]
@@ -321,7 +322,7 @@ def test_nothing_is_lost_or_wrong_whatever_the_link_does(seed, drop, repeat, dam
     controller.check()
     for node in nodes:
         assert node.spool == {}
-        for key in node.taken:
+        for key in node.images:
             assert (key.capture_id, node.name) in controller.archive
 
 

@@ -14,8 +14,8 @@ RIG = '[rig]\nname = "ring"\n[[cameras]]\nid = "201"\n[[cameras]]\nid = "202"\n'
 IMAGE = b"P5\n2 1\n255\nab"
 
 
-class Desk:
-    """An intake with everything that it tells written down."""
+class RecordedIntake:
+    """An intake into a session with one open capture, and all that it acknowledges and reports."""
 
     def __init__(self, root, limit: int = 1 << 20) -> None:
         self.archive = Archive(root)
@@ -34,8 +34,8 @@ class Desk:
 
 
 @pytest.fixture
-def desk(tmp_path):
-    return Desk(tmp_path)
+def recorded(tmp_path):
+    return RecordedIntake(tmp_path)
 
 
 def manifest_of(image: bytes = IMAGE, camera: str = "201", fire_at_ns: int = 50) -> Manifest:
@@ -43,26 +43,26 @@ def manifest_of(image: bytes = IMAGE, camera: str = "201", fire_at_ns: int = 50)
     return Manifest(camera, key, "board", hashlib.sha256(image).hexdigest(), len(image), 2, 1, 60)
 
 
-def test_an_image_is_acknowledged_when_it_lies_in_the_archive(desk):
-    desk.intake.take(manifest_of(), IMAGE)
-    assert (desk.capture.path / "201.pgm").read_bytes() == IMAGE
-    assert desk.acks == [("201", "archived")]
-    assert desk.archived == ["201"]
-    assert desk.events[-1]["cameras"]["201"]["status"] == "ok"
+def test_an_image_is_acknowledged_when_it_lies_in_the_archive(recorded):
+    recorded.intake.take(manifest_of(), IMAGE)
+    assert (recorded.capture.path / "201.pgm").read_bytes() == IMAGE
+    assert recorded.acks == [("201", "archived")]
+    assert recorded.archived == ["201"]
+    assert recorded.events[-1]["cameras"]["201"]["status"] == "ok"
 
 
-def test_a_repeat_is_acknowledged_again_because_the_first_may_have_been_lost(desk):
-    desk.intake.take(manifest_of(), IMAGE)
-    desk.intake.take(manifest_of(), IMAGE)
-    assert desk.acks == [("201", "archived")] * 2
-    assert len(desk.events) == 1
+def test_a_repeat_is_acknowledged_again_because_the_first_may_have_been_lost(recorded):
+    recorded.intake.take(manifest_of(), IMAGE)
+    recorded.intake.take(manifest_of(), IMAGE)
+    assert recorded.acks == [("201", "archived")] * 2
+    assert len(recorded.events) == 1
 
 
-def test_a_damaged_image_is_neither_archived_nor_acknowledged(desk):
-    desk.intake.take(manifest_of(), IMAGE[:-1])
-    desk.intake.take(manifest_of(), IMAGE[:-1] + b"c")
-    assert desk.acks == []
-    assert not (desk.capture.path / "201.pgm").exists()
+def test_a_damaged_image_is_neither_archived_nor_acknowledged(recorded):
+    recorded.intake.take(manifest_of(), IMAGE[:-1])
+    recorded.intake.take(manifest_of(), IMAGE[:-1] + b"c")
+    assert recorded.acks == []
+    assert not (recorded.capture.path / "201.pgm").exists()
 
 
 @pytest.mark.parametrize(
@@ -75,95 +75,95 @@ def test_a_damaged_image_is_neither_archived_nor_acknowledged(desk):
     ],
     ids=["another moment", "another camera", "another session", "another capture"],
 )
-def test_an_image_of_no_capture_here_is_told_to_be_unknown(desk, manifest):
-    desk.intake.take(manifest, IMAGE)
-    assert [verdict for _, verdict in desk.acks] == ["unknown"]
-    assert sorted(path.name for path in desk.capture.path.iterdir()) == ["capture.json"]
-    assert not desk.intake.wants(manifest)
+def test_an_image_of_no_capture_here_is_told_to_be_unknown(recorded, manifest):
+    recorded.intake.take(manifest, IMAGE)
+    assert [verdict for _, verdict in recorded.acks] == ["unknown"]
+    assert sorted(path.name for path in recorded.capture.path.iterdir()) == ["capture.json"]
+    assert not recorded.intake.wants(manifest)
 
 
-def test_a_second_image_of_a_camera_is_kept_aside_and_safe(desk):
-    desk.intake.take(manifest_of(), IMAGE)
-    desk.intake.take(manifest_of(b"other"), b"other")
-    assert desk.acks == [("201", "archived")] * 2
-    assert (desk.capture.path / "201.pgm").read_bytes() == IMAGE
-    assert (desk.capture.path / "201.conflict-1.pgm").read_bytes() == b"other"
+def test_a_second_image_of_a_camera_is_kept_aside_and_safe(recorded):
+    recorded.intake.take(manifest_of(), IMAGE)
+    recorded.intake.take(manifest_of(b"other"), b"other")
+    assert recorded.acks == [("201", "archived")] * 2
+    assert (recorded.capture.path / "201.pgm").read_bytes() == IMAGE
+    assert (recorded.capture.path / "201.conflict-1.pgm").read_bytes() == b"other"
 
 
-def test_what_a_node_still_holds_is_wanted_only_if_the_closed_capture_lacks_it(desk):
-    assert not desk.intake.wants(manifest_of()), "the open round pulls by itself"
-    desk.capture.close()
-    assert desk.intake.wants(manifest_of())
-    desk.intake.take(manifest_of(), IMAGE)
-    desk.acks.clear()
-    assert not desk.intake.wants(manifest_of())
-    assert desk.acks == [("201", "archived")], "the acknowledgement had been lost"
-    assert desk.capture.record()["cameras"]["201"]["status"] == "late"
+def test_what_a_node_still_holds_is_wanted_only_if_the_closed_capture_lacks_it(recorded):
+    assert not recorded.intake.wants(manifest_of()), "the open round pulls by itself"
+    recorded.capture.close()
+    assert recorded.intake.wants(manifest_of())
+    recorded.intake.take(manifest_of(), IMAGE)
+    recorded.acks.clear()
+    assert not recorded.intake.wants(manifest_of())
+    assert recorded.acks == [("201", "archived")], "the acknowledgement had been lost"
+    assert recorded.capture.record()["cameras"]["201"]["status"] == "late"
 
 
 def test_a_full_inbox_drops_and_a_worked_off_one_takes_again(tmp_path):
-    desk = Desk(tmp_path, limit=len(IMAGE))
-    assert desk.intake.put(manifest_of(), IMAGE)
-    assert not desk.intake.put(manifest_of(camera="202"), IMAGE)
-    assert not desk.intake.has_room(1)
-    desk.intake.start()
-    desk.intake.stop(timeout=10)
-    assert desk.intake.has_room(len(IMAGE))
-    assert desk.acks == [("201", "archived")]
+    recorded = RecordedIntake(tmp_path, limit=len(IMAGE))
+    assert recorded.intake.put(manifest_of(), IMAGE)
+    assert not recorded.intake.put(manifest_of(camera="202"), IMAGE)
+    assert not recorded.intake.has_room(1)
+    recorded.intake.start()
+    recorded.intake.stop(timeout=10)
+    assert recorded.intake.has_room(len(IMAGE))
+    assert recorded.acks == [("201", "archived")]
 
 
 def test_an_image_that_waits_already_takes_no_second_room(tmp_path):
-    desk = Desk(tmp_path, limit=len(IMAGE))
-    assert not desk.intake.holds(manifest_of())
-    assert desk.intake.put(manifest_of(), IMAGE)
-    assert desk.intake.holds(manifest_of())
-    assert desk.intake.put(manifest_of(), IMAGE), "pulled while it was being pushed"
-    desk.intake.start()
-    desk.intake.stop(timeout=10)
-    assert desk.acks == [("201", "archived")]
-    assert not desk.intake.holds(manifest_of())
+    recorded = RecordedIntake(tmp_path, limit=len(IMAGE))
+    assert not recorded.intake.holds(manifest_of())
+    assert recorded.intake.put(manifest_of(), IMAGE)
+    assert recorded.intake.holds(manifest_of())
+    assert recorded.intake.put(manifest_of(), IMAGE), "pulled while it was being pushed"
+    recorded.intake.start()
+    recorded.intake.stop(timeout=10)
+    assert recorded.acks == [("201", "archived")]
+    assert not recorded.intake.holds(manifest_of())
 
 
 def test_images_archived_side_by_side_are_all_in_the_record(tmp_path):
     cameras = [f"cam_{k:02d}" for k in range(40)]
-    desk = Desk(tmp_path)
-    capture = desk.session.begin_capture("board", cameras, fire_at_ns=70)
+    recorded = RecordedIntake(tmp_path)
+    capture = recorded.session.begin_capture("board", cameras, fire_at_ns=70)
     for camera in cameras:
         key = CaptureKey("s", capture.capture_id, 70)
-        desk.intake.put(replace(manifest_of(camera.encode(), camera), key=key), camera.encode())
-    desk.intake.start()
-    desk.intake.stop(timeout=30)
-    assert sorted(desk.acks) == [(camera, "archived") for camera in cameras]
+        recorded.intake.put(replace(manifest_of(camera.encode(), camera), key=key), camera.encode())
+    recorded.intake.start()
+    recorded.intake.stop(timeout=30)
+    assert sorted(recorded.acks) == [(camera, "archived") for camera in cameras]
     assert {entry["status"] for entry in capture.record()["cameras"].values()} == {"ok"}
-    assert verify(desk.session.path) == []
+    assert verify(recorded.session.path) == []
 
 
-def test_whoever_watches_does_not_keep_the_node_waiting(desk):
-    desk.intake = Intake(
-        desk.archive,
-        lambda manifest, verdict: desk.events.append({"ack": verdict}),
+def test_whoever_watches_does_not_keep_the_node_waiting(recorded):
+    recorded.intake = Intake(
+        recorded.archive,
+        lambda manifest, verdict: recorded.events.append({"ack": verdict}),
         lambda manifest: None,
-        desk.events.append,
+        recorded.events.append,
     )
-    desk.intake.take(manifest_of(), IMAGE)
-    assert [event.get("ack") for event in desk.events] == ["archived", None]
+    recorded.intake.take(manifest_of(), IMAGE)
+    assert [event.get("ack") for event in recorded.events] == ["archived", None]
 
 
-def test_a_damaged_record_costs_no_image_and_does_not_end_the_archivist(desk):
-    (desk.capture.path / "capture.json").write_text("{")
-    second = desk.session.begin_capture("board", ["201"], fire_at_ns=70)
-    desk.intake.put(manifest_of(), IMAGE)
-    desk.intake.put(replace(manifest_of(), key=CaptureKey("s", second.capture_id, 70)), IMAGE)
-    desk.intake.start()
-    desk.intake.stop(timeout=10)
-    assert desk.acks == [("201", "archived")], "the first stays with its node, the second is safe"
+def test_a_damaged_record_costs_no_image_and_does_not_end_the_archivist(recorded):
+    (recorded.capture.path / "capture.json").write_text("{")
+    second = recorded.session.begin_capture("board", ["201"], fire_at_ns=70)
+    recorded.intake.put(manifest_of(), IMAGE)
+    recorded.intake.put(replace(manifest_of(), key=CaptureKey("s", second.capture_id, 70)), IMAGE)
+    recorded.intake.start()
+    recorded.intake.stop(timeout=10)
+    assert recorded.acks == [("201", "archived")], "the first stays with its node, the second is safe"
 
 
-def test_a_nodes_own_reason_replaces_a_general_one(desk):
-    desk.capture.close({"201": "no image arrived", "202": "no image arrived"})
+def test_a_nodes_own_reason_replaces_a_general_one(recorded):
+    recorded.capture.close({"201": "no image arrived", "202": "no image arrived"})
     key = CaptureKey("s", "0001-board", 50)
-    desk.intake.note_failure(Failure("201", key, "the camera timed out"))
-    desk.intake.note_failure(Failure("202", replace(key, fire_at_ns=51), "of another session"))
-    cameras = desk.capture.record()["cameras"]
+    recorded.intake.note_failure(Failure("201", key, "the camera timed out"))
+    recorded.intake.note_failure(Failure("202", replace(key, fire_at_ns=51), "of another session"))
+    cameras = recorded.capture.record()["cameras"]
     assert cameras["201"]["reason"] == "the camera timed out"
     assert cameras["202"]["reason"] == "no image arrived"

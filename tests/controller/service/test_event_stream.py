@@ -12,13 +12,13 @@ def test_a_follower_gets_the_snapshot_and_then_the_events_of_other_threads() -> 
     async def story() -> list:
         stream = EventStream(lambda: {"nodes": 12})
         events = stream.follow()
-        seen = [await anext(events)]
+        received = [await anext(events)]
         threading.Thread(target=lambda: [stream.publish("job", {"done": k}) for k in range(5)]).start()
         for _ in range(5):
-            seen.append(await asyncio.wait_for(anext(events), 5))
+            received.append(await asyncio.wait_for(anext(events), 5))
         await events.aclose()
         stream.publish("job", {"done": 9})  # nobody follows any more
-        return seen
+        return received
 
     assert asyncio.run(story()) == [("snapshot", {"nodes": 12}), *(("job", {"done": k}) for k in range(5))]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from ringdic_controller.service.refusals import NotFoundError
 
 API = "/api/v1"
 AROUND, ALONG, STRETCH = 60, 16, 0.1  # the stand-in's tube
@@ -108,6 +110,33 @@ def test_a_second_capture_at_once_is_refused_and_the_first_goes_on(client, nodes
     nodes.gate.set()
     until(lambda: client.get(address).json()["state"] == "closed")
     assert len(client.get(f"{API}/sessions/limb/captures").json()) == 1
+    assert client.get(f"{API}/rig").json()["refusal"] is None
+
+
+def test_while_a_capture_is_under_way_no_other_session_is_made_or_selected(client, nodes) -> None:
+    for name in ("other", "limb"):
+        client.post(f"{API}/sessions", json={"name": name})
+    nodes.gate.clear()
+    first = client.post(f"{API}/captures", json={"kind": "board"}).json()
+    assert client.post(f"{API}/sessions", json={"name": "third"}).status_code == 409
+    assert client.put(f"{API}/sessions/current", json={"name": "other"}).status_code == 409
+    assert client.put(f"{API}/sessions/current", json={"name": "nobody"}).status_code == 404
+    assert client.put(f"{API}/sessions/current", json={"name": "limb"}).status_code == 200
+    listing = client.get(f"{API}/sessions").json()
+    assert (listing["current"], len(listing["sessions"])) == ("limb", 2), "a refusal has changed nothing"
+    nodes.gate.set()
+    until(lambda: client.get(f"{API}/rounds/{first['id']}").json()["state"] == "closed")
+
+
+def test_a_capture_closes_even_if_its_processing_cannot_be_queued(client, desk, monkeypatch) -> None:
+    client.post(f"{API}/sessions", json={"name": "limb"})
+
+    def fail(*_: object) -> None:
+        raise NotFoundError("the session's folder has been moved")
+
+    monkeypatch.setattr(desk.processing, "submit_step", fail)
+    monkeypatch.setattr(threading, "excepthook", lambda _: None)
+    assert capture(client, "specimen")["state"] == "closed"
     assert client.get(f"{API}/rig").json()["refusal"] is None
 
 

@@ -122,9 +122,9 @@ def test_a_signal_ends_the_controller_with_its_streams_and_jobs(tmp_path: Path, 
         with httpx.stream("GET", f"{address}/api/v1/live", timeout=20) as stream:
             assert next(stream.iter_lines()) == "event: snapshot"
             process.send_signal(number)
-            said, _ = process.communicate(timeout=20)
+            output, _ = process.communicate(timeout=20)
         assert process.returncode == 0
-        assert said.strip() == "closed in order"
+        assert output.strip() == "closed in order"
         with pytest.raises(ProcessLookupError):
             os.kill(child, 0)
     finally:
@@ -141,8 +141,8 @@ def test_without_a_rig_the_controller_shows_and_captures_nothing(tmp_path: Path)
 
 
 def test_a_port_that_is_taken_is_named(desk: Desk) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
         with pytest.raises(InputError, match=str(port)):
             serve_page(desk, ControllerConfig(port=port))
 

@@ -16,12 +16,12 @@ def grey(path: Path) -> np.ndarray:
     return image
 
 
-def nearest(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """For each found corner its offset from the nearest wanted one, which must be a one-to-one choice."""
-    distance = np.linalg.norm(found[:, None] - wanted[None], axis=-1)
+def nearest(corners: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Offsets of corners from the nearest true ones; the choice must be one-to-one."""
+    distance = np.linalg.norm(corners[:, None] - wanted[None], axis=-1)
     choice = distance.argmin(axis=1)
     assert len(set(choice.tolist())) == len(wanted)
-    return found - wanted[choice]
+    return corners - wanted[choice]
 
 
 def test_board_points_lie_on_the_board_in_the_order_of_the_corners(shared_data):
@@ -32,17 +32,17 @@ def test_board_points_lie_on_the_board_in_the_order_of_the_corners(shared_data):
     H, _ = cv2.findHomography(points, corners)
     mapped = cv2.perspectiveTransform(points[:, None], H)[:, 0]
     side = np.linalg.norm(corners[1] - corners[0])
-    # A wrong order would be off by whole squares; the lens bends the board by a part of one.
+    # A wrong order would displace corners by whole squares; the lens displaces them by a part of one.
     assert np.linalg.norm(mapped - corners, axis=1).max() < 0.4 * side
 
 
 def test_corners_of_rendered_boards_are_true_to_three_hundredths_of_a_pixel(shared_data):
     truth = np.load(shared_data / "rendered_ring/limb/board_truth.npz")
     for camera, view in (("cam_01", 0), ("cam_04", 2), ("cam_09", 4)):
-        found = find_corners(
+        corners = find_corners(
             grey(shared_data / f"rendered_ring/limb/board/{camera}/{view:03d}.jpg"), BOARD.inner_corners
         )
-        error = nearest(found, truth[f"corners_{camera}"][view].astype(float))
+        error = nearest(corners, truth[f"corners_{camera}"][view].astype(float))
         assert np.abs(error.mean(axis=0)).max() < 0.01
         assert np.sqrt(np.mean(error**2)) < 0.04
         assert np.abs(error).max() < 0.15
@@ -52,8 +52,8 @@ def test_corners_of_a_reduced_image_lie_where_the_reduction_puts_them(shared_dat
     truth = np.load(shared_data / "rendered_ring/limb/board_truth.npz")["corners_cam_04"][2].astype(float)
     image = grey(shared_data / "rendered_ring/limb/board/cam_04/002.jpg")
     half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    found = find_corners(half, BOARD.inner_corners)
-    error = nearest(found, (truth + 0.5) / 2 - 0.5)
+    corners = find_corners(half, BOARD.inner_corners)
+    error = nearest(corners, (truth + 0.5) / 2 - 0.5)
     assert np.abs(error.mean(axis=0)).max() < 0.02
     assert np.sqrt(np.mean(error**2)) < 0.08
 
@@ -71,9 +71,9 @@ def test_corners_on_handheld_boards_agree_with_matlab(shared_data):
         names = reference["checkerboard_names_201"].tolist()
         wanted = reference["checkerboard_corners_201"]
     for name in ("201_18.jpg", "201_35.jpg"):
-        found = find_corners(grey(folder / "checkerboard" / "201" / name), BOARD.inner_corners)
-        distance = np.linalg.norm(nearest(found, wanted[names.index(name)]), axis=1)
-        # Two detectors on a real print: a tenth of a pixel apart in the middle of the distribution.
+        corners = find_corners(grey(folder / "checkerboard" / "201" / name), BOARD.inner_corners)
+        distance = np.linalg.norm(nearest(corners, wanted[names.index(name)]), axis=1)
+        # The medians of two detectors on a real print differ by a tenth of a pixel.
         assert np.median(distance) < 0.15
         assert distance.max() < 0.7
 

@@ -1,4 +1,4 @@
-"""All cameras adjusted together: exact on a perfect world, as uncertain as stated, without the DLT's bias.
+"""Bundle adjustment: exact on exact data, with errors of the stated size, without the bias of the DLT.
 
 A ring of twelve full-scale cameras is made of numbers, no images. Centroids come from the outline of each dot, by
 Green's theorem: nothing of the model under test.
@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 from ringdic.calibration import dlt
-from ringdic.calibration.bundle import BundleFit, TargetPrior, adjust_ring, centroid_shift
+from ringdic.calibration.bundle import BundleFit, TargetPrior, bundle_adjustment, centroid_shift
 from ringdic.calibration.camera_calibration import CameraCalibration
 from ringdic.calibration.intrinsics import IntrinsicsFit, calibrate_intrinsics
-from ringdic.calibration.patch import PrintedSheet, Views, nodes, patch_jacobians, project_patches, sheet_points
+from ringdic.calibration.patch import DotViews, PrintedSheet, patch_jacobians, project_patches, quadrature, sheet_points
 from ringdic.calibration.target import DotObservations, dot_points
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera, Intrinsics
@@ -91,7 +91,7 @@ def observed(
     print_errors: np.ndarray | None = None,
     points: int = 400,
 ) -> CameraCalibration:
-    """The paper's calibration of a camera that sees the target as it truly is: the start of the adjustment."""
+    """DLT calibration of a camera that sees the true target: the start of the adjustment."""
     sheet = sheet or PrintedSheet.nominal(target)
     rows, columns = (axis.ravel() for axis in np.mgrid[1 : target.rows + 1, 1 : target.columns + 1])
     xyz = dot_points(target, rows, columns)
@@ -105,8 +105,8 @@ def observed(
     flat = px if lens is None else lens.to_undistorted(px)
     L = dlt.solve_dlt(xyz, flat)
     dots = DotObservations(camera.id, rows, columns, px, xyz, 0.0, float("inf"))
-    found = Camera(camera.id, dlt.to_projection(L), SIZE, lens)
-    return CameraCalibration(found, dots, dlt.residuals(L, xyz, flat), 0, fit, np.zeros_like(px))
+    estimate = Camera(camera.id, dlt.to_projection(L), SIZE, lens)
+    return CameraCalibration(estimate, dots, dlt.residuals(L, xyz, flat), 0, fit, np.zeros_like(px))
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +122,7 @@ def half_ring(true_cameras) -> dict[str, Camera]:
 
 @pytest.fixture(scope="module")
 def fits(true_cameras) -> dict[str, IntrinsicsFit]:
-    """Every lens as ten views of the board give it."""
+    """Every lens, fitted to ten views of the board."""
     rng = np.random.default_rng(2)
     return {name: lens_from_boards(camera.intrinsics, 0.03, rng) for name, camera in true_cameras.items()}
 
@@ -168,11 +168,11 @@ def pose(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return M[:, :3], M[:, 3]
 
 
-def pulls(true: Camera, found: Camera, sigma: np.ndarray) -> np.ndarray:
-    """Errors of the sixteen parameters in stated standard errors."""
-    (R, t), (R_true, t_true) = pose(found), pose(true)
+def pulls(true: Camera, estimate: Camera, sigma: np.ndarray) -> np.ndarray:
+    """Errors of the sixteen parameters in units of their stated standard errors."""
+    (R, t), (R_true, t_true) = pose(estimate), pose(true)
     omega = cv2.Rodrigues(R @ R_true.T)[0].ravel()
-    lens = lens_values(found.intrinsics) - lens_values(true.intrinsics)
+    lens = lens_values(estimate.intrinsics) - lens_values(true.intrinsics)
     return np.concatenate([lens, omega, t - turned(omega) @ t_true + (turned(omega) - np.eye(3)) @ t_true]) / sigma
 
 
@@ -182,13 +182,13 @@ def test_the_centroid_of_a_patch_is_that_of_its_outline(true_cameras, shape) -> 
     sz = np.column_stack([np.linspace(-52, 52, 9), np.linspace(10, 238, 9)])  # up to 52° round the cylinder
     R, t = pose(camera)
     inner = np.tile(lens_values(camera.intrinsics), (9, 1))
-    views = Views(inner, np.tile(R, (9, 1, 1)), np.tile(t, (9, 1)), sz, 57.0)
+    views = DotViews(inner, np.tile(R, (9, 1, 1)), np.tile(t, (9, 1)), sz, 57.0)
     outline = outline_centroids(camera, sz, 57.0, shape, 4.0)
     assert np.abs(project_patches(views, shape, 4.0) - outline).max() < 2e-5
     angle = sz[:, 0] / 57
     centre = camera.project(np.column_stack([57 * np.cos(angle), 57 * np.sin(angle), sz[:, 1]]))
     assert 0.15 < np.linalg.norm(outline - centre, axis=1).max() < 0.6
-    assert nodes(shape, 4.0)[1].sum() == pytest.approx(1.0)
+    assert quadrature(shape, 4.0)[1].sum() == pytest.approx(1.0)
 
 
 def test_centroids_of_a_moved_target_are_known_too(true_cameras) -> None:
@@ -199,10 +199,10 @@ def test_centroids_of_a_moved_target_are_known_too(true_cameras) -> None:
     moved = Camera("moved", camera.P @ np.vstack([M, [0, 0, 0, 1]]), SIZE, camera.intrinsics)
     centre = camera.project(dot_points(TARGET, rows, columns) @ R.T + t)
     truth = outline_centroids(moved, sz, 57.0, "square", 4.0) - centre
-    found = centroid_shift(camera, TARGET, rows, columns, rotation=R, translation=t)
-    assert np.allclose(found, truth, rtol=0, atol=2e-5)
+    estimate = centroid_shift(camera, TARGET, rows, columns, rotation=R, translation=t)
+    assert np.allclose(estimate, truth, rtol=0, atol=2e-5)
     still = centroid_shift(camera, TARGET, rows, columns)
-    assert np.abs(still - found).max() > 1e-3
+    assert np.abs(still - estimate).max() > 1e-3
     bare = replace(camera, intrinsics=None)
     flat = outline_centroids(bare, sz, 57.0, "square", 4.0) - bare.project(dot_points(TARGET, rows, columns))
     assert np.allclose(centroid_shift(bare, TARGET, rows, columns), flat, rtol=0, atol=2e-5)
@@ -213,7 +213,7 @@ def test_derivatives_of_a_patch_are_those_of_differences(true_cameras) -> None:
     values = lens_values(true_cameras["c02"].intrinsics)
 
     def centroid(x: np.ndarray) -> np.ndarray:
-        views = Views(
+        views = DotViews(
             (values + x[:10])[None],
             (turned(x[10:13]) @ R)[None],
             (t + x[13:16])[None],
@@ -222,7 +222,7 @@ def test_derivatives_of_a_patch_are_those_of_differences(true_cameras) -> None:
         )
         return project_patches(views, "square", 4.0)[0]
 
-    views = Views(values[None], R[None], t[None], np.array([[30.0, 60.0]]), 57.0)
+    views = DotViews(values[None], R[None], t[None], np.array([[30.0, 60.0]]), 57.0)
     px, inner, by_pose, by_sz, by_radius = patch_jacobians(views, "square", 4.0)
     exact = np.concatenate([inner, by_pose, by_sz, by_radius], axis=-1)[0]
     steps = np.concatenate([np.full(5, 1e-2), np.full(5, 1e-4), np.full(3, 1e-5), np.full(6, 1e-3)])
@@ -239,7 +239,7 @@ def test_a_perfect_world_comes_back(true_cameras) -> None:
     some = {name: true_cameras[name] for name in NAMES[:4]}
     perfect = {name: lens_from_boards(camera.intrinsics, 0.0, rng) for name, camera in some.items()}
     start = seen_by_all(some, perfect, 4, noise=0.0, points=8000)
-    cameras, fit = adjust_ring(start, TARGET)
+    cameras, fit = bundle_adjustment(start, TARGET)
     for name, true in some.items():
         # The outline and the rule of sixteen nodes agree to 5e-8 px.
         assert np.linalg.norm(cameras[name].camera.centre - true.centre) < 1e-6
@@ -257,21 +257,21 @@ def test_the_diameter_is_right_where_the_dlt_s_is_not(request, fits, shape, figu
     true_cameras = request.getfixturevalue("true_cameras" if shape == "square" else "half_ring")
     target = replace(TARGET, dot_shape=shape)
     start = seen_by_all(true_cameras, fits, 5, target=target)
-    cameras, fit = adjust_ring(start, target)
+    cameras, fit = bundle_adjustment(start, target)
     before, after = diameter_error(true_cameras, start), diameter_error(true_cameras, cameras)
     figures(f"diameter bias, {shape} dots: DLT, bundle, µm", f"{before * 1e3:.1f}, {after * 1e3:.2f}", "> 50, 3")
     assert 0.05 < before < 0.12
     assert abs(after) < 0.003
     assert fit.px_sigma == pytest.approx(0.01, rel=0.1)
     assert fit.print_sigma < 0.002
-    # Some three hundred numbers a camera, each of variance one but for Huber's weights.
+    # About three hundred numbers for each camera, of variance one but for Huber's weights.
     assert np.abs(fit.chi2 - 1).max() < 0.35
     assert 1.0 <= fit.lens_scale < 1.3
 
 
 def test_print_errors_are_found_and_leave_the_diameter_alone(true_cameras, fits, figures) -> None:
     start = seen_by_all(true_cameras, fits, 6, print_error=0.03)
-    cameras, fit = adjust_ring(start, TARGET)
+    cameras, fit = bundle_adjustment(start, TARGET)
     after = diameter_error(true_cameras, cameras)
     figures("diameter bias, prints off by 0.03 mm, bundle, µm", f"{after * 1e3:.2f}", "5")
     assert abs(after) < 0.005
@@ -279,7 +279,7 @@ def test_print_errors_are_found_and_leave_the_diameter_alone(true_cameras, fits,
     assert fit.px_sigma == pytest.approx(0.01, rel=0.12)
     truth = np.random.default_rng(6).normal(size=(20, 30, 2))[fit.rows - 1, fit.columns - 1] * 0.03
     error = fit.offsets - truth
-    # But for the motion of the whole print, which nothing can tell from one of the world.
+    # A motion of the whole print cannot be separated from one of the world.
     assert np.sqrt(np.mean((error - error.mean(axis=0)) ** 2)) < 0.004
     assert np.abs(error / fit.offsets_sigma).max() < 5
 
@@ -287,46 +287,46 @@ def test_print_errors_are_found_and_leave_the_diameter_alone(true_cameras, fits,
 def test_a_target_of_another_size_is_measured_where_that_is_allowed(half_ring, fits) -> None:
     sheet = PrintedSheet(57.02, 12.01, 0.001)
     start = seen_by_all(half_ring, fits, 7, print_error=0.01, sheet=sheet)
-    cameras, fit = adjust_ring(start, TARGET, TargetPrior(radius=0.1, pitch=0.05, tilt=0.01))
+    cameras, fit = bundle_adjustment(start, TARGET, TargetPrior(radius=0.1, pitch=0.05, tilt=0.01))
     error = np.array([fit.sheet.radius, fit.sheet.pitch, fit.sheet.tilt]) - [57.02, 12.01, 0.001]
     assert (np.abs(error) < 4 * fit.sheet_sigma).all()
     assert fit.sheet_sigma[0] < 0.004
     assert fit.sheet.seam(TARGET) == pytest.approx(2 * np.pi * 57.02 - 29 * 12.01, abs=0.02)
-    told = fit.figures(TARGET)
-    assert told["radius_mm"] == pytest.approx(57.02, abs=4 * told["radius_sigma_mm"])
-    assert told["tilt_deg"] == pytest.approx(np.degrees(0.001), abs=4 * told["tilt_sigma_deg"])
-    assert [row["camera"] for row in told["cameras"]] == list(half_ring)
-    assert all(0 < row["focal_sigma_px"][0] < 1 for row in told["cameras"])
+    figures = fit.figures(TARGET)
+    assert figures["radius_mm"] == pytest.approx(57.02, abs=4 * figures["radius_sigma_mm"])
+    assert figures["tilt_deg"] == pytest.approx(np.degrees(0.001), abs=4 * figures["tilt_sigma_deg"])
+    assert [row["camera"] for row in figures["cameras"]] == list(half_ring)
+    assert all(0 < row["focal_sigma_px"][0] < 1 for row in figures["cameras"])
     assert abs(diameter_error(half_ring, cameras)) < 0.005
-    held, _ = adjust_ring(start, TARGET)
+    held, _ = bundle_adjustment(start, TARGET)
     assert diameter_error(half_ring, held) < -0.03  # a radius believed 0.02 too small makes everything so
 
 
 def test_stated_uncertainties_are_true(true_cameras) -> None:
-    found, prints = [], []
+    estimate, prints = [], []
     some = {name: true_cameras[name] for name in NAMES[:4]}
     for seed in range(6):
         rng = np.random.default_rng(100 + seed)
         fits = {name: lens_from_boards(camera.intrinsics, 0.03, rng) for name, camera in some.items()}
-        cameras, fit = adjust_ring(seen_by_all(some, fits, 200 + seed, print_error=0.02), TARGET)
-        found += [
+        cameras, fit = bundle_adjustment(seen_by_all(some, fits, 200 + seed, print_error=0.02), TARGET)
+        estimate += [
             pulls(true, cameras[name].camera, sigma)
             for (name, true), sigma in zip(some.items(), fit.camera_sigma, strict=True)
         ]
         prints.append(fit.print_sigma)
     # Six independent draws of sixty-four correlated numbers.
-    assert 0.75 < np.sqrt(np.mean(np.square(found))) < 1.25
-    assert np.abs(found).max() < 5
+    assert 0.75 < np.sqrt(np.mean(np.square(estimate))) < 1.25
+    assert np.abs(estimate).max() < 5
     assert np.mean(prints) == pytest.approx(0.02, rel=0.08)
 
 
 def test_gross_errors_are_left_out_and_counted(half_ring, fits) -> None:
     start = seen_by_all(half_ring, fits, 8)
-    clean, _ = adjust_ring(start, TARGET)
+    clean, _ = bundle_adjustment(start, TARGET)
     px = start["c03"].dots.px.copy()
     px[[5, 50, 90]] += [0.6, -0.5]
     start["c03"] = replace(start["c03"], dots=replace(start["c03"].dots, px=px))
-    cameras, _ = adjust_ring(start, TARGET)
+    cameras, _ = bundle_adjustment(start, TARGET)
     assert cameras["c03"].left_out - clean["c03"].left_out == 3
     assert len(cameras["c03"].dots) == len(px) - cameras["c03"].left_out
     assert np.linalg.norm(cameras["c03"].camera.centre - clean["c03"].camera.centre) < 0.02
@@ -338,10 +338,10 @@ def test_a_lens_that_contradicts_the_target_is_told(half_ring, fits) -> None:
     K = lens.K.copy()
     K[:2, :2] *= 1.004  # refocused after the boards
     other = {**fits, "c04": lens_from_boards(replace(lens, K=K), 0.03, rng)}
-    _, fit = adjust_ring(seen_by_all(half_ring, other, 10), TARGET)
+    _, fit = bundle_adjustment(seen_by_all(half_ring, other, 10), TARGET)
     assert fit.cameras[int(np.argmax(fit.lens_chi2))] == "c04"
     assert fit.lens_chi2.max() > 10
-    _, good = adjust_ring(seen_by_all(half_ring, fits, 10), TARGET)
+    _, good = bundle_adjustment(seen_by_all(half_ring, fits, 10), TARGET)
     assert good.lens_chi2.max() < 4
 
 
@@ -350,7 +350,7 @@ def test_a_camera_that_is_worse_than_the_others_is_told(half_ring, fits) -> None
     shaken = start["c02"].dots
     px = shaken.px + np.random.default_rng(5).normal(0, 0.025, shaken.px.shape)
     start["c02"] = replace(start["c02"], dots=replace(shaken, px=px))
-    _, fit = adjust_ring(start, TARGET)
+    _, fit = bundle_adjustment(start, TARGET)
     others = [value for id_, value in zip(fit.cameras, fit.chi2, strict=True) if id_ != "c02"]
     assert fit.chi2[1] > 2.5 * max(others)
 
@@ -359,7 +359,7 @@ def test_a_given_lens_is_held_and_a_bare_camera_needs_none(true_cameras) -> None
     rng = np.random.default_rng(11)
     some = {name: true_cameras[name] for name in NAMES[:3]}
     start = {name: observed(camera, camera.intrinsics, None, 0.01, rng) for name, camera in some.items()}
-    cameras, fit = adjust_ring(start, TARGET)
+    cameras, fit = bundle_adjustment(start, TARGET)
     for name, true in some.items():
         assert np.array_equal(lens_values(cameras[name].camera.intrinsics), lens_values(true.intrinsics))
         assert np.linalg.norm(cameras[name].camera.centre - true.centre) < 0.03
@@ -370,7 +370,7 @@ def test_a_given_lens_is_held_and_a_bare_camera_needs_none(true_cameras) -> None
     for name, camera in some.items():
         lens = Intrinsics(camera.intrinsics.K_undistorted, np.zeros(5), SIZE)
         pinholes[name] = observed(replace(camera, intrinsics=lens), None, None, 0.001, rng)
-    cameras, _ = adjust_ring(pinholes, TARGET)
+    cameras, _ = bundle_adjustment(pinholes, TARGET)
     for name, true in some.items():
         assert cameras[name].camera.intrinsics is None
         assert np.linalg.norm(cameras[name].camera.centre - true.centre) < 0.1
@@ -382,13 +382,13 @@ def test_a_camera_that_is_none_is_refused(half_ring, fits) -> None:
     nonsense = np.random.default_rng(13).normal(0, 20, start["c02"].dots.px.shape)
     start["c02"] = replace(start["c02"], dots=replace(start["c02"].dots, px=start["c02"].dots.px + nonsense))
     with pytest.raises(ComputationError, match="camera c02: only"):
-        adjust_ring(start, TARGET)
+        bundle_adjustment(start, TARGET)
 
 
 def test_the_adjustment_survives_json(true_cameras, fits) -> None:
     start = seen_by_all({name: true_cameras[name] for name in NAMES[:2]}, fits, 14)
     start["c02"] = replace(start["c02"], fit=None)
-    cameras, fit = adjust_ring(start, TARGET)
+    cameras, fit = bundle_adjustment(start, TARGET)
     again = BundleFit.from_dict(json.loads(json.dumps(fit.to_dict())))
     assert again.to_dict() == fit.to_dict()
     stored = CameraCalibration.from_dict(json.loads(json.dumps(cameras["c01"].to_dict())))

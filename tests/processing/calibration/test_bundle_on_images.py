@@ -1,4 +1,4 @@
-"""All cameras adjusted together on images: the rendered ring against its truth, the real pair against the paper's way.
+"""Bundle adjustment on images: the rendered ring against its truth, the real pair against the calibration by DLT.
 
 One table of figures for both ways: control points, diameter, the target moved by 5 mm.
 """
@@ -10,11 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from ringdic.calibration.bundle import adjust_ring, centroid_shift
+from ringdic.calibration.bundle import bundle_adjustment, centroid_shift
 from ringdic.calibration.calibrated_rig import calibrate_rig, control_points
 from ringdic.calibration.camera_calibration import CameraCalibration, calibrate_camera
 from ringdic.calibration.dots import find_dots
-from ringdic.calibration.target import DotObservations, identify
+from ringdic.calibration.target import DotObservations, identify_dots
 from ringdic.errors import InputError
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.geometry.triangulation import reprojection_residuals, triangulate
@@ -34,7 +34,7 @@ def grey(path: Path) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Ways:
-    """The paper's calibration and the adjusted one."""
+    """The calibration by DLT and the adjusted one."""
 
     dlt: dict[str, CameraCalibration]
     bundle: dict[str, CameraCalibration]
@@ -58,7 +58,7 @@ def calibrated(folder: Path, rig: Rig, camera: str) -> CameraCalibration:
 @pytest.fixture(scope="module")
 def ways(folder, rig) -> Ways:
     start = {camera.id: calibrated(folder, rig, camera.id) for camera in rig.cameras}
-    return Ways(start, adjust_ring(start, rig.target)[0])
+    return Ways(start, bundle_adjustment(start, rig.target)[0])
 
 
 @pytest.fixture(scope="module")
@@ -78,15 +78,15 @@ def pairs(rig: Rig) -> list[tuple[str, str]]:
 
 
 def fitted_diameter(cloud: np.ndarray, z: float) -> tuple[float, float]:
-    """Diameter of the least-squares cylinder and the standard deviation of the points' own. mm."""
+    """Diameter of the least-squares cylinder and standard deviation of the points' diameters, mm."""
 
     def misfit(q: np.ndarray) -> np.ndarray:
         axis = np.array([q[2], q[3], 1.0]) / np.linalg.norm([q[2], q[3], 1.0])
         offset = cloud - [q[0], q[1], z]
         return np.linalg.norm(offset - np.outer(offset @ axis, axis), axis=1) - q[4]
 
-    found = least_squares(misfit, [0, 0, 0, 0, 57.0], x_scale=[1, 1, 0.01, 0.01, 1])
-    return 2 * found.x[4], 2 * float(found.fun.std())
+    results = least_squares(misfit, [0, 0, 0, 0, 57.0], x_scale=[1, 1, 0.01, 0.01, 1])
+    return 2 * results.x[4], 2 * float(results.fun.std())
 
 
 def diameter_bias(rig: Rig, true: dict[str, Camera], cameras: dict[str, CameraCalibration]) -> float:
@@ -132,7 +132,7 @@ def stage(
 
 def test_the_rendered_ring_is_right_in_every_figure(folder, rig, ways, true_cameras, figures) -> None:
     moved = {
-        camera.id: identify(
+        camera.id: identify_dots(
             find_dots(grey(folder / "target_moved_5mm" / f"{camera.id}.jpg"), rig.target),
             rig.target,
             camera.azimuth_deg,
@@ -141,23 +141,23 @@ def test_the_rendered_ring_is_right_in_every_figure(folder, rig, ways, true_came
         )
         for camera in rig.cameras
     }
-    found = {}
+    results = {}
     for name, cameras in (("dlt", ways.dlt), ("bundle", ways.bundle)):
         rms = np.sqrt(np.mean([control_points(cameras[a], cameras[b]).rms ** 2 for a, b in pairs(rig)]))
         bias = diameter_bias(rig, true_cameras, cameras)
         length, superimposed = stage(rig, cameras, moved, patches=name == "bundle")
         centre = max(np.linalg.norm(cameras[id_].camera.centre - true.centre) for id_, true in true_cameras.items())
-        found[name] = (float(rms), bias, length, superimposed, float(centre))
+        results[name] = (float(rms), bias, length, superimposed, float(centre))
         figures(f"rendered ring, {name}: control points, superimposed, mm", f"{rms:.4f}, {superimposed:.4f}", "0.01")
         figures(f"rendered ring, {name}: diameter bias, 5 mm, mm", f"{bias:+.4f}, {length:.4f}", "0.003, 5 ± 0.001")
-    rms, bias, length, superimposed, centre = found["bundle"]
+    rms, bias, length, superimposed, centre = results["bundle"]
     assert rms < 0.006
     assert abs(bias) < 0.001
     assert length == pytest.approx(5.0, abs=0.001)
     assert superimposed < 0.008
     assert centre < 0.1
-    rms, bias, length, superimposed, centre = found["dlt"]
-    # The paper's figures do not see what the length and the diameter see.
+    rms, bias, length, superimposed, centre = results["dlt"]
+    # The reconstruction error does not show the bias that the length and the diameter show.
     assert rms < 0.007
     assert superimposed < 0.008
     assert bias > 0.07
@@ -181,10 +181,10 @@ def test_the_real_pair_is_better_than_the_paper_s_way(shared_data, rig, figures)
         )
         for id_ in ("201", "202")
     }
-    bundle, fit = adjust_ring(start, real.target)
+    bundle, fit = bundle_adjustment(start, real.target)
     reference = np.load(folder / "reference.npz")
     speckles = np.stack([reference["points2d_201"][0], reference["points2d_202"][0]])
-    found = {}
+    results = {}
     for name, cameras in (("dlt", start), ("bundle", bundle)):
         both = [cameras["201"], cameras["202"]]
         nominal = [
@@ -195,20 +195,26 @@ def test_the_real_pair_is_better_than_the_paper_s_way(shared_data, rig, figures)
         cloud = triangulate(lenses, speckles)
         across = float(np.sqrt(np.mean(reprojection_residuals(lenses, cloud, speckles)[..., 1] ** 2)))
         diameter, scatter = fitted_diameter(cloud, 124.0)
-        found[name] = (control_points(nominal[0], nominal[1]).rms, control_points(*both).rms, across, diameter, scatter)
+        results[name] = (
+            control_points(nominal[0], nominal[1]).rms,
+            control_points(*both).rms,
+            across,
+            diameter,
+            scatter,
+        )
         figures(
             f"real pair, {name}: control points, nominal and adjusted, mm",
-            "{:.4f}, {:.4f}".format(*found[name]),
+            "{:.4f}, {:.4f}".format(*results[name]),
             "0.07",
         )
         figures(f"real pair, {name}: speckles off the epipolar line, px", f"{across:.3f}", "")
         figures(f"real pair, {name}: diameter, its STD, mm", f"{diameter:.3f}, {scatter:.3f}", "114 ± 0.05, 0.041")
-    assert found["bundle"][0] < found["dlt"][0] < 0.07
-    assert found["bundle"][1] < 0.02
+    assert results["bundle"][0] < results["dlt"][0] < 0.07
+    assert results["bundle"][1] < 0.02
     # Points that took no part in the calibration: another specimen in later images.
-    assert found["bundle"][2] < 0.75 * found["dlt"][2]
-    assert found["bundle"][3] == pytest.approx(114.0, abs=0.05)
-    assert found["bundle"][4] < found["dlt"][4]
+    assert results["bundle"][2] < 0.75 * results["dlt"][2]
+    assert results["bundle"][3] == pytest.approx(114.0, abs=0.05)
+    assert results["bundle"][4] < results["dlt"][4]
     assert 0.01 < fit.print_sigma < 0.05
 
 
@@ -238,20 +244,20 @@ def session(folder, rig, tmp_path) -> Session:
 
 
 def test_a_session_is_calibrated_as_its_settings_say_and_once(session, rig, ways) -> None:
-    told: list[tuple[float, str]] = []
-    plain = calibrate_rig(session, CalibrationGroup(), lambda done, who: told.append((done, who)))
+    reports: list[tuple[float, str]] = []
+    plain = calibrate_rig(session, CalibrationGroup(), lambda done, who: reports.append((done, who)))
     assert plain.bundle is None
-    assert told[-1] == (1.0, "camera cam_02")
-    first = calibrate_rig(session, CalibrationGroup(method="bundle"), lambda done, who: told.append((done, who)))
-    assert told[-1] == (1.0, "all cameras together")
+    assert reports[-1] == (1.0, "camera cam_02")
+    first = calibrate_rig(session, CalibrationGroup(method="bundle"), lambda done, who: reports.append((done, who)))
+    assert reports[-1] == (1.0, "all cameras together")
     assert first.bundle is not None
     assert first.bundle.cameras == ("cam_12", "cam_01", "cam_02")
-    kept = {path: path.stat().st_mtime_ns for path in (session.path / "calibration").iterdir()}
-    assert sum(path.name.startswith("bundle-") for path in kept) == 1
-    assert sum(path.name.startswith("survey-") for path in kept) == 1
-    assert len(kept) == 5  # the start is shared by both methods
+    stored = {path: path.stat().st_mtime_ns for path in (session.path / "calibration").iterdir()}
+    assert sum(path.name.startswith("bundle-") for path in stored) == 1
+    assert sum(path.name.startswith("survey-") for path in stored) == 1
+    assert len(stored) == 5  # the start is shared by both methods
     again = calibrate_rig(session, CalibrationGroup(method="bundle"))
-    assert {path: path.stat().st_mtime_ns for path in (session.path / "calibration").iterdir()} == kept
+    assert {path: path.stat().st_mtime_ns for path in (session.path / "calibration").iterdir()} == stored
     assert again.bundle is not None
     assert again.bundle.to_dict() == first.bundle.to_dict()
     for id_, calibration in first.cameras.items():

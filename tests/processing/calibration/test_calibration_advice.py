@@ -1,4 +1,4 @@
-"""Figures of cameras and pairs are what they say, and advice comes where something can be done and nowhere else."""
+"""Figures of cameras and pairs are true, and advice is given where it helps and nowhere else."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import pytest
 from ringdic.calibration.advice import camera_advice, pair_advice
 from ringdic.calibration.camera_calibration import CameraCalibration
 from ringdic.calibration.intrinsics import calibrate_intrinsics
-from ringdic.calibration.parameters import Parameters
+from ringdic.calibration.parameters import CameraParameters
 from ringdic.calibration.quality import camera_quality, pair_quality
 from ringdic.calibration.target import DotObservations, dot_points
 from ringdic.errors import ComputationError
@@ -24,25 +24,25 @@ BOARD = np.stack(np.meshgrid(np.arange(14) * 10.0, np.arange(19) * 10.0), axis=-
 
 
 def views(count: int, seed: int, spread: float = 1.0) -> list[np.ndarray]:
-    """The board all over the image; spread 0 : always in the middle of it, and small."""
+    """Corners of the board in views all over the image; spread 0: always small and in the middle."""
     rng = np.random.default_rng(seed)
     board = np.column_stack([BOARD - BOARD.mean(axis=0), np.zeros(len(BOARD))])
-    found = []
+    corners = []
     for k in range(count):
         R, _ = cv2.Rodrigues(rng.uniform(-1, 1, 3) * [0.6, 0.6, 0.4])
         corner = spread * 55.0 * np.array([(-1) ** k, (-1) ** (k // 2)])
         camera = board @ R.T + [*corner, 360 + 350 * (1 - spread)]
         px = LENS.distort_normalised(camera[:, :2] / camera[:, 2:]) @ LENS.K[:2, :2].T + LENS.K[:2, 2]
-        found.append(px + rng.normal(0, 0.03, px.shape))
-    return found
+        corners.append(px + rng.normal(0, 0.03, px.shape))
+    return corners
 
 
 def calibrated(name: str, azimuth_deg: float, corners: list[np.ndarray]) -> CameraCalibration:
-    """A camera on the ring that measures the dots before it exactly."""
+    """A camera on the ring that measures the dots in front of it exactly."""
     a = np.deg2rad(azimuth_deg)
     centre = np.array([350 * np.cos(a), 350 * np.sin(a), 124.0])
     R = np.array([[-np.sin(a), np.cos(a), 0], [0, 0, -1], [-np.cos(a), -np.sin(a), 0]])
-    camera = Parameters(np.array([1303.5, 1306.1, -0.8, 624.0, 811.0, *LENS.distortion]), R, -R @ centre).camera(
+    camera = CameraParameters(np.array([1303.5, 1306.1, -0.8, 624.0, 811.0, *LENS.distortion]), R, -R @ centre).camera(
         Camera(name, np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1]]), SIZE, LENS)
     )
     rows, columns = (axis.ravel() for axis in np.mgrid[1:21, 1:31])

@@ -1,4 +1,4 @@
-"""Whole cameras: control points come back in space, on the real pair and on the rendered ring."""
+"""Calibration of single cameras: control points are reconstructed, on the real pair and on the rendered ring."""
 
 import json
 from dataclasses import replace
@@ -107,7 +107,7 @@ def test_lens_and_place_of_a_rendered_camera_are_the_true_ones(ring, shared_data
         x, y = np.meshgrid(np.linspace(300, 930, 8), np.linspace(250, 1400, 12))
         px = np.column_stack([x.ravel(), y.ravel()])
         rays = [(each.to_undistorted(px) - each.K[:2, 2]) / each.K[[0, 1], [0, 1]] for each in (lens, lens_true)]
-        # The same rays but for a turn of the camera, to a tenth of a pixel on the target.
+        # Apart from a rotation of the camera, rays on the target agree to a tenth of a pixel.
         offset = (rays[0] - rays[1]) * 1303
         assert np.sqrt(np.mean(np.sum((offset - offset.mean(axis=0)) ** 2, axis=1))) < 0.1
         assert calibration.residual_rms < 0.05
@@ -165,8 +165,8 @@ def test_one_pose_seen_again_and_again_is_not_a_lens(ring_rig, shared_data):
 
 def test_reconstruction_error_follows_its_definition():
     true = np.zeros((4, 3))
-    found = np.array([[0.3, 0, 0], [0.1, 0, 0], [0, 0.2, 0], [np.nan, 0, 0]])
-    error = reconstruction_error(true, found)
+    reconstructed = np.array([[0.3, 0, 0], [0.1, 0, 0], [0, 0.2, 0], [np.nan, 0, 0]])
+    error = reconstruction_error(true, reconstructed)
     assert error.points == 3
     assert np.allclose(error.mean_vector, [0.4 / 3, 0.2 / 3, 0])
     assert error.mean == pytest.approx(np.hypot(0.4, 0.2) / 3)

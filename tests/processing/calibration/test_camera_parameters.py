@@ -1,9 +1,9 @@
-"""A camera as sixteen numbers: there and back, and the derivatives are those of the projection."""
+"""A camera by its sixteen parameters: conversion to and fro, and derivatives of the projection."""
 
 import cv2
 import numpy as np
 import pytest
-from ringdic.calibration.parameters import PER_CAMERA, Parameters, projection_jacobians
+from ringdic.calibration.parameters import PER_CAMERA, CameraParameters, projection_jacobians
 from ringdic.geometry.camera import Camera, Intrinsics
 
 K = np.array([[2611.7, -1.37, 1246.5], [0, 2615.4, 1627.7], [0, 0, 1]])
@@ -25,16 +25,16 @@ def points() -> np.ndarray:
 
 @pytest.mark.parametrize("lens", [LENS, None], ids=["with a lens", "by projection alone"])
 def test_parameters_make_the_camera_they_were_taken_from(lens, points):
-    found = Parameters.of(camera(lens))
-    assert np.allclose(found.rotation, R, atol=1e-12)
-    assert np.allclose(found.translation, T, atol=1e-9)
-    again = found.camera(camera(lens))
+    parameters = CameraParameters.of(camera(lens))
+    assert np.allclose(parameters.rotation, R, atol=1e-12)
+    assert np.allclose(parameters.translation, T, atol=1e-9)
+    again = parameters.camera(camera(lens))
     assert np.allclose(again.project(points), camera(lens).project(points), atol=1e-8)
 
 
 @pytest.mark.parametrize("lens", [LENS, None], ids=["with a lens", "by projection alone"])
 def test_derivatives_are_those_of_the_projection(lens, points):
-    start = Parameters.of(camera(lens))
+    start = CameraParameters.of(camera(lens))
     px, by_parameters, by_point = projection_jacobians(start, points)
     assert np.allclose(px, camera(lens).project(points), atol=1e-8)
     sizes = np.array([1, 1, 1, 1, 1, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, *[1e-5] * 3, *[1e-2] * 3])
@@ -42,7 +42,7 @@ def test_derivatives_are_those_of_the_projection(lens, points):
     for k in free:
         step = np.zeros(PER_CAMERA)
         step[k] = sizes[k]
-        both = [start.moved(sign * step).camera(camera(lens)).project(points) for sign in (1, -1)]
+        both = [start.plus(sign * step).camera(camera(lens)).project(points) for sign in (1, -1)]
         numeric = (both[0] - both[1]) / (2 * sizes[k])
         assert np.allclose(by_parameters[..., k], numeric, rtol=1e-5, atol=1e-5 * np.abs(numeric).max() + 1e-7)
     for k in range(3):

@@ -1,4 +1,4 @@
-"""The DLT: exact on exact points, equal to MultiDIC's stored parameters, blind to planted gross errors."""
+"""The DLT: exact on exact points, equal to MultiDIC's stored parameters, not affected by planted gross errors."""
 
 import numpy as np
 import pytest
@@ -51,9 +51,9 @@ def test_gross_errors_are_left_out_and_nothing_else(truth):
     px = Camera("a", dlt.to_projection(truth), (1, 1)).project(xyz) + rng.normal(0, 0.05, (len(xyz), 2))
     bad = rng.choice(len(xyz), 10, replace=False)
     px[bad] += rng.choice([-1, 1], (10, 2)) * rng.uniform(3, 40, (10, 2))
-    L, kept = dlt.solve_dlt_robust(xyz, px)
-    assert sorted(np.flatnonzero(~kept)) == sorted(bad)
-    assert np.array_equal(L, dlt.solve_dlt(xyz[kept], px[kept]))
+    L, inliers = dlt.solve_dlt_robust(xyz, px)
+    assert sorted(np.flatnonzero(~inliers)) == sorted(bad)
+    assert np.array_equal(L, dlt.solve_dlt(xyz[inliers], px[inliers]))
 
 
 def test_a_plane_or_a_handful_of_points_is_not_a_camera(truth):

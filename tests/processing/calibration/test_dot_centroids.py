@@ -1,4 +1,4 @@
-"""Centroids of dark dots on white: without bias, in linear light, blind to a tilt of the light."""
+"""Centroids of dark dots on white: without bias, in linear light, not affected by a gradient of the light."""
 
 import cv2
 import numpy as np
@@ -41,11 +41,11 @@ def centres() -> np.ndarray:
 
 
 def errors(image: np.ndarray, centres: np.ndarray, **options: bool) -> np.ndarray:
-    found = find_dots(image, TARGET, **options)
-    assert len(found) == len(centres)
-    distance = np.linalg.norm(found.px[:, None] - centres, axis=-1)
+    dots = find_dots(image, TARGET, **options)
+    assert len(dots) == len(centres)
+    distance = np.linalg.norm(dots.px[:, None] - centres, axis=-1)
     assert sorted(distance.argmin(axis=1)) == list(range(len(centres)))
-    return found.px - centres[distance.argmin(axis=1)]
+    return dots.px - centres[distance.argmin(axis=1)]
 
 
 @pytest.mark.parametrize("shape", ["square", "circle"])

@@ -1,4 +1,4 @@
-"""Intrinsics with skew: exact on a perfect world, as uncertain as their standard errors say, robust to bad views."""
+"""Intrinsics with skew: exact on exact data, with errors of the stated size, robust to bad views."""
 
 import json
 
@@ -46,7 +46,7 @@ def test_a_perfect_world_gives_the_lens_back():
     fit = calibrate_intrinsics(see(6, 0.0, 1), BOARD, SIZE)
     assert np.allclose(values(fit.intrinsics), values(LENS), rtol=1e-6, atol=1e-6)
     assert fit.rms < 1e-8
-    assert fit.kept.all()
+    assert fit.inliers.all()
 
 
 def test_standard_errors_tell_the_scatter_of_repeated_calibrations():
@@ -79,15 +79,15 @@ def test_bad_views_are_dropped_and_named_by_their_error():
     rng = np.random.default_rng(5)
     views[3] = views[3] + rng.normal(0, 2.0, views[3].shape)
     fit = calibrate_intrinsics(views, BOARD, SIZE, drop_percentile=100)
-    assert np.flatnonzero(~fit.kept).tolist() == [3]
+    assert np.flatnonzero(~fit.inliers).tolist() == [3]
     assert fit.view_errors[3] == pytest.approx(2 * np.sqrt(2), rel=0.1)
     assert np.delete(fit.view_errors, 3).max() < 0.06
     assert (np.abs(values(fit.intrinsics) - values(LENS)) < 5 * fit.sigma).all()
 
 
 def test_views_above_the_percentile_are_dropped_only_where_enough_are_left():
-    assert calibrate_intrinsics(see(15, 0.05, 6), BOARD, SIZE, drop_percentile=80).kept.sum() == 12
-    assert calibrate_intrinsics(see(5, 0.05, 6), BOARD, SIZE, drop_percentile=80).kept.all()
+    assert calibrate_intrinsics(see(15, 0.05, 6), BOARD, SIZE, drop_percentile=80).inliers.sum() == 12
+    assert calibrate_intrinsics(see(5, 0.05, 6), BOARD, SIZE, drop_percentile=80).inliers.all()
 
 
 def test_too_few_views_are_refused():

@@ -1,11 +1,11 @@
-"""Which terms a lens gets, how much of the image its views cover, and what they leave over in common."""
+"""Choice of the terms of a lens, coverage of the image by the views, and systematic residuals."""
 
 import cv2
 import numpy as np
 import pytest
 from ringdic.calibration.coverage import coverage, residual_distortion
 from ringdic.calibration.intrinsics import IntrinsicsFit, calibrate_intrinsics
-from ringdic.calibration.lens_model import LensModel, independent
+from ringdic.calibration.lens_model import LensModel, independent_observations
 from ringdic.geometry.camera import Intrinsics
 
 SIZE = (1232, 1640)
@@ -57,10 +57,10 @@ def test_the_criterion_takes_the_terms_that_the_lens_has() -> None:
 def test_white_residuals_count_in_full_and_bent_ones_do_not() -> None:
     rng = np.random.default_rng(1)
     white = rng.normal(size=(10, len(BOARD), 2))
-    assert independent(white, BOARD) == pytest.approx(white.size, rel=0.1)
+    assert independent_observations(white, BOARD) == pytest.approx(white.size, rel=0.1)
     waves = np.sin(BOARD[:, :1] / 30) + np.cos(BOARD[:, 1:] / 40)
     smooth = rng.normal(size=(10, 1, 2)) * waves
-    assert independent(smooth, BOARD) < 0.02 * white.size
+    assert independent_observations(smooth, BOARD) < 0.02 * white.size
 
 
 def test_coverage_is_the_share_of_the_image_inside_the_outlines() -> None:

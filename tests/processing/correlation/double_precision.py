@@ -1,10 +1,10 @@
-"""Inverse-compositional Gauss-Newton of one subset, and of many on all cores. Plain numbers and arrays only.
+"""Inverse-compositional Gauss-Newton in plain double precision, to which the vectorised kernels are compared.
 
-Parameters of a subset, 12: u ux uy uxx uxy uyy v vx vy vxx vxy vyy, so that a pixel at (dx, dy) from the centre
-(x, y) lies in the current image at x + dx + u + ux dx + uy dy + ½ uxx dx² + uxy dx dy + ½ uyy dy², likewise in y
-(Lu & Cary 2000). First order keeps the second derivatives as they come in (zero, or a known curvature): its free
-parameters are six. Criterion: zero-mean normalised sum of squared differences; the inverse-compositional scheme is
-Baker & Matthews (2004), its second-order composition Gao et al. (2015).
+Parameters of a subset, 12: u ux uy uxx uxy uyy v vx vy vxx vxy vyy, so that a pixel at (dx, dy) from the centre (x, y)
+lies in the current image at x + dx + u + ux dx + uy dy + ½ uxx dx² + uxy dx dy + ½ uyy dy², likewise in y (Lu & Cary
+2000). First order keeps the second derivatives at their start values (zero, or a known curvature): its free parameters
+are six. Criterion: zero-mean normalised sum of squared differences; the inverse-compositional scheme is Baker &
+Matthews (2004), its second-order composition Gao et al. (2015).
 """
 
 # Everything the kernel calls is in this file: numba's cache follows the file of the compiled function alone.
@@ -90,7 +90,7 @@ def _row(c, i, j, a):  # type: ignore[no-untyped-def]
 
 @nb.njit(inline="always", fastmath=_FAST)
 def _row3(c, i, j, a):  # type: ignore[no-untyped-def]
-    """The same over the four taps of the cubic."""
+    """Σ_k a_k c[i, j + k] over the four taps of the cubic, k = 1 to 4."""
     return (
         a[1] * c[i, j + np.uint64(1)]
         + a[2] * c[i, j + np.uint64(2)]
@@ -101,6 +101,7 @@ def _row3(c, i, j, a):  # type: ignore[no-untyped-def]
 
 @nb.njit(inline="always", fastmath=_FAST)
 def _quintic(c, i, j, wx, wy):  # type: ignore[no-untyped-def]
+    """Quintic spline at the weights wx, wy of the six taps from (i, j) on."""
     return (
         wy[0] * _row(c, i, j, wx)
         + wy[1] * _row(c, i + np.uint64(1), j, wx)
@@ -113,6 +114,7 @@ def _quintic(c, i, j, wx, wy):  # type: ignore[no-untyped-def]
 
 @nb.njit(inline="always", fastmath=_FAST)
 def _cubic(c, i, j, wx, wy):  # type: ignore[no-untyped-def]
+    """Cubic spline at the weights wx, wy of the four taps from (i + 1, j + 1) on."""
     return (
         wy[1] * _row3(c, i + np.uint64(1), j, wx)
         + wy[2] * _row3(c, i + np.uint64(2), j, wx)
@@ -123,7 +125,7 @@ def _cubic(c, i, j, wx, wy):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True)
 def cholesky(H, n):  # type: ignore[no-untyped-def]
-    """H (n, n) to its lower factor in place; False where it is not positive definite."""
+    """Cholesky factor of H (n, n), in place; False where H is not positive definite."""
     for i in range(n):
         for j in range(i + 1):
             total = H[i, j]
@@ -140,7 +142,7 @@ def cholesky(H, n):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True)
 def solve(L, b, n):  # type: ignore[no-untyped-def]
-    """x of L Lᵀ x = b, in place of b."""
+    """Solve L Lᵀ x = b for x (n,), in place of b."""
     for i in range(n):
         for k in range(i):
             b[i] -= L[i, k] * b[k]
@@ -216,9 +218,10 @@ def compose_inverse_affine(p, d):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, fastmath=_FAST)
 def gather_subset(image, gx, gy, coef, mask, x, y, radius, circle, quintic, px):  # type: ignore[no-untyped-def]
-    """The pixels of a subset about (x, y): rows of px (5, N) become dx, dy, f, ∂f/∂x, ∂f/∂y; returns their number.
+    """Collect the pixels of a subset: rows of px (5, N) become dx, dy, f, ∂f/∂x, ∂f/∂y; returns their number.
 
-    (dx, dy) is measured from (x, y); at a fractional centre f and its gradient are interpolated. The mask cuts.
+    image, gx, gy, mask : (h, w); (x, y) : the centre, px, from which dx and dy are measured. At a fractional centre f
+    and its gradient are interpolated from coef (quintic or cubic). radius, circle : of the subset, which the mask cuts.
     """
     jx, iy = math.floor(x + 0.5), math.floor(y + 0.5)
     whole = x == jx and y == iy
@@ -256,9 +259,11 @@ def gather_subset(image, gx, gy, coef, mask, x, y, radius, circle, quintic, px):
 
 @nb.njit(cache=True, nogil=True, fastmath=_FAST)
 def accumulate(px, n, coef, x, y, p, second, quintic, sums):  # type: ignore[no-untyped-def]
-    """One pass over the subset in the current image; False where it leaves the image.
+    """Sum over the n pixels px of a subset in the current image; False where one lies outside the image.
 
-    sums : (16,), Σg, Σg², Σfg, spare, then Σ g ∂f/∂x φ_k (6) and Σ g ∂f/∂y φ_k (6) with φ = 1 dx dy dx²/2 dxdy dy²/2.
+    coef : padded coefficients of the current image; (x, y) : the centre, p (12,) : the warp. second : whether of second
+    order; quintic : degree 5, else 3. sums : (16,), filled: Σg, Σg², Σfg, spare, then Σ g ∂f/∂x φ_k (6) and Σ g ∂f/∂y
+    φ_k (6) with φ = 1 dx dy dx²/2 dxdy dy²/2.
     """
     last_x, last_y = coef.shape[1] - 2 * _PAD - 1, coef.shape[0] - 2 * _PAD - 1
     s_g = s_gg = s_fg = a0 = a1 = a2 = a3 = a4 = a5 = b0 = b1 = b2 = b3 = b4 = b5 = 0.0
@@ -306,7 +311,10 @@ def accumulate(px, n, coef, x, y, p, second, quintic, sums):  # type: ignore[no-
 
 @nb.njit(cache=True, nogil=True, fastmath=_FAST)
 def normal_matrix(px, n, terms, H, sum_J, sum_fJ):  # type: ignore[no-untyped-def]
-    """H = Σ JᵀJ (2 terms, 2 terms), ΣJ and Σ f J of the subset, J = (∂f/∂x φ, ∂f/∂y φ)."""
+    """Normal matrix H = Σ JᵀJ (2 terms, 2 terms), sum_J = ΣJ and sum_fJ = Σ f J, with J = (∂f/∂x φ, ∂f/∂y φ).
+
+    px, n : the pixels of the subset and their number. terms : 3 or 6.
+    """
     phi = np.empty(6)
     H[: 2 * terms, : 2 * terms] = 0.0
     sum_J[:] = 0.0
@@ -406,11 +414,13 @@ def refine(  # type: ignore[no-untyped-def]
     radius, circle, terms, quintic, tolerance, max_iterations, texture, noise,
     status, zncc, iterations, sigma,
 ):  # fmt: skip
-    """IC-GN of many subsets in parallel; each is independent of the others, so of the number of threads too.
+    """Refine many subsets in parallel; each is independent of the others, and so are the results of the number of
+    threads.
 
     image, gx, gy, mask : (h, w) crop of the reference at origin_ref (x, y), coef_ref its coefficients, padded.
     coef : padded coefficients of the crop of the current image at origin_cur.
     xy : (n, 2) px. parameters : (n, 12), start values in and results out. known : (n,) bool, points to refine.
+    radius, circle, terms, quintic, tolerance, max_iterations, texture, noise : as for the kernel ``refine_points``.
     status, zncc, iterations (n,) and sigma (n, 2) are filled where known.
     """
     for k in nb.prange(xy.shape[0]):

@@ -25,9 +25,9 @@ def test_every_run_matches_the_pair_and_counts_its_time(result: dict) -> None:
 
 
 def test_a_result_compared_with_itself_is_as_fast(result: dict, tmp_path) -> None:
-    kept = tmp_path / "before.json"
-    kept.write_text(json.dumps(result))
-    for row in bench.ratios(result, bench.read_result(kept)):
+    earlier = tmp_path / "before.json"
+    earlier.write_text(json.dumps(result))
+    for row in bench.ratios(result, bench.read_result(earlier)):
         assert row["kernel"] == row["refine"] == row["whole"] == 1.0
 
 
@@ -39,7 +39,7 @@ def test_half_the_time_is_twice_as_fast(result: dict) -> None:
     assert all(row["kernel"] == row["whole"] == 2.0 for row in bench.ratios(faster, result))
 
 
-def test_what_is_no_result_is_refused(tmp_path) -> None:
+def test_a_file_without_a_result_is_refused(tmp_path) -> None:
     path = tmp_path / "x.json"
     path.write_text("[1]")
     with pytest.raises(InputError, match="not a result of the benchmark"):

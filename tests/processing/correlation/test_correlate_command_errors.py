@@ -77,6 +77,6 @@ def test_an_image_without_the_surface_cannot_be_computed(images):
         {"tolerance": 0.0}, {"zncc_min": 1.5}, {"noise": -1.0}, {"max_iterations": 0},
     ],
 )  # fmt: skip
-def test_settings_refuse_what_makes_no_sense(wrong):
+def test_settings_out_of_range_are_refused(wrong):
     with pytest.raises(InputError, match=f"correlation: .*{str(next(iter(wrong.values()))).replace('.', '[.]')}"):
         CorrelationSettings(**wrong)

@@ -29,6 +29,7 @@ def pattern(x, y, seed=0, waves=120):
 
 
 def pixels(size=SIZE):
+    """Pixel positions x and y of a square image."""
     return np.meshgrid(np.arange(size, dtype=float), np.arange(size, dtype=float))
 
 
@@ -40,22 +41,26 @@ def pair(displacement, seed=0):
 
 
 def inner(margin=30):
+    """Mask of the image less a margin."""
     mask = np.zeros((SIZE, SIZE), bool)
     mask[margin:-margin, margin:-margin] = True
     return mask
 
 
 def match(reference, current, settings=SETTINGS, mask=None, **options):
+    """Correlation of the grid points inside a mask."""
     xy, _ = grid(inner() if mask is None else mask, settings.step)
     prepared = prepare_reference(reference, mask, settings), prepare_current(current, None, settings)
     return correlate_points(*prepared, xy, settings, **options)
 
 
 def affine(x, y):
+    """Displacement u, v at positions x, y of an affine motion, px."""
     return 2.3 + 0.02 * (x - 110) - 0.03 * (y - 110), -1.7 + 0.04 * (x - 110) + 0.01 * (y - 110)
 
 
 def quadratic(x, y):
+    """Displacement u, v at positions x, y of a quadratic motion, px."""
     a, b = x - 110, y - 110
     return 1.2 + 0.01 * a + 4e-4 * a * a - 2e-4 * a * b, 0.4 - 0.02 * b + 3e-4 * b * b
 
@@ -88,15 +93,15 @@ def test_second_order_follows_a_quadratic_and_first_order_does_not():
     np.testing.assert_allclose(result.curvature, curvature, atol=2e-5)
 
 
-def test_known_curvature_is_held_by_first_order():
+def test_first_order_keeps_the_curvature_of_its_start_values():
     result = match(*pair(quadratic))
     n = len(result.xy)
     start = np.zeros((n, 12))
     start[:, :2], start[:, 2:6] = result.uv, result.gradient.reshape(n, 4)
     start[:, 6:] = [8e-4, -2e-4, 0.0, 0.0, 0.0, 6e-4]
-    held = match(*pair(quadratic), start=start)
-    assert held.good.all()
-    assert np.abs(held.uv - np.stack(quadratic(*held.xy.T), axis=1)).max() < 5e-4
+    corrected = match(*pair(quadratic), start=start)
+    assert corrected.good.all()
+    assert np.abs(corrected.uv - np.stack(quadratic(*corrected.xy.T), axis=1)).max() < 5e-4
 
 
 def test_points_between_pixels_are_matched_as_well():
@@ -204,7 +209,7 @@ def test_few_seeds_reach_every_point():
     assert np.abs(result.uv - np.stack(affine(*xy.T), axis=1)).max() < 1e-3
 
 
-def test_bare_and_departed_points_say_so():
+def test_points_without_texture_or_outside_the_image_have_that_status():
     x, y = pixels()
     reference = np.where(x < 70, 100.0, pattern(x, y))
     current = np.where(x < 70, 100.0, pattern(x, y))

@@ -26,7 +26,7 @@ from ringdic.session.images import read_gray
 
 
 @dataclass(frozen=True)
-class Row:
+class ErrorRow:
     """One row of the error table, px; pairs are (x, y)."""
 
     name: str
@@ -55,7 +55,7 @@ class Row:
         assert np.all(self.rms <= tolerance + 1.3 * self.predicted)
 
 
-def match(reference, current, settings, mask=None):
+def correlation_of_grid(reference, current, settings, mask=None):
     """All grid points of a region (default: the image less the subset radius) matched with automatic start values."""
     if mask is None:
         mask = np.zeros(reference.shape, bool)
@@ -66,8 +66,8 @@ def match(reference, current, settings, mask=None):
     )
 
 
-def row(name: str, settings: CorrelationSettings, result: Correlation, truth, shape, where=None) -> Row:
-    """The row of one image; a point counts as lost if its true subset lies inside the current image."""
+def error_row(name: str, settings: CorrelationSettings, result: Correlation, truth, shape, where=None) -> ErrorRow:
+    """The row of one image; a point without a match counts as lost if its true subset lies inside the current image."""
     known = np.isfinite(truth).all(axis=1)
     if where is not None:
         known &= where
@@ -76,7 +76,7 @@ def row(name: str, settings: CorrelationSettings, result: Correlation, truth, sh
     inside = known & (to >= edge).all(axis=1) & (to < np.array(shape[::-1]) - 1 - edge).all(axis=1)
     used = result.good & known
     error = result.uv[used] - truth[used]
-    return Row(
+    return ErrorRow(
         name,
         settings,
         int(used.sum()),
@@ -94,10 +94,12 @@ def challenge(shared_data: Path) -> Path:
 
 
 def read_truth(folder: Path):
+    """The imposed displacements and tolerances of a set."""
     return json.loads((folder / "truth.json").read_text())
 
 
 def profile(folder: Path):
+    """Table of the imposed displacement along a line."""
     return np.genfromtxt(folder / "truth_profile.csv", delimiter=",", names=True)
 
 
@@ -106,12 +108,12 @@ def test_whole_pixel_shifts_are_exact(challenge):
     settings = CorrelationSettings(radius=15, step=16, tolerance=1e-8)
     reference = read_gray(folder / "reference.png")
     for frame in read_truth(folder)["frames"]:
-        result = match(reference, read_gray(folder / frame["image"]), settings)
+        result = correlation_of_grid(reference, read_gray(folder / frame["image"]), settings)
         truth = np.tile([frame["u"], frame["v"]], (len(result.xy), 1))
-        found = row(f"whole shift {frame['u']:.0f}", settings, result, truth, reference.shape)
-        print(found)
-        assert found.lost == 0
-        assert found.largest <= 1e-6
+        errors = error_row(f"whole shift {frame['u']:.0f}", settings, result, truth, reference.shape)
+        print(errors)
+        assert errors.lost == 0
+        assert errors.largest <= 1e-6
 
 
 def test_translation_with_change_of_contrast(challenge):
@@ -119,10 +121,10 @@ def test_translation_with_change_of_contrast(challenge):
     settings = CorrelationSettings(radius=15, step=10)
     reference, truth_file = read_gray(folder / "reference.png"), read_truth(folder)
     for frame in truth_file["frames"]:
-        result = match(reference, read_gray(folder / frame["image"]), settings)
+        result = correlation_of_grid(reference, read_gray(folder / frame["image"]), settings)
         truth = np.tile([frame["u"], frame["v"]], (len(result.xy), 1))
-        found = row(f"sample 5 {frame['image']}", settings, result, truth, reference.shape)
-        found.check(truth_file["truth_tolerance_px"])
+        errors = error_row(f"sample 5 {frame['image']}", settings, result, truth, reference.shape)
+        errors.check(truth_file["truth_tolerance_px"])
 
 
 def test_chirp(challenge):
@@ -131,10 +133,10 @@ def test_chirp(challenge):
     reference, columns = read_gray(folder / "reference.png"), profile(folder)
     for frame in read_truth(folder)["frames"]:
         level = frame["image"][4:6]
-        result = match(reference, read_gray(folder / frame["image"]), settings)
+        result = correlation_of_grid(reference, read_gray(folder / frame["image"]), settings)
         u = np.interp(result.xy[:, 0], columns["x_px"], columns[f"u_{level}_px"])
-        found = row(f"sample 14 {level}", settings, result, np.stack([u, 0 * u], axis=1), reference.shape)
-        found.check(frame["truth_tolerance_px"])
+        errors = error_row(f"sample 14 {level}", settings, result, np.stack([u, 0 * u], axis=1), reference.shape)
+        errors.check(frame["truth_tolerance_px"])
 
 
 def test_shear_bands(challenge):
@@ -143,10 +145,10 @@ def test_shear_bands(challenge):
     reference, columns = read_gray(folder / "reference.png"), profile(folder)
     for frame in read_truth(folder)["frames"]:
         band = frame["image"][4:-4]
-        result = match(reference, read_gray(folder / frame["image"]), settings)
+        result = correlation_of_grid(reference, read_gray(folder / frame["image"]), settings)
         v = np.interp(result.xy[:, 1], columns["y_px"], columns[f"v_of_reference_y_{band}_px"])
-        found = row(f"sample 15 {band}", settings, result, np.stack([0 * v, v], axis=1), reference.shape)
-        found.check(read_truth(folder)["truth_tolerance_px"])
+        errors = error_row(f"sample 15 {band}", settings, result, np.stack([0 * v, v], axis=1), reference.shape)
+        errors.check(read_truth(folder)["truth_tolerance_px"])
 
 
 @pytest.mark.parametrize(("radius", "order", "least_period"), [(8, 1, 80.0), (8, 2, 40.0), (12, 2, 60.0)])
@@ -154,14 +156,14 @@ def test_star_over_the_periods_a_subset_resolves(challenge, radius, order, least
     folder = challenge / "2d_star_wave_2000"
     settings = CorrelationSettings(radius=radius, step=9, order=order)
     reference = read_gray(folder / "reference.png")
-    result = match(reference, read_gray(folder / "deformed.png"), settings)
+    result = correlation_of_grid(reference, read_gray(folder / "deformed.png"), settings)
     x, y = result.xy.T
     period = 10.0 + 0.07 * x
     v = 0.5 * np.cos(2 * np.pi * (y - 250.0) / period)
     truth = np.stack([0 * v, v], axis=1)
     where = period >= least_period
-    found = row(f"star, period >= {least_period:.0f} px", settings, result, truth, reference.shape, where)
-    found.check(read_truth(folder)["truth_tolerance_px"])
+    errors = error_row(f"star, period >= {least_period:.0f} px", settings, result, truth, reference.shape, where)
+    errors.check(read_truth(folder)["truth_tolerance_px"])
 
 
 def test_static_object_drifts_as_another_code_sees_it(challenge):
@@ -190,7 +192,7 @@ def test_lens_distortion_is_the_displacement_between_the_views(challenge, side):
     # The speckled plate: where the local contrast is the speckle's, less a subset at its rim.
     plate = cv2.blur(cv2.absdiff(reference, cv2.medianBlur(reference, 31)), (31, 31)) > 5
     plate = cv2.erode(plate.astype(np.uint8), np.ones((45, 45))) > 0
-    result = match(reference, read_gray(folder / f"{side}_dist.png"), settings, plate)
+    result = correlation_of_grid(reference, read_gray(folder / f"{side}_dist.png"), settings, plate)
     camera = json.loads((folder / "calibration.json").read_text())["cam0"]
     x = (result.xy[:, 0] - camera["cx"]) / camera["fx"]
     y = (result.xy[:, 1] - camera["cy"]) / camera["fy"]
@@ -199,7 +201,7 @@ def test_lens_distortion_is_the_displacement_between_the_views(challenge, side):
     radial = r2 * (k1 + r2 * (k2 + r2 * k3))
     truth = np.stack([x * radial * camera["fx"], y * radial * camera["fy"]], axis=1)
     assert not (result.status == Status.NO_TEXTURE).any()
-    row(f"lens distortion {side}", settings, result, truth, reference.shape).check(0.02)
+    error_row(f"lens distortion {side}", settings, result, truth, reference.shape).check(0.02)
 
 
 def test_rendered_plate_in_its_own_camera(challenge):
@@ -210,6 +212,6 @@ def test_rendered_plate_in_its_own_camera(challenge):
     plate[60:-60, 60:-60] = True
     for frame in read_truth(folder)["frames"]:
         image, moved = frame["images"][0], frame["cam0_pixel_displacement"]
-        result = match(reference, read_gray(folder / image), settings, plate)
+        result = correlation_of_grid(reference, read_gray(folder / image), settings, plate)
         truth = np.tile([moved["u"], moved["v"]], (len(result.xy), 1))
-        row(f"plate {image}", settings, result, truth, reference.shape).check(1e-4)
+        error_row(f"plate {image}", settings, result, truth, reference.shape).check(1e-4)

@@ -1,4 +1,4 @@
-"""Grey levels of a vector of pixels are those of the spline, whatever the slopes; lanes compute as arrays do."""
+"""Interpolated grey levels of vectors of pixels are those of the spline for any slope; lanes compute as arrays do."""
 
 import numba as nb
 import numpy as np
@@ -11,14 +11,14 @@ from ringdic.correlation.lanes import (
     WINDOW,
     absolute,
     bit_count,
+    blend,
     floor,
-    gather,
     lane_sum,
     load,
+    lookup,
     mask_from_bits,
     nonzero_bits,
     pointer,
-    select,
     store,
 )
 from ringdic.correlation.spline import PAD, coefficients
@@ -45,7 +45,10 @@ _SAMPLERS = {degree: _make_sampler(degree) for degree in _SPLINES}
 
 
 def levels(image, degree, x, y, slopes, bends):
-    """Grey levels of the pixels of a vector from (x, y) on, and the case they are."""
+    """Grey levels (LANES,) of the pixels of a vector from (x, y) on, and the case of the interpolation.
+
+    image : (h, w). degree : 3 or 5. slopes, bends : of the position along the lanes, in x and in y.
+    """
     coef = coefficients(image.astype(np.float32), degree)
     p = np.zeros(12)
     p[[1, 7]], p[[3, 9]] = slopes, 2.0 * np.array(bends)
@@ -71,11 +74,11 @@ def test_levels_are_those_of_the_spline_for_any_slope(degree):
         for _ in range(40):
             x, y = rng.uniform([30.0, 30.0], [60.0, 60.0])
             slopes, bends = rng.uniform(-size, size, 2), rng.uniform(-0.002, 0.002, 2)
-            found, case = levels(image, degree, x, y, slopes, bends)
+            grey, case = levels(image, degree, x, y, slopes, bends)
             at = [y + slopes[1] * lane + bends[1] * lane**2, x + lane + slopes[0] * lane + bends[0] * lane**2]
             truth = ndimage.map_coordinates(spline, at, order=degree, mode="mirror", prefilter=False)
             # Positions are rounded to 2e-6 px, and a grey level changes by at most about 400 a pixel.
-            np.testing.assert_allclose(found, truth, atol=2e-3)
+            np.testing.assert_allclose(grey, truth, atol=2e-3)
             cases.add(min(case, WIDE))
     assert cases == {0, 1, 2, 3, WIDE, SCATTERED}
 
@@ -84,14 +87,14 @@ def test_levels_are_those_of_the_spline_for_any_slope(degree):
 def _arithmetic(a, b, bits, out):
     x, y, at = load(pointer(a), _U(0)), load(pointer(b), _U(0)), pointer(out)
     store(at, _U(0), 2.0 * x - y * x + 1.0)
-    store(at, _U(LANES), select(x >= y, floor(x), absolute(y)))
-    store(at, _U(2 * LANES), select(mask_from_bits(bits), x, 0.0))
+    store(at, _U(LANES), blend(x >= y, floor(x), absolute(y)))
+    store(at, _U(2 * LANES), blend(mask_from_bits(bits), x, 0.0))
     return lane_sum(x)
 
 
 @nb.njit
 def _pick(a, which, out):
-    store(pointer(out), _U(0), gather(pointer(a), _U(3), load(pointer(which), _U(0))))
+    store(pointer(out), _U(0), lookup(pointer(a), _U(3), load(pointer(which), _U(0))))
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
@@ -115,7 +118,7 @@ def _marks(mask):
     return nonzero_bits(pointer(mask), _U(1))
 
 
-def test_marked_bytes_become_bits():
+def test_bytes_that_are_not_zero_become_bits():
     mask = np.array([7, 1, 0, 255, *[0] * (LANES - 4), 3, 9], np.uint8)
     assert _marks(mask) == 0b101 | 1 << (LANES - 1)
 

@@ -1,4 +1,4 @@
-"""Local quadratics: exact on quadratics, and as uncertain as they say."""
+"""Local quadratics are exact on quadratic fields, and their scatter is the stated uncertainty."""
 
 import numpy as np
 import pytest
@@ -8,19 +8,21 @@ GRADIENT = np.array([[0.3, -0.2], [0.05, 0.4]])
 CURVATURE = np.array([[4e-3, -1e-3, 2e-3], [-3e-3, 5e-4, 1e-3]])
 
 
-def scattered(n=400, size=200.0, seed=3):
+def random_points(n=400, size=200.0, seed=3):
+    """Points (n, 2) px, random in a square."""
     return np.random.default_rng(seed).uniform(0, size, (n, 2))
 
 
-def quadratic(xy):
+def quadratic_values(xy):
+    """A quadratic field of two components at points (n, 2). (n, 2)."""
     x, y = xy[:, 0, None], xy[:, 1, None]
     p, q, r = CURVATURE.T
     return 1.5 + xy @ GRADIENT.T + 0.5 * p * x**2 + q * x * y + 0.5 * r * y**2
 
 
 def test_a_quadratic_field_is_its_own_fit_at_every_point_and_at_lost_ones():
-    xy = scattered()
-    values = quadratic(xy)
+    xy = random_points()
+    values = quadratic_values(xy)
     measured = values.copy()
     measured[::7] = np.nan
     fit = Neighbourhoods(xy, 40.0).fit(measured)
@@ -37,55 +39,55 @@ def test_a_quadratic_field_is_its_own_fit_at_every_point_and_at_lost_ones():
     assert np.isnan(fit.leave_one_out[::7]).all()
 
 
-def test_the_scatter_of_second_derivatives_is_the_stated_one():
+def test_second_derivatives_scatter_by_their_stated_uncertainty():
     x, y = np.meshgrid(np.arange(0.0, 300.0, 10.0), np.arange(0.0, 300.0, 10.0))
     xy = np.stack([x.ravel(), y.ravel()], axis=1)
     around = Neighbourhoods(xy, 35.0)
     rng = np.random.default_rng(0)
     sigma = 0.01
-    found, stated = [], None
+    curvatures, stated = [], None
     for _ in range(40):
         fit = around.fit(rng.normal(0.0, sigma, (len(xy), 2)), np.full(len(xy), sigma))
-        found.append(fit.curvature[:, 0])
+        curvatures.append(fit.curvature[:, 0])
         stated = fit.curvature_sigma
-    ratio = np.std(found, axis=0) / stated
+    ratio = np.std(curvatures, axis=0) / stated
     assert np.sqrt((ratio**2).mean(axis=0)) == pytest.approx(1.0, abs=0.02)  # 36,000 samples
 
 
-def test_a_point_that_is_off_shows_by_as_much_against_the_others():
-    xy = scattered()
-    values = quadratic(xy)
+def test_the_leave_one_out_residual_of_an_outlier_is_its_error():
+    xy = random_points()
+    values = quadratic_values(xy)
     values[50] += (0.4, -0.3)
     fit = Neighbourhoods(xy, 40.0).fit(values)
     np.testing.assert_allclose(fit.leave_one_out[50], (0.4, -0.3), atol=1e-6)
 
 
-def test_points_on_one_line_claim_no_certainty_across_it():
+def test_points_on_a_line_have_a_large_uncertainty_across_it():
     xy = np.stack([np.arange(0.0, 60.0), np.zeros(60)], axis=1)
     fit = Neighbourhoods(xy, 20.0).fit(xy * 0.1, np.full(60, 0.01))
     assert (fit.curvature_sigma[:, 2] > 1e3 * fit.curvature_sigma[:, 0]).all()
 
 
-def test_too_few_neighbours_give_nothing():
-    xy = scattered(8)
-    assert np.isnan(Neighbourhoods(xy, 300.0).fit(quadratic(xy)).value).all()
+def test_too_few_neighbours_give_nan():
+    xy = random_points(8)
+    assert np.isnan(Neighbourhoods(xy, 300.0).fit(quadratic_values(xy)).value).all()
 
 
 def test_the_lower_quartile_about_a_point_is_that_of_the_known_points_within_reach():
-    xy, centres = scattered(300), scattered(60, seed=4)
+    xy, centres = random_points(300), random_points(60, seed=4)
     values = np.random.default_rng(1).normal(size=300)
     values[::5] = np.nan
-    found = LowerQuartiles(centres, xy, 40.0)(values)
-    for centre, quartile in zip(centres, found, strict=True):
+    quartiles = LowerQuartiles(centres, xy, 40.0)(values)
+    for centre, quartile in zip(centres, quartiles, strict=True):
         about = np.sort(values[(np.hypot(*(xy - centre).T) <= 40.0) & np.isfinite(values)])
         assert len(about) > 2
         assert quartile == about[len(about) // 4]
     assert np.isnan(LowerQuartiles(centres + 1e4, xy, 25.0)(values)).all()
 
 
-def test_a_fit_carried_to_other_places_is_the_field_there():
-    xy = scattered()
-    fit = Neighbourhoods(xy, 40.0).fit(quadratic(xy))
+def test_a_quadratic_field_is_extrapolated_exactly():
+    xy = random_points()
+    fit = Neighbourhoods(xy, 40.0).fit(quadratic_values(xy))
     inner = np.flatnonzero(((xy > 30) & (xy < 170)).all(axis=1))
     away = np.random.default_rng(2).uniform(-12, 12, (len(inner), 2))
-    np.testing.assert_allclose(fit.extrapolate(inner, away), quadratic(xy[inner] + away), atol=1e-5)
+    np.testing.assert_allclose(fit.extrapolate(inner, away), quadratic_values(xy[inner] + away), atol=1e-5)

@@ -17,6 +17,7 @@ BORDER = 10.0  # mm of the speckled band left out at either end
 
 
 def project(camera, xyz):
+    """Pixels (..., 2) of world points (..., 3) in a camera with its lens."""
     K = np.array([[camera["fx"], camera["skew"], camera["cx"]], [0, camera["fy"], camera["cy"]], [0, 0, 1]])
     lens = Intrinsics(K, np.array(camera["dist_k1k2p1p2k3"]), (camera["width"], camera["height"]))
     x = xyz @ np.array(camera["R"]).T + np.array(camera["t"])
@@ -26,6 +27,7 @@ def project(camera, xyz):
 
 @pytest.fixture(scope="module")
 def ring(shared_data: Path) -> Path:
+    """Folder of the rendered ring."""
     return shared_data / "rendered_ring"
 
 

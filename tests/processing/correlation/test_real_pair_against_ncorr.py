@@ -52,8 +52,8 @@ def test_all_points_are_matched_and_agree_with_ncorr(rig, ncorr, reference, came
     result = correlate_points(reference, current, xy, SETTINGS)
     error = np.hypot(*(xy + result.uv - truth).T)
     p50, p95 = np.percentile(error, [50, 95])
-    found = f"{camera}_{frame}: {result.good.sum()} of {len(xy)}"
-    print(f"{found}, median {p50:.5f}, 95 % {p95:.5f}, largest {error.max():.5f} px")
+    summary = f"{camera}_{frame}: {result.good.sum()} of {len(xy)}"
+    print(f"{summary}, median {p50:.5f}, 95 % {p95:.5f}, largest {error.max():.5f} px")
     assert result.good.all()
     assert error.max() < 1.0
     assert p50 <= 0.005

@@ -1,4 +1,4 @@
-"""The fast kernel against plain arithmetic in double precision, and against the bound that noise sets."""
+"""The vectorised kernels against plain arithmetic in double precision, and against the bound that image noise sets."""
 
 import importlib.util
 import sys
@@ -23,6 +23,7 @@ COLUMNS = [0, 6, 1, 2, 7, 8]
 
 @pytest.fixture(scope="module")
 def speckle():
+    """Speckle about 4 px wide, 120 ± 45 grey levels. (SIZE, SIZE)."""
     noise = cv2.GaussianBlur(np.random.default_rng(3).normal(size=(SIZE, SIZE)), (0, 0), 1.6)
     return 120.0 + 45.0 * noise / noise.std()
 
@@ -42,6 +43,7 @@ def warped(image, gradient, shift, curvature=0.0):
 
 
 def in_double_precision(reference, current, mask, xy, start, settings):
+    """Status, ZNCC, parameters and sigma of the same points, matched in plain double precision."""
     degree = settings.degree
     trim = PAD - 3
     cut = np.s_[trim:-trim, trim:-trim]
@@ -58,24 +60,27 @@ def in_double_precision(reference, current, mask, xy, start, settings):
 
 
 def in_the_middle(settings):
-    """Points of a grid whose subsets lie in the image."""
+    """Grid points (n, 2) px, by the step of the settings, whose subsets lie well inside the image."""
     mask = np.zeros((SIZE, SIZE), bool)
     mask[40:160, 40:160] = True
     return grid(mask, settings.step)[0]
 
 
-def left_by_the_tolerance(speckle, settings, xy, start):
-    """How far points of a gentle pair lie from where they go in the end (n, 2) px, and their mean iterations."""
+def residual_of_the_tolerance(speckle, settings, xy, start):
+    """Distance (n, 2) px of points from where they converge to, at the tolerance of the settings, and mean iterations.
+
+    speckle : reference image, matched to a gently deformed one. xy : (n, 2) px. start : (n, 12).
+    """
     reference, current = np.rint(speckle), warped(speckle, GENTLE, (3.3, -1.7))
-    found, iterations = [], []
+    positions, iterations = [], []
     for tolerance in (settings.tolerance, 1e-6):
         finer = replace(settings, tolerance=tolerance)
         prepared = prepare_reference(reference, None, finer), prepare_current(current, None, finer)
-        status, _, made, _, parameters = refine(*prepared, xy, start, finer)
+        status, _, count, _, parameters = refine(*prepared, xy, start, finer)
         assert (status == 0).all()
-        found.append(parameters[:, [0, 6]])
-        iterations.append(made.mean())
-    return found[0] - found[1], iterations[0]
+        positions.append(parameters[:, [0, 6]])
+        iterations.append(count.mean())
+    return positions[0] - positions[1], iterations[0]
 
 
 GENTLE = np.array([[0.012, -0.02], [0.015, 0.008]])
@@ -102,12 +107,12 @@ def test_single_precision_gives_the_matches_of_double(speckle, gradient, interpo
     whole = np.ones((SIZE, SIZE), bool)
     whole[90:110, 70:95] = False
     prepared = prepare_reference(reference, whole, settings), prepare_current(current, None, settings)
-    status, zncc, _, sigma, found = refine(*prepared, xy, start, settings)
+    status, zncc, _, sigma, positions = refine(*prepared, xy, start, settings)
     truth = in_double_precision(reference, current, whole, xy, start, settings)
     good = truth[0] == 0
     assert good.mean() > 0.9
     np.testing.assert_array_equal(status == 0, good)
-    difference = np.abs(found - truth[2])[good]
+    difference = np.abs(positions - truth[2])[good]
     print(f"{interpolation}, order {order}, {subset}: {difference[:, [0, 6]].max():.1e} px")
     assert difference[:, [0, 6]].max() < 1e-5
     assert difference[:, [1, 2, 7, 8]].max() < 1e-6
@@ -116,8 +121,10 @@ def test_single_precision_gives_the_matches_of_double(speckle, gradient, interpo
 
 
 @pytest.mark.parametrize("order", [1, 2])
-def test_images_that_are_stretched_along_their_rows_are_matched_along_their_columns(speckle, order):
-    """As the same images turned about their diagonal are along their rows, to the last digit."""
+def test_steep_images_are_matched_as_their_transposes_are(speckle, order):
+    """Images stretched along their rows give, to the last digit, the matches of the transposed images along their
+    columns.
+    """
     settings = CorrelationSettings(14, 11, order)
     reference, current = np.rint(speckle), warped(speckle, STEEP_ALONG_ROWS, (3.3, -1.7), 2e-4)
     mask = np.zeros((SIZE, SIZE), bool)
@@ -140,32 +147,32 @@ def test_images_that_are_stretched_along_their_rows_are_matched_along_their_colu
 
 
 @pytest.mark.parametrize("order", [1, 2])
-def test_the_default_tolerance_leaves_a_tenth_of_itself(speckle, order, figures):
-    """The end of an iteration is foretold from its last two steps; start values are 0.3 px off."""
+def test_the_default_tolerance_leaves_an_error_of_a_tenth_of_itself(speckle, order, figures):
+    """Convergence is predicted from the last two steps; start values are 0.3 px off."""
     settings = CorrelationSettings(14, 9, order)
     xy = in_the_middle(settings)
     start = np.zeros((len(xy), 12))
     start[:, [0, 6]] = (xy - (SIZE - 1) / 2) @ GENTLE.T + [3.5, -1.5]
-    left, _ = left_by_the_tolerance(speckle, settings, xy, start)
-    figures(f"left by the default tolerance, order {order}: 1e-3 px", f"{1e3 * left.std():.3f}", "0.1")
-    assert np.abs(left).max() < settings.tolerance
-    assert np.sqrt(np.mean(left**2)) < 0.1 * settings.tolerance
+    residual, _ = residual_of_the_tolerance(speckle, settings, xy, start)
+    figures(f"left by the default tolerance, order {order}: 1e-3 px", f"{1e3 * residual.std():.3f}", "0.1")
+    assert np.abs(residual).max() < settings.tolerance
+    assert np.sqrt(np.mean(residual**2)) < 0.1 * settings.tolerance
 
 
 @pytest.mark.parametrize("order", [1, 2])
-def test_points_that_begin_near_their_match_save_an_iteration(speckle, order, figures):
-    """The end is then foretold from how the steps of other points shrank; by two steps of their own it takes two."""
+def test_points_that_start_near_their_match_need_one_iteration_less(speckle, order, figures):
+    """Convergence is then predicted from how the steps of other points shrink; their own steps alone would need two."""
     settings = CorrelationSettings(20, 4, order)
     xy = in_the_middle(settings)
     start = np.zeros((len(xy), 12))
     start[:, [0, 6]] = (xy - (SIZE - 1) / 2) @ GENTLE.T + [3.3, -1.7]
     start[:, [1, 2, 7, 8]] = GENTLE.ravel()
     start[:, [0, 6]] += np.random.default_rng(0).normal(0.0, 0.01, (len(xy), 2))
-    left, iterations = left_by_the_tolerance(speckle, settings, xy, start)
-    figures(f"left after {iterations:.2f} iterations, order {order}: 1e-3 px", f"{1e3 * left.std():.3f}", "0.1")
+    residual, iterations = residual_of_the_tolerance(speckle, settings, xy, start)
+    figures(f"left after {iterations:.2f} iterations, order {order}: 1e-3 px", f"{1e3 * residual.std():.3f}", "0.1")
     assert iterations < (1.3 if order == 1 else 1.8)
-    assert np.abs(left).max() < settings.tolerance
-    assert np.sqrt(np.mean(left**2)) < 0.1 * settings.tolerance
+    assert np.abs(residual).max() < settings.tolerance
+    assert np.sqrt(np.mean(residual**2)) < 0.1 * settings.tolerance
 
 
 @pytest.mark.parametrize(("order", "off"), [(1, 0.0), (2, 0.0), (1, 0.25)])
@@ -176,17 +183,17 @@ def test_a_reference_used_again_gives_the_same_matches_to_the_last_digit(speckle
     mask[60:75, 60:75] = False
     xy = grid(mask, settings.step)[0] + off
     images = [warped(speckle, GENTLE, shift) for shift in ((3.3, -1.7), (-2.2, 0.4))]
-    used = prepare_reference(np.rint(speckle), mask, settings)
+    shared = prepare_reference(np.rint(speckle), mask, settings)
     for image in images:
         current = prepare_current(image, None, settings)
-        again = correlate_points(used, current, xy, settings)
-        once = correlate_points(prepare_reference(np.rint(speckle), mask, settings), current, xy, settings)
+        again = correlate_points(shared, current, xy, settings)
+        fresh = correlate_points(prepare_reference(np.rint(speckle), mask, settings), current, xy, settings)
         assert again.good.mean() > 0.95
         for name in ("uv", "gradient", "curvature", "zncc", "sigma", "status", "iterations"):
-            np.testing.assert_array_equal(getattr(again, name), getattr(once, name))
+            np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
 
 
-def test_points_that_resemble_nothing_are_soon_given_up(speckle):
+def test_points_without_a_match_are_given_up_after_few_iterations(speckle):
     other = np.random.default_rng(9).normal(size=(SIZE, SIZE))
     other = np.rint(120.0 + 450.0 * cv2.GaussianBlur(other, (0, 0), 1.6))
     settings = CorrelationSettings(14, 5, 1)

@@ -1,4 +1,4 @@
-"""Start values between matches of a lattice."""
+"""Start values interpolated between the matches of a lattice."""
 
 import numpy as np
 from ringdic.correlation import Correlation, CorrelationSettings
@@ -7,7 +7,7 @@ from ringdic.correlation.start_field import interpolate_start_values, lattice_sp
 SPACING = 40
 
 
-def quadratic(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def quadratic_field(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Displacement (n, 2), gradient (n, 2, 2) and second derivatives (n, 2, 3) of a quadratic field."""
     x, y = xy.T
     a = np.array([[3.0, 0.02, -0.05, 4e-5, -3e-5, 2e-5], [-7.0, 0.04, 0.01, -1e-5, 5e-5, 6e-5]])
@@ -17,22 +17,24 @@ def quadratic(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return uv, slope, bend
 
 
-def matched(xy: np.ndarray, lost: np.ndarray) -> Correlation:
-    uv, slope, bend = quadratic(xy)
+def correlation_of(xy: np.ndarray, lost: np.ndarray) -> Correlation:
+    """Correlation of points (n, 2) that moved by the quadratic field; lost : (n,), 1 for points without a match."""
+    uv, slope, bend = quadratic_field(xy)
     n = len(xy)
     return Correlation(xy, uv, slope, bend, np.ones(n), np.zeros(n), np.ones(n, int), 2 * lost, np.zeros((n, 2)), {})
 
 
 def grid(step: int) -> np.ndarray:
+    """Points (n, 2) px of a grid."""
     return np.stack(np.meshgrid(np.arange(120, 480, step), np.arange(200, 680, step)), -1).reshape(-1, 2).astype(float)
 
 
-def test_a_quadratic_field_is_met_exactly_between_its_corners() -> None:
+def test_a_quadratic_field_is_interpolated_exactly() -> None:
     xy, coarse = grid(10), grid(SPACING)
     coarse = coarse[on_lattice(coarse, SPACING)]
     for order in (1, 2):
-        start = interpolate_start_values(matched(coarse, np.zeros(len(coarse), int)), xy, SPACING, order)
-        uv, slope, bend = quadratic(xy)
+        start = interpolate_start_values(correlation_of(coarse, np.zeros(len(coarse), int)), xy, SPACING, order)
+        uv, slope, bend = quadratic_field(xy)
         known = np.isfinite(start).all(axis=1)
         inside = (xy <= coarse.max(axis=0)).all(axis=1)
         np.testing.assert_array_equal(known, inside)
@@ -42,11 +44,11 @@ def test_a_quadratic_field_is_met_exactly_between_its_corners() -> None:
             np.testing.assert_allclose(start[known, 6:], bend.reshape(-1, 6)[known], atol=1e-15)
 
 
-def test_where_a_corner_is_lost_nothing_is_said() -> None:
+def test_around_a_lost_lattice_point_there_is_no_start_value() -> None:
     xy, coarse = grid(10), grid(SPACING)
     lost = (coarse == (240, 320)).all(axis=1).astype(int)
     assert lost.sum() == 1
-    start = interpolate_start_values(matched(coarse, lost), xy, SPACING, 1)
+    start = interpolate_start_values(correlation_of(coarse, lost), xy, SPACING, 1)
     beside = (np.abs(xy - (240, 320)) < SPACING).all(axis=1)
     assert np.isnan(start[beside]).all()
     inside = (xy <= coarse.max(axis=0)).all(axis=1)

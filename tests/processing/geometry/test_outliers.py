@@ -1,4 +1,4 @@
-"""Wrong points are found among noisy good ones; good ones stay."""
+"""Outlier tests find planted wrong points among noisy good ones, and no others."""
 
 import numpy as np
 from ringdic.geometry.outliers import crossing_outliers, grid_neighbours, midpoint_residuals, surface_outliers
@@ -28,8 +28,8 @@ def test_planted_outliers_are_found_and_no_good_point_is_lost() -> None:
     apart = np.flatnonzero((xy % (4 * STEP) == 20).all(axis=1))
     planted = rng.choice(apart, 20, replace=False)
     xyz[planted] += rng.choice([-1.0, 1.0], (20, 3)) * rng.uniform(0.5, 2.0, (20, 3))
-    found = np.flatnonzero(surface_outliers(grid_neighbours(xy, STEP), xyz))
-    np.testing.assert_array_equal(found, np.sort(planted))
+    outliers = np.flatnonzero(surface_outliers(grid_neighbours(xy, STEP), xyz))
+    np.testing.assert_array_equal(outliers, np.sort(planted))
 
 
 def test_a_jump_of_one_camera_as_a_whole_is_no_outlier() -> None:
@@ -38,9 +38,9 @@ def test_a_jump_of_one_camera_as_a_whole_is_no_outlier() -> None:
     residuals[0] += [0.0, 0.35]
     residuals[1] -= [0.0, 0.35]
     residuals[:, 17] += [[0, 2.0], [0, -2.0]]
-    found = crossing_outliers(residuals)
-    assert found[17]
-    assert found.sum() == 1
+    outliers = crossing_outliers(residuals)
+    assert outliers[17]
+    assert outliers.sum() == 1
 
 
 def test_lost_points_are_no_outliers() -> None:

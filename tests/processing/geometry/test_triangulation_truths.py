@@ -1,4 +1,4 @@
-"""Triangulation of points whose place is known."""
+"""Linear triangulation of points with known positions."""
 
 import numpy as np
 import pytest
@@ -40,9 +40,9 @@ def test_a_camera_that_did_not_match_takes_no_part_and_one_alone_is_not_enough()
     px = np.stack([camera.project(xyz) for camera in cameras])
     px[2, :20] = np.nan  # two cameras are left
     px[1, :10, 0] = np.nan  # one camera is left
-    found = triangulate(cameras, px)
-    assert np.isnan(found[:10]).all()
-    np.testing.assert_allclose(found[10:], xyz[10:], rtol=0, atol=1e-8)
+    result = triangulate(cameras, px)
+    assert np.isnan(result[:10]).all()
+    np.testing.assert_allclose(result[10:], xyz[10:], rtol=0, atol=1e-8)
 
 
 def test_parallel_lines_of_sight_are_lost_points() -> None:

@@ -1,4 +1,4 @@
-"""Triangulation by weight, of points whose place is known."""
+"""Weighted triangulation of points with known positions: exact, of least χ², with errors of the stated size."""
 
 import numpy as np
 import pytest
@@ -35,25 +35,25 @@ def seen(cameras: list[Camera], xyz: np.ndarray) -> np.ndarray:
 def test_exact_pixels_give_the_exact_points_whatever_their_weights(count: int, lens: bool) -> None:
     cameras, xyz = ring(count, lens), cloud()
     px = seen(cameras, xyz)
-    found = triangulate_weighted(cameras, px, np.random.default_rng(0).uniform(0.005, 0.5, px.shape))
-    np.testing.assert_allclose(found.xyz, xyz, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(found.chi2, 0.0, atol=1e-12)
-    np.testing.assert_array_equal(found.degrees, 2 * count - 3)
+    result = triangulate_weighted(cameras, px, np.random.default_rng(0).uniform(0.005, 0.5, px.shape))
+    np.testing.assert_allclose(result.xyz, xyz, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(result.chi2, 0.0, atol=1e-12)
+    np.testing.assert_array_equal(result.degrees, 2 * count - 3)
 
 
 def test_equal_weights_and_small_noise_agree_with_the_minimum_of_the_squares() -> None:
     cameras, xyz, h = ring(4), cloud(), 1e-4
     px = seen(cameras, xyz) + np.random.default_rng(1).normal(0.0, 0.5, (4, len(xyz), 2))
     sigma = np.random.default_rng(2).uniform(0.1, 1.0, px.shape)
-    found = triangulate_weighted(cameras, px, sigma)
+    result = triangulate_weighted(cameras, px, sigma)
 
     def chi2(points: np.ndarray) -> np.ndarray:
         return np.sum(((px - seen(cameras, points)) / sigma) ** 2, axis=(0, 2))
 
-    np.testing.assert_allclose(found.chi2, chi2(found.xyz), rtol=1e-6)
+    np.testing.assert_allclose(result.chi2, chi2(result.xyz), rtol=1e-6)
     for d in np.eye(3) * h:  # the slope of a parabola of curvature 2 / σ² is zero at its minimum
-        slope = (chi2(found.xyz + d) - chi2(found.xyz - d)) / (2 * h)
-        assert np.abs(slope).max() < 1e-3 * (2 * h / np.einsum("nii->ni", found.covariance)).max()
+        slope = (chi2(result.xyz + d) - chi2(result.xyz - d)) / (2 * h)
+        assert np.abs(slope).max() < 1e-3 * (2 * h / np.einsum("nii->ni", result.covariance)).max()
 
 
 def test_scatter_covariance_and_chi_square_are_those_of_the_noise_that_was_put_in() -> None:
@@ -61,13 +61,13 @@ def test_scatter_covariance_and_chi_square_are_those_of_the_noise_that_was_put_i
     xyz = np.array([[30.0, 20.0, 10.0]])
     exact = np.repeat(seen(cameras, xyz), trials, axis=1)
     sigma = np.broadcast_to(np.array([0.01, 0.02, 0.05, 0.1])[:, None, None], exact.shape)
-    found = triangulate_weighted(cameras, exact + rng.normal(size=exact.shape) * sigma, sigma)
-    whitened = np.linalg.solve(np.linalg.cholesky(found.covariance), (found.xyz - xyz)[..., None])[..., 0]
+    result = triangulate_weighted(cameras, exact + rng.normal(size=exact.shape) * sigma, sigma)
+    whitened = np.linalg.solve(np.linalg.cholesky(result.covariance), (result.xyz - xyz)[..., None])[..., 0]
     # A variance of 4000 trials is known to √(2/4000) = 2.2 %, a correlation to 1.6 %.
     np.testing.assert_allclose(whitened.T @ whitened / trials, np.eye(3), atol=0.09)
-    assert found.chi2.mean() == pytest.approx(5.0, abs=4 * np.sqrt(10.0 / trials))
-    assert found.chi2.var() == pytest.approx(10.0, rel=0.2)
-    np.testing.assert_allclose(found.sigma, np.sqrt(np.einsum("nii->ni", found.covariance)))
+    assert result.chi2.mean() == pytest.approx(5.0, abs=4 * np.sqrt(10.0 / trials))
+    assert result.chi2.var() == pytest.approx(10.0, rel=0.2)
+    np.testing.assert_allclose(result.sigma, np.sqrt(np.einsum("nii->ni", result.covariance)))
 
 
 def test_weights_bring_points_nearer_than_the_unweighted_solution() -> None:
@@ -85,30 +85,30 @@ def test_a_camera_that_did_not_match_takes_no_part_and_one_alone_is_not_enough()
     px, sigma = seen(cameras, xyz), np.full((3, len(xyz), 2), 0.01)
     px[2, :20] = np.nan  # two cameras are left
     sigma[1, :10, 0] = np.inf  # one camera is left
-    found = triangulate_weighted(cameras, px, sigma)
-    assert np.isnan(found.xyz[:10]).all()
-    assert np.isnan(found.covariance[:10]).all()
-    assert np.isnan(found.chi2[:10]).all()
-    np.testing.assert_array_equal(found.degrees, [0] * 10 + [1] * 10 + [3] * 20)
-    np.testing.assert_allclose(found.xyz[10:], xyz[10:], rtol=0, atol=1e-9)
+    result = triangulate_weighted(cameras, px, sigma)
+    assert np.isnan(result.xyz[:10]).all()
+    assert np.isnan(result.covariance[:10]).all()
+    assert np.isnan(result.chi2[:10]).all()
+    np.testing.assert_array_equal(result.degrees, [0] * 10 + [1] * 10 + [3] * 20)
+    np.testing.assert_allclose(result.xyz[10:], xyz[10:], rtol=0, atol=1e-9)
 
 
 def test_parallel_lines_of_sight_are_lost_points() -> None:
     camera = ring(1)[0]
     px = np.stack([camera.project(cloud())] * 2)
-    found = triangulate_weighted([camera, camera], px, np.full_like(px, 0.01))
-    assert np.isnan(found.xyz).all()
-    assert (found.degrees == 0).all()
+    result = triangulate_weighted([camera, camera], px, np.full_like(px, 0.01))
+    assert np.isnan(result.xyz).all()
+    assert (result.degrees == 0).all()
 
 
 def test_a_wrong_match_is_told_by_chi_square_and_does_not_disturb_its_neighbours() -> None:
     cameras, xyz = ring(3), cloud()
     px, sigma = seen(cameras, xyz), np.full((3, len(xyz), 2), 0.01)
     px[1, 7] += 5.0
-    found = triangulate_weighted(cameras, px, sigma)
-    assert found.chi2[7] > 1e4
+    result = triangulate_weighted(cameras, px, sigma)
+    assert result.chi2[7] > 1e4
     others = np.arange(len(xyz)) != 7
-    np.testing.assert_allclose(found.xyz[others], xyz[others], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(result.xyz[others], xyz[others], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -38,8 +38,8 @@ def test_a_lost_vertex_opens_a_border_round_it() -> None:
     border = opened.boundary_edges()
     assert len(border) == around
     assert sorted(border[:, 0]) == sorted(border[:, 1])  # a closed loop, each vertex entered and left once
-    small, kept = opened.compact()
-    assert 100 not in kept
+    small, old_indices = opened.compact()
+    assert 100 not in old_indices
     np.testing.assert_array_equal(small.vertices[small.faces], opened.vertices[opened.faces])
 
 

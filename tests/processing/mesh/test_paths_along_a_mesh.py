@@ -1,4 +1,4 @@
-"""Distances along a mesh against those of the surface it stands for."""
+"""Distances along a mesh against geodesic distances on the surface that it approximates."""
 
 import numpy as np
 from ringdic.mesh.geodesic import DETOUR, reach, step_graph

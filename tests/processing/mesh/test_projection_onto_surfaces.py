@@ -1,4 +1,4 @@
-"""Points carried onto a surface along directions."""
+"""Projection of points onto a surface along given directions."""
 
 import numpy as np
 import pytest

@@ -78,12 +78,12 @@ def test_the_area_of_a_hole_is_that_of_the_triangles_taken_out() -> None:
     vertex = 10 * 61 + 30
     for mesh in (sheet(20, 61), tube()):
         opened = without(mesh, vertex)
-        taken = mesh.areas.sum() - opened.areas.sum()
+        removed = mesh.areas.sum() - opened.areas.sum()
         (hole,) = holes(opened)
-        assert hole.area == pytest.approx(taken, rel=0.01)
+        assert hole.area == pytest.approx(removed, rel=0.01)
         assert hole.turning == pytest.approx(-1.0, abs=0.01)
-        assert holes(opened, above=1.1 * taken) == ()
-    assert is_closed_tube(without(tube(), vertex), largest_hole=1.1 * taken)
+        assert holes(opened, above=1.1 * removed) == ()
+    assert is_closed_tube(without(tube(), vertex), largest_hole=1.1 * removed)
     assert not is_closed_tube(without(tube(), vertex))
 
 

@@ -118,7 +118,7 @@ def test_a_camera_without_an_image_at_a_step_loses_that_step_alone(session: Path
     assert (results.status[:2] == 0).mean() > 0.95
     assert (results.status[2] == Status.NOT_REACHED).all()
     (job,) = jobs(session)
-    assert [task is None for task in job.followed[1].steps] == [False, True]
+    assert [task is None for task in job.camera_jobs[1].steps] == [False, True]
 
 
 def test_threads_side_by_side_make_the_same(session: Path) -> None:

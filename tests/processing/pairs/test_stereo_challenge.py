@@ -162,7 +162,7 @@ def test_the_simulated_board_gives_the_published_cameras(challenge, figures) -> 
             ),
             "± 3, ± 2",
         )
-        assert fit.kept.all()
+        assert fit.inliers.all()
         assert fit.rms < 0.05
         for got, name in ((K[0, 0], "fx"), (K[1, 1], "fy")):
             assert abs(got - wanted[name]) <= truth["truth_tolerance"]["fx_fy_px"]

@@ -17,12 +17,11 @@ from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.multiview.motion import Motion
 from ringdic.multiview.shape import ReferenceShape, reference_shape
 from ringdic.multiview.uncertainty import SurfaceUncertainty, surface_uncertainty
-from ringdic.pairs import tracking as in_time
-from ringdic.pairs.matching import Grid, StepMatches, Stereo, at_step, match_reference
+from ringdic.pairs.matching import PairGrid, StepMatches, Stereo, match_reference, step_matches
 from ringdic.pairs.reconstruction import pair_shape
 from ringdic.pairs.surfaces import pairs_surface
 from ringdic.pairs.surfaces import reconstruct_pair as follow_pair
-from ringdic.pairs.tracking import CameraGrid, CameraPixels, camera_grid, match_camera
+from ringdic.pairs.tracking import CameraGrid, CameraPixels, camera_grid, interpolate_matches, match_camera
 from ringdic.results.results import Results
 from ringdic.results.series import StepCache, join_steps
 from ringdic.results.uncertainty import add_uncertainty
@@ -163,18 +162,18 @@ def by_pair(cameras: list[Camera], image: Callable[[str, int], np.ndarray], sear
     return add_uncertainty(join_steps([series.at(k) for k in range(STEPS)]), None)
 
 
-def matched(stereo: Stereo, image: Callable[[str, int], np.ndarray]) -> tuple[Grid, list[StepMatches]]:
+def matched(stereo: Stereo, image: Callable[[str, int], np.ndarray]) -> tuple[PairGrid, list[StepMatches]]:
     first, second = stereo.cameras
     grid, found = match_reference(stereo, image(first.id, 0), image(second.id, 0), None)
     own = camera_grid(first.size, CORRELATION.step, [(grid.region, grid.xy[found.good])], [])
-    other = camera_grid(second.size, CORRELATION.step, [], [(found.second, grid.faces)])
+    other = camera_grid(second.size, CORRELATION.step, [], [(found.second_px, grid.faces)])
 
     def seen(id_: str, points: CameraGrid, xy: np.ndarray, step: int) -> CameraPixels:
         reference = prepare_reference(image(id_, 0), points.region, CORRELATION)
-        return in_time.places(match_camera(reference, image(id_, step), points, CORRELATION), xy)
+        return interpolate_matches(match_camera(reference, image(id_, step), points, CORRELATION), xy)
 
     later = [
-        at_step(found, (seen(first.id, own, grid.xy, k), seen(second.id, other, found.second, k)))
+        step_matches(found, (seen(first.id, own, grid.xy, k), seen(second.id, other, found.second_px, k)))
         for k in range(1, STEPS)
     ]
     return grid, [found, *later]

@@ -36,11 +36,11 @@ def plane_patch() -> tuple[np.ndarray, np.ndarray]:
 def test_a_rigid_motion_gives_no_strain_to_round_off(vector: tuple, shift: tuple) -> None:
     _, xyz, faces = cylinder_patch(8)
     R = Rotation.from_rotvec(vector).as_matrix()
-    found = deformation(xyz, xyz @ R.T + np.array(shift), faces)
+    fields = deformation(xyz, xyz @ R.T + np.array(shift), faces)
     for name in ("E", "e", "E1", "E2", "e1", "e2", "E_equivalent", "E_shear"):
-        np.testing.assert_allclose(getattr(found, name), 0.0, atol=1e-12, err_msg=name)
-    np.testing.assert_allclose(found.F, np.broadcast_to(R, found.F.shape), atol=1e-12)
-    np.testing.assert_allclose(found.J, 1.0, atol=1e-12)
+        np.testing.assert_allclose(getattr(fields, name), 0.0, atol=1e-12, err_msg=name)
+    np.testing.assert_allclose(fields.F, np.broadcast_to(R, fields.F.shape), atol=1e-12)
+    np.testing.assert_allclose(fields.J, 1.0, atol=1e-12)
 
 
 @settings(max_examples=30, deadline=None)
@@ -51,29 +51,29 @@ def test_a_homogeneous_deformation_of_a_plane_is_exact(G: list[float], vector: t
     F_plane[:2, :2] += np.reshape(G, (2, 2))
     R = Rotation.from_rotvec(vector).as_matrix()
     F = R @ F_plane
-    found = deformation(xyz, xyz @ F.T + np.array([4.0, -5.0, 6.0]), faces)
+    fields = deformation(xyz, xyz @ F.T + np.array([4.0, -5.0, 6.0]), faces)
     C = F.T @ F
     stretch = np.linalg.svd(F_plane[:2, :2], compute_uv=False)
-    np.testing.assert_allclose(found.F, np.broadcast_to(F, found.F.shape), atol=1e-12)
-    np.testing.assert_allclose(found.E, np.broadcast_to((C - np.eye(3)) / 2, found.F.shape), atol=1e-12)
+    np.testing.assert_allclose(fields.F, np.broadcast_to(F, fields.F.shape), atol=1e-12)
+    np.testing.assert_allclose(fields.E, np.broadcast_to((C - np.eye(3)) / 2, fields.F.shape), atol=1e-12)
     almansi = (np.eye(3) - np.linalg.inv(F @ F.T)) / 2
-    np.testing.assert_allclose(found.e, np.broadcast_to(almansi, found.F.shape), atol=1e-11)
-    np.testing.assert_allclose(found.lambda1, stretch[1], atol=1e-12)
-    np.testing.assert_allclose(found.lambda2, stretch[0], atol=1e-12)
-    np.testing.assert_allclose(found.J, np.linalg.det(F_plane), atol=1e-12)
-    np.testing.assert_allclose(found.e2, (1 - stretch[0] ** -2) / 2, atol=1e-12)
+    np.testing.assert_allclose(fields.e, np.broadcast_to(almansi, fields.F.shape), atol=1e-11)
+    np.testing.assert_allclose(fields.lambda1, stretch[1], atol=1e-12)
+    np.testing.assert_allclose(fields.lambda2, stretch[0], atol=1e-12)
+    np.testing.assert_allclose(fields.J, np.linalg.det(F_plane), atol=1e-12)
+    np.testing.assert_allclose(fields.e2, (1 - stretch[0] ** -2) / 2, atol=1e-12)
 
 
 def test_uniaxial_tension_has_the_textbook_numbers() -> None:
     xyz, faces = plane_patch()
-    found = deformation(xyz, xyz * [1.2, 1.0, 1.0], faces)
+    fields = deformation(xyz, xyz * [1.2, 1.0, 1.0], faces)
     E = (1.2**2 - 1) / 2
-    np.testing.assert_allclose(found.E_magnitude, E, atol=1e-13)
-    np.testing.assert_allclose(found.E_equivalent, 2 / 3 * E, atol=1e-13)
-    np.testing.assert_allclose(found.E_shear, E / 2, atol=1e-13)
-    np.testing.assert_allclose(np.abs(found.direction2_reference[:, 0]), 1.0, atol=1e-13)
-    np.testing.assert_allclose(np.abs(found.shear_direction_reference[..., :2]), np.sqrt(0.5), atol=1e-13)
-    np.testing.assert_allclose(np.abs(found.normal_current[:, 2]), 1.0, atol=1e-13)
+    np.testing.assert_allclose(fields.E_magnitude, E, atol=1e-13)
+    np.testing.assert_allclose(fields.E_equivalent, 2 / 3 * E, atol=1e-13)
+    np.testing.assert_allclose(fields.E_shear, E / 2, atol=1e-13)
+    np.testing.assert_allclose(np.abs(fields.direction2_reference[:, 0]), 1.0, atol=1e-13)
+    np.testing.assert_allclose(np.abs(fields.shear_direction_reference[..., :2]), np.sqrt(0.5), atol=1e-13)
+    np.testing.assert_allclose(np.abs(fields.normal_current[:, 2]), 1.0, atol=1e-13)
 
 
 def inflated_and_twisted(surface: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -98,8 +98,8 @@ def test_the_stretch_of_a_curved_body_converges_at_the_expected_rates() -> None:
         surface, xyz, faces = cylinder_patch(n)
         current, _ = inflated_and_twisted(surface)
         _, truth = inflated_and_twisted(surface[faces].mean(axis=1))
-        found = deformation(xyz, current, faces)
-        error = np.stack([found.lambda1, found.lambda2], axis=1) - truth
+        fields = deformation(xyz, current, faces)
+        error = np.stack([fields.lambda1, fields.lambda2], axis=1) - truth
         single.append(np.sqrt((error**2).mean()))
         paired.append(np.sqrt((error.reshape(2, -1, 2).mean(axis=0) ** 2).mean()))
     assert np.log2(single[0] / single[2]) / 2 == pytest.approx(1.0, abs=0.05)
@@ -111,14 +111,14 @@ def test_a_lost_vertex_loses_its_triangles_and_no_other() -> None:
     _, xyz, faces = cylinder_patch(5)
     current = 1.1 * xyz
     current[7] = np.nan
-    found = deformation(xyz, current, faces)
+    fields = deformation(xyz, current, faces)
     lost = (faces == 7).any(axis=1)
     assert 0 < lost.sum() < len(faces)
     follow = [name for name in vars(Deformation) if not name.startswith("_")]
     assert "e" in follow
     of_reference = ("area", "normal_reference", "directors_reference")
     for name in (*Deformation.__dataclass_fields__, *follow):
-        values = getattr(found, name)
+        values = getattr(fields, name)
         whole = np.isfinite(values.reshape(len(faces), -1)).all(axis=1)
         expected = np.ones(len(faces), bool) if name in of_reference else ~lost
         assert (whole == expected).all(), name
@@ -134,8 +134,8 @@ def test_steps_stack_in_front_without_changing_a_number() -> None:
 
 def test_isotropy_of_known_triangles() -> None:
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0.5, np.sqrt(0.75), 0], [0.5, 1e-9, 0]])
-    found = isotropy(vertices, np.array([[0, 1, 2], [0, 1, 3]]))
-    np.testing.assert_allclose(found, [1.0, 0.0], atol=1e-7)
+    fields = isotropy(vertices, np.array([[0, 1, 2], [0, 1, 3]]))
+    np.testing.assert_allclose(fields, [1.0, 0.0], atol=1e-7)
 
 
 @settings(max_examples=40, deadline=None)

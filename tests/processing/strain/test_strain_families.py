@@ -1,4 +1,4 @@
-"""Families of strain: special cases, limits, order, and the same tensor on any way to it."""
+"""Strain families: special cases, limits, order, and tensors that agree however they are computed."""
 
 import numpy as np
 import pytest
@@ -56,11 +56,11 @@ def one_triangle() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("m", [1.0, 0.5, 0.25, 0.0, -1.0])
 def test_the_tensor_is_the_matrix_function_of_the_right_stretch(m: float) -> None:
-    found = deformation(*one_triangle())
-    C = found.F[0].T @ found.F[0]
+    result = deformation(*one_triangle())
+    C = result.F[0].T @ result.F[0]
     truth = logm(C) / 2 if m == 0 else (fractional_matrix_power(C, m) - np.eye(3)) / (2 * m)
-    first, second = strain.seth_hill(found.lambda1, m), strain.seth_hill(found.lambda2, m)
-    tensor = strain.tensor(first, second, found.direction1_reference, found.direction2_reference)
+    first, second = strain.seth_hill(result.lambda1, m), strain.seth_hill(result.lambda2, m)
+    tensor = strain.tensor(first, second, result.direction1_reference, result.direction2_reference)
     np.testing.assert_allclose(tensor[0], np.real(truth), atol=1e-12)
     assert strain.magnitude(first, second)[0] == pytest.approx(np.linalg.norm(truth), rel=1e-11)
     deviator = truth - np.trace(truth) / 3 * np.eye(3)
@@ -72,11 +72,11 @@ def test_linear_strain_is_that_of_theory_and_takes_a_rotation_for_strain() -> No
     reference, _, faces = one_triangle()
     normal = deformation(reference, reference, faces).normal_reference
     H = 1e-6 * np.random.default_rng(3).normal(size=(3, 3))
-    found = deformation(reference, reference @ (np.eye(3) + H).T, faces)
+    result = deformation(reference, reference @ (np.eye(3) + H).T, faces)
     plane = np.eye(3) - np.outer(normal[0], normal[0])
-    linear = strain.infinitesimal(found.F, found.normal_reference)[0]
+    linear = strain.infinitesimal(result.F, result.normal_reference)[0]
     np.testing.assert_allclose(linear, plane @ (H + H.T) @ plane / 2, atol=1e-11)  # the second order is 1e-12
-    np.testing.assert_allclose(linear, found.E[0], atol=1e-11)
+    np.testing.assert_allclose(linear, result.E[0], atol=1e-11)
     turned = deformation(reference, reference @ Rotation.from_rotvec(0.1 * normal[0]).as_matrix().T, faces)
     np.testing.assert_allclose(
         strain.infinitesimal(turned.F, turned.normal_reference)[0], (np.cos(0.1) - 1) * plane, atol=1e-12
@@ -85,9 +85,9 @@ def test_linear_strain_is_that_of_theory_and_takes_a_rotation_for_strain() -> No
 
 def test_principal_linear_strains_are_those_of_its_tensor_after_the_rigid_motion() -> None:
     reference, current, faces = one_triangle()
-    found = deformation(reference, current, faces)
-    tensor = strain.infinitesimal(found.F, found.normal_reference)[0]
-    first, second = strain.infinitesimal_principal(found.F, found.normal_reference)
+    result = deformation(reference, current, faces)
+    tensor = strain.infinitesimal(result.F, result.normal_reference)[0]
+    first, second = strain.infinitesimal_principal(result.F, result.normal_reference)
     values = sorted(np.linalg.eigvalsh(tensor), key=abs)[1:]  # the one along the normal is 0
     np.testing.assert_allclose([first[0], second[0]], sorted(values), rtol=1e-9)
     # A small stretch and a large turn of the whole: the field shows the stretch alone.
@@ -103,21 +103,21 @@ def test_principal_linear_strains_are_those_of_its_tensor_after_the_rigid_motion
 
 
 def test_every_field_of_strain_has_the_value_of_its_family() -> None:
-    found = deformation(*one_triangle())
-    arrays = {"E1": found.E1, "E2": found.E2}
+    result = deformation(*one_triangle())
+    arrays = {"E1": result.E1, "E2": result.E2}
     for family, m in (("E", 1.0), ("e", -1.0), ("hencky", 0.0), ("biot", 0.5), ("seth_hill", 0.25)):
         end = ":0.25" if family == "seth_hill" else ""
-        principal = strain.seth_hill(found.lambda1, m), strain.seth_hill(found.lambda2, m)
+        principal = strain.seth_hill(result.lambda1, m), strain.seth_hill(result.lambda2, m)
         for suffix, truth in (
             ("1", principal[0]), ("2", principal[1]), ("_magnitude", strain.magnitude(*principal)),
             ("_equivalent", strain.equivalent(*principal)), ("_shear", strain.shear(*principal)),
         ):  # fmt: skip
             values = field(f"{family}{suffix}{end}").from_arrays(arrays.__getitem__)
             np.testing.assert_allclose(values, truth, rtol=1e-12, err_msg=family + suffix)
-    bazant = strain.bazant(found.lambda2, 1.0)
+    bazant = strain.bazant(result.lambda2, 1.0)
     np.testing.assert_allclose(field("bazant2").from_arrays(arrays.__getitem__), bazant, rtol=1e-12)
     for name in ("e1", "e2", "e_magnitude", "e_equivalent", "e_shear", "E_magnitude", "E_equivalent", "E_shear"):
-        np.testing.assert_allclose(field(name).from_arrays(arrays.__getitem__), getattr(found, name), rtol=1e-12)
+        np.testing.assert_allclose(field(name).from_arrays(arrays.__getitem__), getattr(result, name), rtol=1e-12)
     assert len({entry.name for entry in FIELDS}) == len(FIELDS)
     assert seth_hill_fields(2)[0].name == "seth_hill1:2"
     for name in ("seth_hill1", "seth_hill1:", "seth_hill9:1", "window_displacement", "E3"):

@@ -1,4 +1,4 @@
-"""Strain over a window: exact on affine deformations, free of strain in rigid motion, and as quiet as theory says."""
+"""Strain over a window: exact on affine deformations, zero in rigid motion, with noise of the predicted size."""
 
 import numpy as np
 import pytest
@@ -55,50 +55,50 @@ def test_another_part_that_is_close_in_space_is_not_in_the_window() -> None:
 def test_a_rigid_motion_gives_no_strain_to_round_off(windows: StrainWindow) -> None:
     for vector in ([0.4, 1.0, -2.0], [0.0, 0.0, 3.0]):
         R = Rotation.from_rotvec(vector).as_matrix()
-        found = windows.deformation(windows.mesh.vertices @ R.T + [300.0, -20.0, 8.0])
+        fields = windows.deformation(windows.mesh.vertices @ R.T + [300.0, -20.0, 8.0])
         for name in ("E", "e", "E1", "E2", "E_equivalent"):
-            np.testing.assert_allclose(getattr(found, name), 0.0, atol=1e-10, err_msg=name)
-        np.testing.assert_allclose(found.F, np.broadcast_to(R, found.F.shape), atol=1e-9)
+            np.testing.assert_allclose(getattr(fields, name), 0.0, atol=1e-10, err_msg=name)
+        np.testing.assert_allclose(fields.F, np.broadcast_to(R, fields.F.shape), atol=1e-9)
 
 
 def test_an_affine_deformation_is_exact_in_the_plane_of_the_window(windows: StrainWindow) -> None:
     A = np.eye(3) + np.random.default_rng(1).normal(0, 0.2, (3, 3))
-    found = windows.deformation(windows.mesh.vertices @ A.T + [1.0, 2.0, 3.0])
-    n = found.normal_reference
+    fields = windows.deformation(windows.mesh.vertices @ A.T + [1.0, 2.0, 3.0])
+    n = fields.normal_reference
     first = np.cross(n, [0.0, 0.0, 1.0])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     plane = np.stack([first, np.cross(n, first)], axis=-1)  # (M, 3, 2)
     stretches = np.linalg.svd(A @ plane, compute_uv=False)
-    np.testing.assert_allclose(found.lambda2, stretches[:, 0], atol=1e-10)
-    np.testing.assert_allclose(found.lambda1, stretches[:, 1], atol=1e-10)
-    np.testing.assert_allclose(found.F @ plane, A @ plane, atol=1e-10)
-    # That plane is the tangent plane, as well as a few points know it.
+    np.testing.assert_allclose(fields.lambda2, stretches[:, 0], atol=1e-10)
+    np.testing.assert_allclose(fields.lambda1, stretches[:, 1], atol=1e-10)
+    np.testing.assert_allclose(fields.F @ plane, A @ plane, atol=1e-10)
+    # The fitted plane is the tangent plane, as exactly as a few points give it.
     tangent = windows.mesh.centroids * [1, 1, 0] / np.linalg.norm(windows.mesh.centroids[:, :2], axis=1)[:, None]
     interior = windows.points > 8
     assert np.einsum("mi,mi->m", n, tangent)[interior].min() > np.cos(np.radians(2.0))
 
 
 def test_an_inflated_and_drawn_tube_has_its_stretches_everywhere(windows: StrainWindow) -> None:
-    found = windows.deformation(windows.mesh.vertices * [1.1, 1.1, 1.25])
+    fields = windows.deformation(windows.mesh.vertices * [1.1, 1.1, 1.25])
     # Heights above the plane lean the fit by at most (slope of the plane), whose square enters.
-    np.testing.assert_allclose(found.lambda1, 1.1, atol=2e-4)
-    np.testing.assert_allclose(found.lambda2, 1.25, atol=2e-4)
-    np.testing.assert_allclose(np.abs(found.direction2_reference[:, 2]), 1.0, atol=2e-3)
+    np.testing.assert_allclose(fields.lambda1, 1.1, atol=2e-4)
+    np.testing.assert_allclose(fields.lambda2, 1.25, atol=2e-4)
+    np.testing.assert_allclose(np.abs(fields.direction2_reference[:, 2]), 1.0, atol=2e-3)
 
 
 def test_the_noise_falls_as_least_squares_says(windows: StrainWindow) -> None:
     mesh, sigma = windows.mesh, 1e-3
     noisy = mesh.vertices + np.random.default_rng(2).normal(0, sigma, mesh.vertices.shape)
-    found = windows.deformation(noisy)
+    fields = windows.deformation(noisy)
     z = mesh.vertices[:, 2]
     count = windows.points
     spread = windows.members @ z**2 - (windows.members @ z) ** 2 / count  # Σ (z - mean)²
     # On a tube, z lies in the plane of every window: E_zz is the slope of u_z over z.
-    ratio = found.E[:, 2, 2] * np.sqrt(spread) / sigma
+    ratio = fields.E[:, 2, 2] * np.sqrt(spread) / sigma
     assert ratio.std() == pytest.approx(1.0, abs=0.1)  # 11,040 windows of 12 points: some 900 independent ones
     assert abs(ratio.mean()) < 0.1
     alone = deformation(mesh.vertices, noisy, mesh.faces)
-    assert found.E[:, 2, 2].std() < 0.35 * alone.E[:, 2, 2].std()
+    assert fields.E[:, 2, 2].std() < 0.35 * alone.E[:, 2, 2].std()
 
 
 def test_lost_points_leave_the_rest_exact_and_their_own_triangles_lost(windows: StrainWindow) -> None:

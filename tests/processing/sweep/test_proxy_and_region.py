@@ -1,4 +1,4 @@
-"""Hypotheses from proxies, and the region that two cameras share."""
+"""Warp hypotheses from proxy cylinders, and the region that two cameras share."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,8 @@ from ringdic.sweep.region import (
 )
 
 
-def camera(azimuth_deg: float) -> Camera:
+def camera_towards_axis(azimuth_deg: float) -> Camera:
+    """Camera at 350 mm from the z axis, looking at it."""
     a = np.radians(azimuth_deg)
     centre = np.array([350 * np.cos(a), 350 * np.sin(a), 120.0])
     z = -np.array([np.cos(a), np.sin(a), 0.0])
@@ -26,10 +27,11 @@ def camera(azimuth_deg: float) -> Camera:
     return Camera(f"c{azimuth_deg:g}", P / P[2, 3], (1232, 1640))
 
 
-FIRST, SECOND = camera(0), camera(30)
+FIRST, SECOND = camera_towards_axis(0), camera_towards_axis(30)
 
 
 def surface(radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) mm of a cylinder and their positions (n, 2) px in the first camera."""
     theta, z = np.meshgrid(np.radians(np.linspace(-20, 45, 9)), np.linspace(40, 200, 5))
     xyz = np.stack([radius * np.cos(theta), radius * np.sin(theta), z], axis=-1).reshape(-1, 3)
     return xyz, FIRST.project(xyz)
@@ -75,19 +77,19 @@ def test_a_lattice_keeps_its_margin_and_its_multiples() -> None:
     assert np.all(points.xy % 12 == 0)
 
 
-def test_a_lonely_depth_is_not_coherent_and_the_smaller_piece_is_dropped() -> None:
+def test_an_isolated_depth_is_not_coherent_and_smaller_pieces_are_dropped() -> None:
     radius = np.full((12, 12), 57.0)
     radius[4, 4] = 49.0
-    unambiguous_matches = np.ones((12, 12), bool)
-    unambiguous_matches[:, 8:10] = False  # columns 10 and 11 are cut off
-    good = coherent_depths(radius, unambiguous_matches, 2.0)
+    candidates = np.ones((12, 12), bool)
+    candidates[:, 8:10] = False  # columns 10 and 11 are cut off
+    good = coherent_depths(radius, candidates, 2.0)
     assert not good[4, 4]
     assert good[:, :8].sum() == 12 * 8 - 1
     assert not good[:, 10:].any()
-    both = coherent_depths(radius, unambiguous_matches, 2.0, min_positions=20)
+    both = coherent_depths(radius, candidates, 2.0, min_positions=20)
     assert both[:, 10:].all()
     assert not both[4, 4]
-    assert (coherent_depths(radius, unambiguous_matches, 2.0, min_positions=30) == good).all()
+    assert (coherent_depths(radius, candidates, 2.0, min_positions=30) == good).all()
 
 
 def test_normals_of_a_cylinder_point_along_its_radii() -> None:
@@ -98,18 +100,18 @@ def test_normals_of_a_cylinder_point_along_its_radii() -> None:
     np.testing.assert_allclose(normals[..., 2], 0, atol=1e-9)
 
 
-def test_what_is_seen_too_steeply_is_left_out() -> None:
+def test_positions_above_the_limit_of_incidence_are_left_out() -> None:
     theta, z = np.meshgrid(np.radians(np.arange(-80.0, 110, 5)), np.linspace(100, 140, 5))
     xyz = np.stack([57 * np.cos(theta), 57 * np.sin(theta), z], axis=-1)
-    seen = within_incidence(xyz, (FIRST, SECOND), 60.0)[2]
+    visible = within_incidence(xyz, (FIRST, SECOND), 60.0)[2]
     angles = np.degrees(theta[2])
     # A camera at 350 mm sees the cylinder's point at angle a under a + asin(57 sin a / distance).
-    assert not seen[np.abs(angles + 35) < 1].any()
-    assert seen[np.abs(angles - 15) < 1].all()
-    assert not seen[angles > 65].any()
+    assert not visible[np.abs(angles + 35) < 1].any()
+    assert visible[np.abs(angles - 15) < 1].all()
+    assert not visible[angles > 65].any()
 
 
-def test_the_painted_region_covers_the_good_positions_only() -> None:
+def test_the_region_covers_the_good_positions_only() -> None:
     points = image_lattice((200, 200), 20, 20)
     good = (points.xy[..., 0] >= 60) & (points.xy[..., 0] <= 120) & (points.xy[..., 1] >= 60)
     mask = lattice_region(ImageLattice(points.xy, 20), good, (200, 200))
@@ -127,7 +129,7 @@ def test_contrast_is_the_rms_gradient() -> None:
     assert contrast(np.full((50, 50), 7, np.uint8), np.array([[25.0, 25.0]]), 5)[0] == 0.0
 
 
-def test_a_long_row_of_radii_is_as_good_as_each_followed_exactly() -> None:
+def test_interpolated_warps_of_many_radii_agree_with_exact_ones() -> None:
     _, px = surface(57.0)
     radii = sweep_radii(57.0, 20.0, 0.28)
     together = stereo_hypotheses(FIRST, SECOND, px, radii, 20.0)
@@ -141,7 +143,7 @@ def test_a_long_row_of_radii_is_as_good_as_each_followed_exactly() -> None:
     assert off[:, 2:].max() < 0.1  # where the surface turns away
 
 
-def test_radii_that_are_of_no_use_are_not_followed_and_the_others_as_ever() -> None:
+def test_bounds_on_the_radii_leave_the_warps_inside_unchanged() -> None:
     _, px = surface(57.0)
     radii = sweep_radii(57.0, 20.0, 0.28)
     low, high = np.linspace(45.0, 55.0, len(px)), np.linspace(50.0, 70.0, len(px))

@@ -1,4 +1,4 @@
-"""The sweep on drawn images of a speckled cylinder: it is found where it is speckled, everywhere, at its own radius."""
+"""The depth sweep on drawn images of a speckled cylinder: it is found wherever it is speckled, at its own radius."""
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ SEARCH = DepthSearch(57.0, 20.0, 65.0)
 SPACING = 20  # of the lattice that these settings lead to, px
 
 
-def camera(azimuth_deg: float) -> Camera:
+def camera_at(azimuth_deg: float) -> Camera:
     """At 350 mm from the axis, looking at it, 1.9 px/mm at the surface."""
     a = np.radians(azimuth_deg)
     centre = np.array([350 * np.cos(a), 350 * np.sin(a), 120.0])
@@ -26,7 +26,7 @@ def camera(azimuth_deg: float) -> Camera:
     return Camera(f"c{azimuth_deg:g}", P / P[2, 3], (WIDTH, HEIGHT))
 
 
-CAMERAS = camera(-12), camera(12)
+CAMERAS = camera_at(-12), camera_at(12)
 
 
 def speckle() -> np.ndarray:
@@ -58,6 +58,7 @@ def views(covered: np.ndarray | None = None) -> list[np.ndarray]:
 
 
 def sweep_result(images: list[np.ndarray], mask: np.ndarray | None = None, min_positions: int = 0) -> DepthSweep:
+    """Sweep between the two cameras' images."""
     radii = search_radii(CAMERAS, SEARCH)
     return sweep_depths(CAMERAS, images[0], prepare_current(images[1]), mask, radii, SEARCH, SETTINGS, min_positions)
 
@@ -105,7 +106,7 @@ def test_a_small_piece_is_found_wherever_it_lies_on_the_lattice(corner: tuple[in
     assert not result.good[about[row, column].reshape(result.good.shape) == 0].any()
 
 
-def test_inside_a_mask_nothing_else_is_looked_for() -> None:
+def test_with_a_mask_all_positions_inside_it_are_good_and_no_others() -> None:
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[100:300, 170:230] = True
     result = sweep_result(views(), mask)

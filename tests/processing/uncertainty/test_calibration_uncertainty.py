@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from ringdic.calibration.parameters import PER_CAMERA, Parameters
+from ringdic.calibration.parameters import PER_CAMERA, CameraParameters
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.geometry.weighted_triangulation import triangulate_weighted
 from ringdic.strain.deformation import deformation
@@ -32,7 +32,7 @@ def ring() -> list[Camera]:
 
 def moved(cameras: list[Camera], step: np.ndarray) -> list[Camera]:
     return [
-        Parameters.of(camera).moved(step[PER_CAMERA * k : PER_CAMERA * (k + 1)]).camera(camera)
+        CameraParameters.of(camera).plus(step[PER_CAMERA * k : PER_CAMERA * (k + 1)]).camera(camera)
         for k, camera in enumerate(cameras)
     ]
 

@@ -1,1 +1,1 @@
-"""The HTTP interface, one file a resource; every route is a thin layer over the operator's desk."""
+"""The HTTP interface, one module for each resource; the routes pass requests on to the operator's desk."""

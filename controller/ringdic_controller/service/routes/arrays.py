@@ -12,8 +12,10 @@ from ringdic.results.reader import read_field, read_mesh, read_positions
 from ringdic_controller.service.routes.etag import cache_headers, client_has
 
 _BINARY: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
-Version = Annotated[str | None, Query(description="The header's version; with it the answer may be kept for ever")]
-Removed = Annotated[bool, Query(description="After the rigid motion of the whole surface has been taken out")]
+Version = Annotated[
+    str | None, Query(description="The header's version; with it the client may keep the answer for ever")
+]
+Removed = Annotated[bool, Query(description="With the rigid motion of the whole surface removed")]
 
 
 def add_arrays(router: APIRouter, prefix: str, locate: Callable[..., Path]) -> None:
@@ -55,7 +57,7 @@ def add_arrays(router: APIRouter, prefix: str, locate: Callable[..., Path]) -> N
         rigid_motion_removed: Removed = False,
         v: Version = None,
     ) -> Response:
-        """Values of a field, NaN where not measured; the header's table of fields tells unit and location."""
+        """Values of a field, NaN where not measured; the header's table of fields gives unit and location."""
         values, location = read_field(path, name, step, rigid_motion_removed)
         headers = _tagged(path, f"{name}-{step}-{rigid_motion_removed:d}", v) | {"X-Location": location}
         if client_has(request, headers):

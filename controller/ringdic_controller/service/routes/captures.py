@@ -32,7 +32,7 @@ class NewCapture(BaseModel):
     summary="Begin a capture in the current session",
 )
 def begin_capture(new: NewCapture, desk: TheDesk) -> dict[str, Any]:
-    """The round that has begun; ``/rounds/{id}`` and the live events tell how it goes. 409 says why none can."""
+    """The round that has begun; ``/rounds/{id}`` and the live events show how it goes on. 409 if none can begin."""
     return asdict(desk.rounds.begin(new.kind, override=new.override))
 
 
@@ -76,7 +76,7 @@ def send_image(session: str, capture_id: str, camera: str, desk: TheDesk) -> Fil
     "/sessions/{session}/captures/{capture_id}/images/{camera}/preview",
     response_class=Response,
     responses={200: {"content": {"image/jpeg": {}}}},
-    summary="One image made small",
+    summary="One image as a small JPEG",
 )
 def send_preview(
     session: str,

@@ -6,7 +6,8 @@ from fastapi import Request
 def cache_headers(tag: str, *, revalidate: bool = True) -> dict[str, str]:
     """Headers of an answer with this entity tag, which the client may keep.
 
-    With ``revalidate`` the client asks each time before it uses what it kept, and gets a short 304; without, never.
+    With ``revalidate`` it has to ask before every use, and gets a short 304 if nothing has changed; without, it need
+    not ask again.
     """
     cache = "private, no-cache" if revalidate else "private, max-age=31536000, immutable"
     return {"ETag": f'"{tag}"', "Cache-Control": cache}

@@ -12,10 +12,11 @@ router = APIRouter(tags=["live"])
 
 @router.get("/live", response_class=EventSourceResponse, summary="Live state")
 async def follow_events(desk: TheDesk) -> AsyncIterable[ServerSentEvent]:
-    """Events of the live state: first ``snapshot``, then ``rig``, ``sessions``, ``round``, ``capture``, ``job``,
-    ``runs`` as they change, ``processing`` (how ready it is) and ``newest`` (a step that has just been processed).
+    """Server-sent events of the live state, without end.
 
-    A client that reconnects gets a new snapshot.
+    The first is ``snapshot``; then come ``rig``, ``sessions``, ``round``, ``capture``, ``job``, ``runs`` as they
+    change, ``processing`` (how ready it is) and ``newest`` (a step that has just been processed at once). A client
+    that reconnects gets a new snapshot.
     """
     async for name, payload in desk.state.events.follow():
         yield ServerSentEvent(event=name, data=payload)

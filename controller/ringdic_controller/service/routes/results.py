@@ -36,7 +36,7 @@ def list_runs(session: str, desk: TheDesk) -> list[dict[str, Any]]:
     return desk.catalogue.runs(session)
 
 
-@router.get("/{run}", summary="What a run found: counts, steps, and the table of fields with their ranges")
+@router.get("/{run}", summary="Header of a run's results: counts, steps, and the table of fields with their ranges")
 def read_run_header(session: str, run: str, path: RunFile) -> dict[str, Any]:
     """Header of a run's results; ``version`` changes only if another run is put in its place."""
     return {"session": session, "run": run, "version": version_of(path), **read_summary(path)}

@@ -10,8 +10,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from ringdic.cli.console import narrated, say, show_table
-from ringdic.progress import Progress, Report
+from ringdic.cli.console import say, show_table
+from ringdic.progress import Progress, Report, progress_bar
 from ringdic.session.folder import newest_results
 from ringdic.session.rig import parse_rig
 from ringdic_node.virtual_rig.render import load_renderer
@@ -49,7 +49,7 @@ def run_demo(folder: Path, *, cameras: int, scale: float, steps: int, serve: boo
         client.wait_for_nodes(ids, _START, lambda: check_alive(nodes, setting.folder))
         say(f"{cameras} nodes and the controller are up; the page is at {address}")
         session = client.post("/sessions", {"name": "demo"})["name"]
-        with narrated() as report:
+        with progress_bar() as report:
             _capture_all(client, steps, report)
             _follow(client, session, report)
         comparison = _compare(setting, session, rig, began)

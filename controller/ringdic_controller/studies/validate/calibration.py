@@ -12,7 +12,7 @@ from ringdic.calibration.bundle import centroid_shift
 from ringdic.calibration.calibrated_rig import CalibratedRig, control_points
 from ringdic.calibration.camera_calibration import CameraCalibration
 from ringdic.calibration.dots import find_dots
-from ringdic.calibration.target import DotObservations, identify
+from ringdic.calibration.target import DotObservations, identify_dots
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.geometry.triangulation import triangulate
 from ringdic.session.images import read_gray
@@ -148,7 +148,7 @@ def _moved_dots(calibration: CameraCalibration, rig: Rig, image: Path) -> DotObs
     """The dots of a further image of the target."""
     camera = calibration.camera
     entry = rig.camera(camera.id)
-    return identify(
+    return identify_dots(
         find_dots(read_gray(image), rig.target),
         rig.target,
         entry.azimuth_deg,

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from ringdic import settings as presets
-from ringdic.cli.console import narrated, say, show_table
+from ringdic.cli.console import say, show_table
 from ringdic.errors import InputError
+from ringdic.progress import progress_bar
 from ringdic.settings import Settings
 from ringdic_node.virtual_rig.render import load_renderer
 
@@ -40,7 +41,7 @@ def run_validation(
     ways = {PAPER: scaled(presets.PAPER, scale), BETTER: scaled(presets.BEST, scale)}
     chosen = tuple(only) or EXPERIMENTS
     load_renderer()
-    with narrated() as progress:
+    with progress_bar() as progress:
         validation = Validation(folder, scenery, ways, progress)
         if images_only:
             validation.render(chosen)

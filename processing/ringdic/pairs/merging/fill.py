@@ -1,4 +1,4 @@
-"""Small holes closed with triangles over the vertices round them."""
+"""Filling of small holes with triangles between the vertices round them."""
 
 from __future__ import annotations
 
@@ -11,23 +11,34 @@ from ringdic.mesh.mesh import Mesh, half_edges
 from ringdic.mesh.polygon import triangulate_polygon
 from ringdic.mesh.topology import Border, Kind, borders
 
-_LONGEST = 150  # vertices of a border that is filled
-_THIN = 0.1  # height over longest edge of triangles that are made only where there is no other way
+_LONGEST = 150  # vertices of a border whose hole may be filled
+_THIN = 0.1  # height over longest edge of triangles that are laid only where there is no other way
 _FACING = 0.5  # least cosine between a hole's own normal and those of the surface round it
 
 
 def fill(mesh: Mesh, area: float, bridge: float, seam: Mask, seam_area: float) -> Indices:
-    """Triangles (K, 3) that close holes, turned as the surface is.
+    """Fill the small holes of a surface with triangles between its vertices.
 
-    area : mm², of the largest hole that is closed; seam_area : of the largest that touches the seam, (N,) vertices.
-    bridge : mm, longest edge of a new triangle. A hole whose outline folds over, or that would need a longer edge or
-    an edge that the mesh has already, stays open.
+    A hole whose outline folds over, or that would need an edge that is too long or that the mesh has already, stays
+    open.
+
+    Parameters
+    ----------
+    mesh : a sound surface.
+    area : mm², largest hole that is filled.
+    bridge : mm, longest edge of a new triangle.
+    seam : (N,) bool, vertices on the seam between surfaces.
+    seam_area : mm², largest hole that is filled where its outline touches the seam.
+
+    Returns
+    -------
+    New triangles (K, 3) int, turned as the surface is.
     """
     normals = np.nan_to_num(mesh.vertex_normals)
-    found = [np.zeros((0, 3), np.int64)]
-    around = borders(mesh)
-    known = _edges_between(mesh, around)
-    for border in around:
+    fillings = [np.zeros((0, 3), np.int64)]
+    all_borders = borders(mesh)
+    edges = _edges_between(mesh, all_borders)
+    for border in all_borders:
         if border.kind is not Kind.HOLE and len(border.loop) == len(set(border.loop.tolist())):
             continue
         for loop in simple_loops(border.loop.tolist()):
@@ -40,18 +51,18 @@ def fill(mesh: Mesh, area: float, bridge: float, seam: Mask, seam_area: float) -
             limit = seam_area if seam[outline].any() else area
             if size == 0 or size > limit or normals[outline].mean(axis=0) @ vector < _FACING * size:
                 continue
-            barred = _forbidden(outline, known)
+            barred = _barred_diagonals(outline, edges)
             triangles = triangulate_polygon(points, vector / size, bridge, barred, _THIN)
             if triangles is None:
                 triangles = triangulate_polygon(points, vector / size, bridge, barred)
             if triangles is not None:
-                found.append(outline[triangles])
-                known.update(_edges_of(found[-1]))
-    return np.concatenate(found)
+                fillings.append(outline[triangles])
+                edges.update(_edges_of(fillings[-1]))
+    return np.concatenate(fillings)
 
 
 def simple_loops(loop: list[int]) -> list[list[int]]:
-    """A closed row of vertices split where it passes one twice."""
+    """Split a closed row of vertices wherever it passes a vertex twice."""
     parts: list[list[int]] = []
     path: list[int] = []
     for v in loop:
@@ -74,11 +85,12 @@ def _edges_between(mesh: Mesh, around: Sequence[Border]) -> set[tuple[int, int]]
 
 
 def _edges_of(faces: Indices) -> set[tuple[int, int]]:
+    """Edges of triangles (K, 3), smaller vertex first."""
     return {(int(min(e)), int(max(e))) for e in faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)}
 
 
-def _forbidden(outline: Indices, known: set[tuple[int, int]]) -> Mask:
-    """Diagonals (n, n) of an outline that are edges of the mesh already."""
+def _barred_diagonals(outline: Indices, known: set[tuple[int, int]]) -> Mask:
+    """Diagonals (n, n) of an outline (n,) that are edges of the mesh already."""
     n = len(outline)
     barred = np.zeros((n, n), bool)
     names = outline.tolist()

@@ -1,4 +1,4 @@
-"""The loops of the overlap's removal that go from triangle to triangle, compiled."""
+"""Loops of the overlap's removal that go from triangle to triangle, compiled."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from ringdic.mesh.nearest import near
 
 @nb.njit(cache=True, nogil=True)
 def peel_triangles(start, rival, beside, living, bad):  # type: ignore[no-untyped-def]
-    """Take border triangles with living rivals away, the worst first, until none is left that a border reaches.
+    """Remove border triangles that compete with remaining ones, the worst first, as long as the border reaches any.
 
-    start (M + 1,), rival : the competitors of each triangle in one row. beside : (M, 3), -1 at a border.
-    living : (M,) bool, changed in place. bad : (M,).
+    start : (M + 1,), where the rivals of each triangle, those it competes with, begin in ``rival``. rival : (R,),
+    triangles. beside : (M, 3), the neighbours of each triangle, -1 at a border. living : (M,) bool, triangles that
+    remain, changed in place. bad : (M,), the larger the worse.
     """
     left = np.zeros(len(living), np.int64)
     queue = [(0.0, 0) for _ in range(0)]
@@ -47,9 +48,12 @@ def peel_triangles(start, rival, beside, living, bad):  # type: ignore[no-untype
 
 @nb.njit(cache=True, nogil=True)
 def regrow_triangles(start, rival, beside, living, wanted, bad):  # type: ignore[no-untyped-def]
-    """Put wanted triangles (M,) without living rivals back beside living ones; most neighbours first, then the best.
+    """Put removed triangles back where none that they compete with remains, beside remaining ones of their surface.
 
-    The other arguments are those of ``peel``.
+    Those with most remaining neighbours come first, of these the best. start : (M + 1,), where the rivals of each
+    triangle, those it competes with, begin in ``rival``. rival : (R,), triangles. beside : (M, 3), the neighbours of
+    each triangle, -1 at a border. living : (M,) bool, triangles that remain, changed in place. wanted : (M,) bool,
+    triangles that may come back. bad : (M,), the larger the worse.
     """
     queue = [(0, 0.0, 0) for _ in range(0)]
     for f in range(len(living)):
@@ -74,7 +78,7 @@ def regrow_triangles(start, rival, beside, living, wanted, bad):  # type: ignore
 
 @nb.njit(cache=True, nogil=True)
 def _count(beside, living, f):  # type: ignore[no-untyped-def]
-    """Living neighbours of a triangle."""
+    """Number of remaining neighbours of triangle f."""
     count = 0
     for g in beside[f]:
         if g >= 0 and living[g]:
@@ -84,14 +88,16 @@ def _count(beside, living, f):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def closer(middles, inside, owner, normals, corners, radius, usual, gap, reach, same_side, first, last):  # type: ignore[no-untyped-def]
-    """Pairs (P, 2) of triangles of different surfaces that lie over one another or within ``gap`` mm beside.
+    """Pairs (P, 2) of triangles of different surfaces that lie over one another or within a gap beside one another.
 
-    middles : centroids (M, 3) in cubes. inside : (M,) triangles of usual size that have no other surface near. radius :
-    (M,) mm, from centroid to farthest corner; usual : mm, of most. first, last : of which triangles in the order of the
-    cubes pairs are sought.
+    middles : centroids (M, 3) mm sorted into cubes. inside : (M,) bool, triangles that are not large and have no other
+    surface near. owner : (M,), surface of each triangle. normals : (M, 3). corners : (M, 3, 3) mm. radius : (M,) mm,
+    from centroid to farthest corner. usual : mm, radius beyond which a triangle is large. gap : mm, beside. reach :
+    mm, along the normal. same_side : least cosine between the normals of two layers of one surface. first, last :
+    range of the triangles, in the order of the cubes, whose rivals are sought.
     """
     M, widest = len(radius), radius.max()
-    found, apart = np.empty(M, np.int64), np.empty(M)
+    nearby, distance = np.empty(M, np.int64), np.empty(M)
     pairs, count = np.empty((last - first + 1, 2), np.int64), 0
     common = math.hypot(2 * usual + gap, reach)
     for k in range(first, last):
@@ -100,13 +106,13 @@ def closer(middles, inside, owner, normals, corners, radius, usual, gap, reach, 
         if inside[a] and not large:
             continue
         within = math.hypot(radius[a] + widest + gap, reach) if large else common
-        for m in range(near(middles, x[0], x[1], x[2], within, found, apart)):
-            b = middles.order[found[m]]
+        for m in range(near(middles, x[0], x[1], x[2], within, nearby, distance)):
+            b = middles.order[nearby[m]]
             if owner[a] == owner[b]:
                 continue
             if b < a if (radius[b] > usual) == large else not large:  # every pair once, from the larger triangle
                 continue
-            if not _close(a, b, middles.at[k], middles.at[found[m]], normals, corners, radius, gap, reach, same_side):
+            if not _close(a, b, middles.at[k], middles.at[nearby[m]], normals, corners, radius, gap, reach, same_side):
                 continue
             if count == len(pairs):
                 pairs = np.concatenate((pairs, np.empty_like(pairs)))
@@ -117,7 +123,7 @@ def closer(middles, inside, owner, normals, corners, radius, usual, gap, reach, 
 
 @nb.njit(cache=True, nogil=True)
 def _close(a, b, at_a, at_b, normals, corners, radius, gap, reach, same_side):  # type: ignore[no-untyped-def]
-    """Whether two triangles lie over one another or within ``gap`` beside. at_a, at_b : (3,) mm, their middles."""
+    """Whether two triangles lie over one another or within ``gap`` beside. at_a, at_b : (3,) mm, their centroids."""
     cosine = normals[a, 0] * normals[b, 0] + normals[a, 1] * normals[b, 1] + normals[a, 2] * normals[b, 2]
     if not cosine > same_side:
         return False
@@ -134,7 +140,7 @@ def _close(a, b, at_a, at_b, normals, corners, radius, gap, reach, same_side):  
 
 @nb.njit(cache=True, nogil=True)
 def _separation(one, two, nx, ny, nz):  # type: ignore[no-untyped-def]
-    """Widest gap of triangle two (3, 3) beyond the edges of triangle one, seen along a normal."""
+    """Widest gap of triangle two (3, 3) beyond the edges of triangle one (3, 3), mm, seen along a normal."""
     widest = -np.inf
     for k in range(3):
         m = (k + 1) % 3
@@ -151,7 +157,11 @@ def _separation(one, two, nx, ny, nz):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def rivals(M, competing):  # type: ignore[no-untyped-def]
-    """For each of M triangles, where its competitors begin (M + 1) in a row of all of them. competing : (P, 2)."""
+    """Collect for each triangle those it competes with, list after list in one array.
+
+    M : number of triangles. competing : (P, 2), pairs of triangles. Returns where each list begins (M + 1,), and the
+    array.
+    """
     start = np.zeros(M + 1, np.int64)
     for first, second in competing:
         start[first + 1] += 1
@@ -167,8 +177,12 @@ def rivals(M, competing):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def smoothed(values, known, beside, rounds):  # type: ignore[no-untyped-def]
-    """Values (M,) averaged with those of the neighbours that are known, round by round; 0 where nothing is."""
+def smooth_over_neighbours(values, known, beside, rounds):  # type: ignore[no-untyped-def]
+    """Average values over neighbouring triangles, in several rounds.
+
+    values : (M,). known : (M,) bool, triangles whose value counts. beside : (M, 3), the neighbours of each triangle,
+    -1 at a border. rounds : their number. Returns (M,), 0 where no value is near.
+    """
     total, weight = np.where(known, values, 0.0), known.astype(np.float64)
     for _ in range(rounds):
         old_total, old_weight = total.copy(), weight.copy()

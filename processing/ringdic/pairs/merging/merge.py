@@ -1,4 +1,4 @@
-"""Surfaces of camera pairs made one: overlaps removed, gaps stitched, small holes closed, no vertex added."""
+"""Merging of several surfaces into one without new vertices: overlaps removed, gaps stitched, small holes filled."""
 
 from __future__ import annotations
 
@@ -9,49 +9,54 @@ from types import MappingProxyType
 
 import numpy as np
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Points
 from ringdic.mesh.mesh import Mesh
 from ringdic.mesh.topology import face_neighbours, pieces, without_pinches
 from ringdic.pairs.merging.fill import fill
 from ringdic.pairs.merging.mismatch import Mismatch, mismatches
-from ringdic.pairs.merging.overlap import MEASURES, badness, closer_than, cover, peel, regrow
+from ringdic.pairs.merging.overlap import MEASURES, badness, close_pairs, cover, peel, regrow
 from ringdic.pairs.merging.stitch import stitch
 
-#: The weights of each heuristic; what "combined" weighs can be given.
+#: Weights of the measures of each heuristic.
 HEURISTICS: Mapping[str, Mapping[str, float]] = MappingProxyType(
     {
         **{name: MappingProxyType({name: 1.0}) for name in ("correlation", "distance", "orientation")},
         "combined": MappingProxyType({"correlation": 1.0, "distance": 1.0, "orientation": 1.0, "margin": 1.0}),
     }
 )
-_FEWEST = 12  # triangles of a piece that is worth keeping
+_FEWEST = 12  # triangles of a piece that is kept
 
 
 @dataclass(frozen=True)
 class SurfacePart:
-    """One surface: vertices (N, 3) mm, finite; faces (M, 3), normals outwards; correlation (N,) C_LS, 0 best.
+    """One of the surfaces to be merged.
 
-    NaN for a vertex that was lost at some step: where another sheet measured the place, its triangles go first.
+    vertices : (N, 3) float64, mm, finite. faces : (M, 3) int, normals outwards. correlation : (N,) C_LS, 0 best, NaN
+    for a vertex that was lost at some step: where another surface measured the place, its triangles are removed
+    first.
+
+    Raises ValueError for arrays of other shapes.
     """
 
-    vertices: Floats
+    vertices: Points
     faces: Indices
     correlation: Floats
 
     def __post_init__(self) -> None:
         N = len(self.vertices)
         if self.vertices.shape != (N, 3) or not np.isfinite(self.vertices).all():
-            raise ValueError("vertices of a sheet must be finite, (N, 3)")
+            raise ValueError("vertices of a surface must be finite, (N, 3)")
         if self.correlation.shape != (N,):
-            raise ValueError(f"a sheet of {N} vertices needs as many correlations, not {self.correlation.shape}")
+            raise ValueError(f"a surface of {N} vertices needs as many correlations, not {self.correlation.shape}")
 
 
 @dataclass(frozen=True)
 class Seam:
-    """How surfaces are joined, in mean edges of the triangles (areas in their squares).
+    """Lengths by which surfaces are joined, in mean edges of the triangles, and areas in their squares.
 
-    gap : left between surfaces before they are stitched. bridge : longest edge of a new triangle. layers : how far
-    apart two layers of one surface may lie. hole : largest hole within a surface that is closed; seam_hole : at a seam.
+    gap : left between surfaces before they are stitched. bridge : longest edge of a new triangle. layers : greatest
+    distance between two layers of one surface. hole : largest hole within a surface that is filled; seam_hole :
+    largest at a seam.
     """
 
     gap: float = 0.4
@@ -66,20 +71,21 @@ class Seam:
                 raise ValueError(f"{name} of a seam must not be negative, not {value}")
 
     @staticmethod
-    def mean_edge(sheets: Sequence[SurfacePart]) -> float:
+    def mean_edge(parts: Sequence[SurfacePart]) -> float:
         """Mean length of the edges of all triangles, mm; 0 without any."""
-        lengths = [np.linalg.norm(np.diff(s.vertices[s.faces[:, [0, 1, 2, 0]]], axis=1), axis=2) for s in sheets]
+        lengths = [np.linalg.norm(np.diff(s.vertices[s.faces[:, [0, 1, 2, 0]]], axis=1), axis=2) for s in parts]
         every = np.concatenate([np.zeros(0), *(length.ravel() for length in lengths)])
         return float(every.mean()) if len(every) else 0.0
 
 
 @dataclass(frozen=True)
-class Merged:
-    """One surface over the vertices of several sheets, numbered one sheet after the other.
+class MergedSurface:
+    """One surface over the vertices of several parts, which are numbered one part after the other.
 
-    faces : (M, 3). pair : (M,) the sheet of all three corners, -1 where a triangle joins sheets. vertex : (K,) the
-    vertices that are used, ascending. removed : (R,) triangles taken out, numbered one sheet after the other.
-    added : number of new triangles, the last ones of ``faces``. mismatch : of every two sheets over one another.
+    faces : (M, 3) int. pair : (M,) int, the part of all three corners, -1 where a triangle joins parts. vertex :
+    (K,) int, vertices that are used, ascending. removed : (R,) int, triangles taken out, numbered one part after the
+    other. added : number of new triangles, the last ones of ``faces``. mismatch : of every two parts that lie over
+    one another.
     """
 
     faces: Indices
@@ -91,52 +97,56 @@ class Merged:
 
 
 def merge(
-    sheets: Sequence[SurfacePart],
+    parts: Sequence[SurfacePart],
     heuristic: str = "combined",
     weights: Mapping[str, float] | None = None,
     seam: Seam = Seam(),
-) -> Merged:
-    """Join sheets into one surface: sound, without a place covered twice.
+) -> MergedSurface:
+    """Merge several surfaces into one that is sound and covers no place twice.
 
-    heuristic : "correlation", "distance", "orientation" or "combined": which triangles of an overlap are worst.
-    weights : of the combination, by measure.
-    Raises ValueError for an unknown heuristic or measure.
+    heuristic : which triangles of an overlap are worst: "correlation", "distance", "orientation" or "combined".
+    weights : of the measures, by name, instead of those of the heuristic. seam : lengths by which surfaces are
+    joined. Raises ValueError for an unknown heuristic or measure.
     """
     if heuristic not in HEURISTICS:
         raise ValueError(f"no heuristic '{heuristic}'; there are {', '.join(HEURISTICS)}")
     chosen = HEURISTICS[heuristic] if weights is None else weights
     if unknown := set(chosen) - set(MEASURES):
         raise ValueError(f"no measure '{unknown.pop()}'; there are {', '.join(MEASURES)}")
-    mesh, owner, correlation = _together(sheets)
+    mesh, owner, correlation = _concatenate(parts)
     if not len(mesh.faces):
-        return Merged(mesh.faces, owner, np.zeros(0, np.int64), np.zeros(0, np.int64), 0, ())
-    edge = Seam.mean_edge(sheets)
+        return MergedSurface(mesh.faces, owner, np.zeros(0, np.int64), np.zeros(0, np.int64), 0, ())
+    edge = Seam.mean_edge(parts)
     overlap = _Overlap.of(mesh, owner, correlation, chosen, seam.layers * edge)
-    with ThreadPoolExecutor(1) as pool:  # the mismatches beside what has to go one after the other
-        apart = pool.submit(mismatches, sheets, seam.layers * edge)
-        kept = _without_overlap(mesh, owner, overlap, seam.gap * edge, seam.layers * edge)
-        faces, pair, added = _joined(mesh, mesh.faces[kept], owner, sheets, seam, edge)
-        return Merged(faces, pair, np.unique(faces), np.flatnonzero(~kept), added, apart.result())
+    with ThreadPoolExecutor(1) as pool:  # the mismatches while the rest runs
+        distances = pool.submit(mismatches, parts, seam.layers * edge)
+        living = _without_overlap(mesh, owner, overlap, seam.gap * edge, seam.layers * edge)
+        faces, pair, added = _close_gaps(mesh, mesh.faces[living], owner, parts, seam, edge)
+        return MergedSurface(faces, pair, np.unique(faces), np.flatnonzero(~living), added, distances.result())
 
 
-def _together(sheets: Sequence[SurfacePart]) -> tuple[Mesh, Indices, Floats]:
-    """All sheets as one mesh, each triangle's sheet (M,) and worst correlation (M,), NaN if lost."""
-    offsets = np.cumsum([0, *(len(sheet.vertices) for sheet in sheets)])
-    faces = [sheet.faces + offset for sheet, offset in zip(sheets, offsets, strict=False)]
+def _concatenate(parts: Sequence[SurfacePart]) -> tuple[Mesh, Indices, Floats]:
+    """All parts as one mesh, with the part and the largest correlation coefficient, NaN if lost, of each
+    triangle (M,).
+    """
+    offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=False)]
     mesh = Mesh(
-        np.concatenate([np.zeros((0, 3)), *(sheet.vertices for sheet in sheets)]),
+        np.concatenate([np.zeros((0, 3)), *(part.vertices for part in parts)]),
         np.concatenate([np.zeros((0, 3), np.int64), *faces]),
     )
-    owner = np.repeat(np.arange(len(sheets)), [len(sheet.faces) for sheet in sheets])
-    values = np.concatenate([np.zeros(0), *(sheet.correlation for sheet in sheets)])
+    owner = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
+    values = np.concatenate([np.zeros(0), *(part.correlation for part in parts)])
     return mesh, owner, values[mesh.faces].max(axis=1)
 
 
 @dataclass(frozen=True)
 class _Overlap:
-    """What lies over one another: pairs (P, 2) of triangles, the first covered by the second.
+    """Overlap of the parts: which triangles lie over one another, and how bad each is.
 
-    beside : (M, 3), of ``neighbours``. lost : (M,) triangles with a lost corner. bad : (M,), those the worst of all.
+    over : (P, 2), pairs of triangles, the first covered by the second. beside : (M, 3), the neighbours of each
+    triangle, -1 at a border. lost : (M,) bool, triangles with a lost corner. bad : (M,), the larger the worse,
+    largest where lost.
     """
 
     over: Indices
@@ -148,7 +158,11 @@ class _Overlap:
     def of(
         cls, mesh: Mesh, owner: Indices, correlation: Floats, weights: Mapping[str, float], reach: float
     ) -> _Overlap:
-        """Of triangles whose surface (M,) and correlation (M,) are given; reach : mm. Works on all cores."""
+        """Determine the overlap, on all cores.
+
+        owner : (M,), part of each triangle. correlation : (M,). weights : of the measures. reach : mm, along the
+        normals.
+        """
         covered, lost, beside = cover(mesh, owner, reach), np.isnan(correlation), face_neighbours(mesh.faces)
         bad = badness(mesh, beside, owner, covered, np.where(lost, 0.0, correlation), weights)
         bad[lost] += 1 + np.ptp(bad)
@@ -156,56 +170,61 @@ class _Overlap:
 
 
 def _without_overlap(mesh: Mesh, owner: Indices, overlap: _Overlap, gap: float, reach: float) -> Mask:
-    """Triangles (M,) left when no place is covered twice and the gap, mm, is kept; reach : mm."""
+    """Triangles (M,) that are left when no place is covered twice and a gap remains. gap, reach : mm."""
     over, beside, lost, bad = overlap.over, overlap.beside, overlap.lost, overlap.bad
-    # First what covers one another's middles, then, of the little that is left, what overlaps or is too close at all.
-    left = np.ones(len(mesh.faces), bool)
-    left[over[lost[over[:, 0]] & ~lost[over[:, 1]], 0]] = False
-    left = peel(beside, left, over, bad)
-    left = peel(beside, left, _close(mesh, owner, left, gap, reach), bad)
-    for _ in range(2):  # where small pieces were dropped, the others may come back
-        left = _tidy(mesh, left)
-        free = ~left & ~lost
-        free[over[left[over[:, 1]], 0]] = False
-        free[over[left[over[:, 0]], 1]] = False
-        close = np.concatenate([over, _close(mesh, owner, left | free, gap, reach)])
-        left = regrow(beside, left, free, close, bad)
-    return _tidy(mesh, left)
+    # First triangles that cover one another's centroids, then those of the few left that overlap or are too close.
+    living = np.ones(len(mesh.faces), bool)
+    living[over[lost[over[:, 0]] & ~lost[over[:, 1]], 0]] = False
+    living = peel(beside, living, over, bad)
+    living = peel(beside, living, _close(mesh, owner, living, gap, reach), bad)
+    for _ in range(2):  # where small pieces were dropped, others may come back
+        living = _tidy(mesh, living)
+        free = ~living & ~lost
+        free[over[living[over[:, 1]], 0]] = False
+        free[over[living[over[:, 0]], 1]] = False
+        close = np.concatenate([over, _close(mesh, owner, living | free, gap, reach)])
+        living = regrow(beside, living, free, close, bad)
+    return _tidy(mesh, living)
 
 
 def _close(mesh: Mesh, owner: Indices, which: Mask, gap: float, reach: float) -> Indices:
+    """Pairs (P, 2) among the triangles of a mask (M,) that lie over one another or closer than the gap, mm."""
     at = np.flatnonzero(which)
-    return at[closer_than(Mesh(mesh.vertices, mesh.faces[at]), owner[at], gap, reach)]
+    return at[close_pairs(Mesh(mesh.vertices, mesh.faces[at]), owner[at], gap, reach)]
 
 
-def _tidy(mesh: Mesh, kept: Mask) -> Mask:
+def _tidy(mesh: Mesh, living: Mask) -> Mask:
     """Triangles (M,) left without pieces of a few triangles and without fans that touch in a point only."""
-    at = np.flatnonzero(kept)
+    at = np.flatnonzero(living)
     while True:
-        part = Mesh(mesh.vertices, mesh.faces[at])
-        piece = pieces(part)
-        left = (np.bincount(piece)[piece] >= _FEWEST) & without_pinches(part)
+        mesh_part = Mesh(mesh.vertices, mesh.faces[at])
+        piece = pieces(mesh_part)
+        left = (np.bincount(piece)[piece] >= _FEWEST) & without_pinches(mesh_part)
         if left.all():
-            result = np.zeros(len(kept), bool)
+            result = np.zeros(len(living), bool)
             result[at] = True
             return result
         at = at[left]
 
 
-def _joined(
-    mesh: Mesh, old: Indices, owner: Indices, sheets: Sequence[SurfacePart], seam: Seam, edge: float
+def _close_gaps(
+    mesh: Mesh, triangles: Indices, owner: Indices, parts: Sequence[SurfacePart], seam: Seam, edge: float
 ) -> tuple[Indices, Indices, int]:
-    """Triangles (M, 3) with gaps stitched and holes filled, their sheets (M,), and how many are new."""
-    sheet_of = np.repeat(np.arange(len(sheets)), [len(sheet.vertices) for sheet in sheets])
-    new = stitch(Mesh(mesh.vertices, old), sheet_of, seam.bridge * edge)
-    whole = Mesh(mesh.vertices, np.concatenate([old, new]))
+    """Stitch the gaps between the parts and fill the holes.
+
+    triangles : (M, 3), left of the parts. edge : mm, their mean edge. Returns all triangles (M', 3), their parts
+    (M',), -1 where they join parts, and the number of new ones.
+    """
+    part_of = np.repeat(np.arange(len(parts)), [len(part.vertices) for part in parts])
+    new = stitch(Mesh(mesh.vertices, triangles), part_of, seam.bridge * edge)
+    whole = Mesh(mesh.vertices, np.concatenate([triangles, new]))
     seam_vertex = np.zeros(len(mesh.vertices), bool)
     seam_vertex[new] = True
-    more = fill(whole, seam.hole * edge**2, seam.bridge * edge, seam_vertex, seam.seam_hole * edge**2)
-    faces = np.concatenate([whole.faces, more])
-    is_new = np.arange(len(faces)) >= len(old)
+    fillings = fill(whole, seam.hole * edge**2, seam.bridge * edge, seam_vertex, seam.seam_hole * edge**2)
+    faces = np.concatenate([whole.faces, fillings])
+    is_new = np.arange(len(faces)) >= len(triangles)
     sound = without_pinches(Mesh(mesh.vertices, faces))
     faces, is_new = faces[sound], is_new[sound]
-    corners = sheet_of[faces]
+    corners = part_of[faces]
     pair = np.where((corners == corners[:, :1]).all(axis=1), corners[:, 0], -1)
     return faces, pair, int(is_new.sum())

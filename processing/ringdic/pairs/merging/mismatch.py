@@ -1,4 +1,4 @@
-"""How far two surfaces lie apart where both measured the same place (Solav et al. 2018, Fig. 7a)."""
+"""Distances between two surfaces where both measured the same place (Solav et al. 2018, Fig. 7a)."""
 
 from __future__ import annotations
 
@@ -12,27 +12,31 @@ from typing import Protocol
 import numba as nb
 import numpy as np
 
-from ringdic.arrays import Floats, Indices, Mask
+from ringdic.arrays import Floats, Indices, Mask, Points
 from ringdic.mesh.adjacency import shared_edges
 from ringdic.mesh.mesh import Mesh, half_edges
 from ringdic.mesh.projection import Projector
 
 
 class Surface(Protocol):
-    """Vertices (N, 3) mm and faces (M, 3), normals outwards."""
+    """A triangulated surface whose normals point outwards."""
 
     @property
-    def vertices(self) -> Floats: ...
+    def vertices(self) -> Points:
+        """Vertices (N, 3) mm, NaN where lost."""
+
     @property
-    def faces(self) -> Indices: ...
+    def faces(self) -> Indices:
+        """Triangles (M, 3), indices of their vertices."""
 
 
 @dataclass(frozen=True)
 class Mismatch:
-    """Of two sheets, by their numbers: distances between them where they lie over one another, both ways, mm.
+    """Distances between two surfaces, by their numbers, where they lie over one another; both ways, mm.
 
-    points : how many vertices were compared. mean, std : of the distances' lengths, the paper's figure. bias : mean
-    with sign, positive where ``second`` lies outside ``first``. rms : of the distances. largest : of their lengths.
+    points : number of vertices compared. mean, std : of the absolute distances, the article's figure. bias : mean of
+    the signed distances, positive where ``second`` lies outside ``first``. rms : of the distances. largest : of
+    their absolute values.
     """
 
     first: int
@@ -45,8 +49,11 @@ class Mismatch:
     largest: float
 
 
-def mismatches(sheets: Sequence[Surface], reach: float, fewest: int = 20) -> tuple[Mismatch, ...]:
-    """The mismatch of every two sheets that share at least ``fewest`` vertices; reach : mm, of one to the other."""
+def mismatches(surfaces: Sequence[Surface], reach: float, fewest: int = 20) -> tuple[Mismatch, ...]:
+    """Mismatch of every two surfaces that share at least ``fewest`` vertices.
+
+    reach : mm, greatest distance along the normal from one surface to the other.
+    """
 
     def between(pair: tuple[int, int]) -> Mismatch | None:
         i, j = pair
@@ -55,16 +62,17 @@ def mismatches(sheets: Sequence[Surface], reach: float, fewest: int = 20) -> tup
         return _summary(i, j, signed) if len(signed) >= fewest else None
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        curved = list(pool.map(lambda s: Curved(Mesh(s.vertices, s.faces).without_lost(), reach), sheets))
-        found = pool.map(between, combinations(range(len(curved)), 2))
-        return tuple(one for one in found if one is not None)
+        curved = list(pool.map(lambda s: CurvedSurface(Mesh(s.vertices, s.faces).without_lost(), reach), surfaces))
+        pairs = pool.map(between, combinations(range(len(curved)), 2))
+        return tuple(mismatch for mismatch in pairs if mismatch is not None)
 
 
-class Curved:
-    """A surface that is curved between its vertices, by their normals: exactly for one of the second degree.
+class CurvedSurface:
+    """A mesh whose triangles are curved according to the vertex normals, exact for a surface of the second degree.
 
-    (Half of what Phong tessellation adds, Boubekeur and Alexa 2008.) A flat triangle's middle lies below a convex
-    body by edge²/8R, which is no mismatch of two surfaces. reach : mm, how far off a point may lie.
+    The middle of a flat triangle lies below a convex body by edge²/8R, which is no mismatch of two surfaces. The
+    curvature added is half of that of Phong tessellation (Boubekeur and Alexa 2008). reach : mm, greatest distance
+    of a point.
     """
 
     def __init__(self, mesh: Mesh, reach: float) -> None:
@@ -72,21 +80,21 @@ class Curved:
         before, alone = shared_edges(half)
         self.mesh = mesh
         self.used = np.unique(mesh.faces)
-        self.normals = _averaged(np.nan_to_num(mesh.vertex_normals), half, before)
+        self.normals = _average_normals(np.nan_to_num(mesh.vertex_normals), half, before)
         self._projector = Projector(mesh, reach)
         on_border = np.zeros(len(mesh.vertices), bool)
         on_border[half[alone]] = True
-        self._inner: Mask = ~np.asarray(on_border[mesh.faces].any(axis=1))
+        self._is_inner: Mask = ~np.asarray(on_border[mesh.faces].any(axis=1))
 
-    def outside(self, other: Curved) -> Floats:
-        """How far the vertices (N,) of another surface lie outside this one, along its normal, mm.
+    def outside(self, other: CurvedSurface) -> Floats:
+        """Signed distances of the vertices of another surface from this one, along its normal, positive outwards.
 
-        NaN for a vertex over no triangle, or over one at the border, whose normals are one-sided.
+        Returns (N,) mm, NaN for a vertex over no triangle, or over one at the border, whose normals are one-sided.
         """
         result = np.full(len(other.mesh.vertices), np.nan)
         points, directions = other.mesh.vertices[other.used], other.normals[other.used]
         hits = self._projector.hits(points, directions)
-        over = self._inner[hits.face]
+        over = self._is_inner[hits.face]
         point, face = hits.point[over], self.mesh.faces[hits.face[over]]
         result[other.used[point]] = _above(
             points[point],
@@ -102,9 +110,10 @@ class Curved:
 
 @nb.njit(cache=True, nogil=True)
 def _above(points, directions, corners, weights, height, vertices, normals):  # type: ignore[no-untyped-def]
-    """How far points (n, 3) lie above the curved triangles that their lines along directions (n, 3) hit, (n,) mm.
+    """Heights of points above the curved triangles that their lines along given directions hit.
 
-    corners (n, 3), weights (n, 3), height (n,) of the hits. vertices, normals (N, 3).
+    points, directions : (n, 3). corners (n, 3), weights (n, 3), height (n,) : of the hits. vertices, normals : (N, 3).
+    Returns (n,) mm.
     """
     out = np.empty(len(points))
     for p in range(len(points)):
@@ -124,10 +133,10 @@ def _above(points, directions, corners, weights, height, vertices, normals):  # 
 
 
 @nb.njit(cache=True, nogil=True)
-def _averaged(normals, half, before):  # type: ignore[no-untyped-def]
-    """Unit normals (N, 3) averaged with those of the neighbours: measured slopes are noisy.
+def _average_normals(normals, half, before):  # type: ignore[no-untyped-def]
+    """Unit normals (N, 3) averaged with those of the neighbours, since measured slopes are noisy.
 
-    half, before : directed edges (3M, 2) and what ``shared_edges`` tells of them.
+    half, before : directed edges (3M, 2) and what ``shared_edges`` gives for them.
     """
     total = normals.copy()
     for h in range(len(half)):
@@ -144,6 +153,7 @@ def _averaged(normals, half, before):  # type: ignore[no-untyped-def]
 
 
 def _summary(first: int, second: int, signed: Floats) -> Mismatch:
+    """Mismatch of two surfaces from their signed distances (n,) mm."""
     length = np.abs(signed)
     return Mismatch(
         first=first,

@@ -1,8 +1,8 @@
-"""Where surfaces lie over one another, and which triangles go.
+"""Overlaps of several surfaces, and which of their triangles are removed.
 
 Two triangles of different surfaces *compete* when they cover the same place, or come closer to one another than the
-gap that is to be left. Triangles at the border of their surface are removed, the worst of all first, until no two
-compete (Solav et al. 2018, overlap removal; there for two surfaces, here for any number at once).
+gap that is to be left. Triangles at the border of their surface are removed, the worst first, until no two compete
+(overlap removal of Solav et al. 2018, for any number of surfaces at once instead of two).
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from ringdic.mesh.nearest import away_from_other_labels, cubes
 from ringdic.mesh.projection import Projector, triangle_spheres
 from ringdic.pairs.merging import kernels
 
-#: What the combination weighs, each relative to its median over the overlaps.
+#: Measures of how bad a triangle is, each relative to its median over the overlaps.
 MEASURES = ("correlation", "distance", "orientation", "margin")
 
-_SMOOTHING = 6  # rounds of averaging over neighbouring triangles: a single triangle's noise does not decide
-_PARTS = 16  # of the triangles, that cores share
+_SMOOTHING = 6  # rounds of averaging over neighbouring triangles, so that no single triangle's noise decides
+_PARTS = 16  # into which the triangles are divided among the cores
 _SAME_SIDE = 0.2  # least cosine between the normals of two layers of one surface
 
 
 @dataclass(frozen=True)
 class Cover:
-    """Triangles that lie under or over the middle of a triangle of another surface: P ordered pairs.
+    """Triangles that lie under or over the centroid of a triangle of another surface: P ordered pairs.
 
-    own, other : (P,) triangles. height : (P,) mm, from the middle of ``own`` to ``other`` along the normal.
-    angle : (P,) rad between the normals.
+    own, other : (P,) int, triangles. height : (P,) mm, from the centroid of ``own`` to ``other`` along the normal.
+    angle : (P,) rad, between the normals.
     """
 
     own: Indices
@@ -44,7 +44,10 @@ class Cover:
 
 
 def cover(mesh: Mesh, owner: Indices, reach: float) -> Cover:
-    """Which triangles' middles are covered by another surface. owner : (M,) surface of each triangle; reach : mm."""
+    """Determine which triangles' centroids are covered by another surface.
+
+    owner : (M,) int, surface of each triangle. reach : mm, greatest distance along the normal.
+    """
     centroids, normals = mesh.centroids, mesh.normals
     parts = [np.flatnonzero(owner == k) for k in range(owner.max(initial=-1) + 1)]
 
@@ -53,26 +56,27 @@ def cover(mesh: Mesh, owner: Indices, reach: float) -> Cover:
 
     def over(k: int) -> list[tuple[Indices, Indices, Floats]]:
         """What the other surfaces cover of surface k."""
-        part, found = parts[k], []
+        part, covers = parts[k], []
         for j, surface in enumerate(surfaces):
             if j != k:
                 hits = surface.hits(centroids[part], normals[part])
-                found.append((part[hits.point], parts[j][hits.face], hits.height))
-        return found
+                covers.append((part[hits.point], parts[j][hits.face], hits.height))
+        return covers
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         surfaces = list(pool.map(projector, parts))
-        found = [row for rows in pool.map(over, range(len(parts))) for row in rows]
-    own, other = (np.concatenate([row[i] for row in found] or [np.zeros(0)]).astype(np.int64) for i in (0, 1))
-    height = np.concatenate([row[2] for row in found] or [np.zeros(0)])
+        covers = [row for rows in pool.map(over, range(len(parts))) for row in rows]
+    own, other = (np.concatenate([row[i] for row in covers] or [np.zeros(0)]).astype(np.int64) for i in (0, 1))
+    height = np.concatenate([row[2] for row in covers] or [np.zeros(0)])
     cosine = np.einsum("ni,ni->n", normals[own], normals[other])
     return Cover(own, other, height, np.arccos(np.clip(cosine, -1, 1)))
 
 
-def closer_than(mesh: Mesh, owner: Indices, gap: float, reach: float) -> Indices:
-    """Pairs (P, 2) of triangles of different surfaces that lie over one another or closer than ``gap`` mm beside.
+def close_pairs(mesh: Mesh, owner: Indices, gap: float, reach: float) -> Indices:
+    """Pairs of triangles of different surfaces that lie over one another or closer than a gap beside one another.
 
-    Seen along the mean of the two normals; ``reach`` mm is how far apart along it two layers may lie.
+    Both are judged along the mean of the two normals. owner : (M,) int, surface of each triangle. gap : mm, beside.
+    reach : mm, greatest distance of two layers along that mean. Returns (P, 2) indices.
     """
     corners = mesh.vertices[mesh.faces]
     centroids, normals, radius = triangle_spheres(corners)
@@ -84,10 +88,10 @@ def closer_than(mesh: Mesh, owner: Indices, gap: float, reach: float) -> Indices
     inside = away_from_other_labels(middles, owner, common)
 
     def pairs(first: int, last: int) -> Indices:
-        found = kernels.closer(
+        close = kernels.closer(
             middles, inside, owner, normals, corners, radius, usual, gap, reach, _SAME_SIDE, first, last
         )
-        return np.asarray(found)
+        return np.asarray(close)
 
     bounds = np.linspace(0, len(radius), _PARTS + 1).astype(np.int64)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -97,12 +101,24 @@ def closer_than(mesh: Mesh, owner: Indices, gap: float, reach: float) -> Indices
 def badness(
     mesh: Mesh, beside: Indices, owner: Indices, covered: Cover, correlation: Floats, weights: Mapping[str, float]
 ) -> Floats:
-    """How bad each triangle is, (M,), in medians over the overlaps: the weighted sum of the measures.
+    """Badness of each triangle: weighted sum of measures, each divided by its median over the overlaps.
 
-    beside : (M, 3), of ``neighbours``. owner : (M,) surface of each triangle. correlation : (M,) its C_LS.
-    Measures: ``correlation``; ``distance`` to the other surfaces; ``orientation``, the angle to the other surfaces'
-    normals; ``margin``, how near the triangle lies to the border of its own surface, where it was seen at the steepest
-    angles.
+    The measures are ``correlation``, the coefficient C_LS; ``distance`` to the other surfaces; ``orientation``, the
+    angle to the other surfaces' normals; and ``margin``, how near the triangle lies to the border of its own
+    surface, where the cameras saw it at the steepest angles.
+
+    Parameters
+    ----------
+    mesh : all surfaces as one mesh.
+    beside : (M, 3) indices of the neighbours of each triangle.
+    owner : (M,) int, its surface.
+    covered : the overlaps.
+    correlation : (M,) C_LS.
+    weights : of the measures, by name.
+
+    Returns
+    -------
+    (M,) without unit, the larger the worse.
     """
     M = len(mesh.faces)
     hits = np.bincount(covered.own, minlength=M)
@@ -116,13 +132,15 @@ def badness(
     total = np.zeros(M)
     for name, values in measures.items():
         if weights.get(name, 0.0):
-            smooth = kernels.smoothed(values, everywhere if name == "correlation" else hidden, beside, _SMOOTHING)
-            usual = float(np.median(smooth[hidden])) if hidden.any() else 0.0
-            total += weights[name] * smooth / (usual or 1.0)
+            smooth = kernels.smooth_over_neighbours(
+                values, everywhere if name == "correlation" else hidden, beside, _SMOOTHING
+            )
+            median = float(np.median(smooth[hidden])) if hidden.any() else 0.0
+            total += weights[name] * smooth / (median or 1.0)
     if weights.get("margin", 0.0):
         depth = _from_border(mesh, owner)
-        usual = float(np.median(depth[hidden])) if hidden.any() else 0.0
-        total -= weights["margin"] * depth / (usual or 1.0)
+        median = float(np.median(depth[hidden])) if hidden.any() else 0.0
+        total -= weights["margin"] * depth / (median or 1.0)
     return total
 
 
@@ -142,25 +160,28 @@ def _from_border(mesh: Mesh, owner: Indices) -> Floats:
 
 
 def peel(beside: Indices, alive: Mask, competing: Indices, bad: Floats) -> Mask:
-    """Triangles (M,) left when, worst first, border triangles that compete with others left are removed.
+    """Remove border triangles that compete with remaining ones, the worst first, until no two compete.
 
-    beside : (M, 3), of ``neighbours``. alive : (M,) to begin with. competing : (P, 2). bad : (M,).
+    beside : (M, 3) indices of the neighbours of each triangle. alive : (M,) bool, to begin with. competing : (P, 2)
+    indices. bad : (M,), the larger the worse. Returns the triangles that remain, (M,) bool.
     """
     competing = competing[alive[competing].all(axis=1)]
     start, rival = kernels.rivals(len(beside), competing)
-    kept = alive.copy()
-    kernels.peel_triangles(start, rival, beside, kept, bad)
-    for first, second in competing[kept[competing].all(axis=1)].tolist():  # what no border reached
-        if kept[first] and kept[second]:
-            kept[first if bad[first] > bad[second] else second] = False
-    return kept
+    living = alive.copy()
+    kernels.peel_triangles(start, rival, beside, living, bad)
+    for first, second in competing[living[competing].all(axis=1)].tolist():  # pairs that no border reached
+        if living[first] and living[second]:
+            living[first if bad[first] > bad[second] else second] = False
+    return living
 
 
 def regrow(beside: Indices, alive: Mask, candidate: Mask, competing: Indices, bad: Floats) -> Mask:
-    """Triangles (M,) there when those that compete with none left are put back, beside what is left of their surface.
+    """Put removed triangles that compete with none of the remaining ones back beside those of their own surface.
 
-    beside : (M, 3), of ``neighbours``. candidate : (M,) that may come back. competing : (P, 2) among those alive and
-    the candidates. The ones with most neighbours there come first, of these the best.
+    Those with most neighbours come first, of these the best. beside : (M, 3) indices of the neighbours of each
+    triangle. alive : (M,) bool, triangles that remain. candidate : (M,) bool, triangles that may come back.
+    competing : (P, 2) indices, among those alive and the candidates. bad : (M,), the larger the worse. Returns the
+    triangles there then, (M,) bool.
     """
     start, rival = kernels.rivals(len(beside), competing)
     living = alive.copy()

@@ -1,4 +1,4 @@
-"""The stars of border vertices in the gap between surfaces, compiled."""
+"""Stars of border vertices in the gap between surfaces, compiled: the Delaunay triangles that touch each of them."""
 
 from __future__ import annotations
 
@@ -15,52 +15,54 @@ _TOLERANCE = 1e-6  # rad
 
 @nb.njit(cache=True, nogil=True)
 def stars(middles, vertices, at, normals, group, start, onward, back, bridge, same_side, thinnest):  # type: ignore[no-untyped-def]
-    """Triangles (K, 3) of the stars of border vertices (B,) in the gap, one star after the other.
+    """Triangles of the stars of border vertices in the gap, one star after the other.
 
-    Corners are counter-clockwise seen against the normal, the smallest index first. middles : vertices (N, 3) in cubes.
-    at, normals : (N, 3). group : (N,). start (N + 1,), onward : ends of the border edges that leave each vertex in one
-    row. back : (N,) start of the border edge that enters, -1 where none does. Others as in ``stitch``.
+    middles : all vertices (N, 3) mm sorted into cubes. vertices : (B,), the border vertices. at, normals : (N, 3).
+    group : (N,). start (N + 1,), onward : ends of the border edges that leave each vertex, in one row. back : (N,),
+    start of the border edge that enters each vertex, -1 where none does. bridge : mm, longest edge. same_side :
+    least cosine between the normals of vertices of one side of the body. thinnest : least height of a triangle over
+    its longest edge. Returns (K, 3), counter-clockwise seen against the normal, the smallest index first.
     """
     N = len(at)
-    found, apart = np.empty(N, np.int64), np.empty(N)
+    nearby, distance = np.empty(N, np.int64), np.empty(N)
     flat, inverse = np.empty((N, 2)), np.empty((N, 2))
-    place = np.full(N, -1)  # in the neighbourhood
+    position = np.full(N, -1)  # in the list of nearby vertices
     result, count = np.empty((2 * len(vertices) + 16, 3), np.int64), 0
     for v in vertices:
         if start[v + 1] - start[v] != 1 or back[v] < 0:
             continue
-        some = near(middles, at[v, 0], at[v, 1], at[v, 2], bridge, found, apart)
-        names, meeting = _facing(v, found[:some], middles.order, normals, group, same_side)
+        count_nearby = near(middles, at[v, 0], at[v, 1], at[v, 2], bridge, nearby, distance)
+        names, meeting = _facing(v, nearby[:count_nearby], middles.order, normals, group, same_side)
         if not meeting or len(names) < 3:
             continue
         across = _tangents(names, normals)
         _spread(across, at, v, names, flat, inverse)
         begin, opening = _gap(across, at, v, back[v], onward[start[v]])
         for i in range(len(names)):
-            place[names[i]] = i
-        ring = delaunay_ring(inverse[: len(names)])
-        for k in range(len(ring)):
-            i, j = ring[k], ring[(k + 1) % len(ring)]
+            position[names[i]] = i
+        neighbours = delaunay_ring(inverse[: len(names)])
+        for k in range(len(neighbours)):
+            i, j = neighbours[k], neighbours[(k + 1) % len(neighbours)]
             b, c = names[i], names[j]
             if back[b] < 0 or back[c] < 0 or not _fits(flat[i], flat[j], begin, opening, thinnest):
                 continue
-            if _crossed(i, place[v], flat, names, place, start, onward):
+            if _crossed(i, position[v], flat, names, position, start, onward):
                 continue
-            if _crossed(j, place[v], flat, names, place, start, onward):
+            if _crossed(j, position[v], flat, names, position, start, onward):
                 continue
             if count == len(result):
                 result = np.concatenate((result, np.empty_like(result)))
             result[count, 0], result[count, 1], result[count, 2] = _from_smallest(v, b, c)
             count += 1
-        place[names] = -1
+        position[names] = -1
     return result[:count]
 
 
 @nb.njit(cache=True, nogil=True)
-def _facing(v, found, order, normals, group, same_side):  # type: ignore[no-untyped-def]
-    """Of the vertices found near v, those on its side of the body, and whether several groups meet there."""
-    names, count, meeting = np.empty(len(found), np.int64), 0, False
-    for k in found:
+def _facing(v, nearby, order, normals, group, same_side):  # type: ignore[no-untyped-def]
+    """Vertices near v on its side of the body, sorted, and whether several groups meet there."""
+    names, count, meeting = np.empty(len(nearby), np.int64), 0, False
+    for k in nearby:
         n = order[k]
         cosine = normals[n, 0] * normals[v, 0] + normals[n, 1] * normals[v, 1] + normals[n, 2] * normals[v, 2]
         if cosine > same_side:
@@ -74,7 +76,10 @@ def _facing(v, found, order, normals, group, same_side):  # type: ignore[no-unty
 
 @nb.njit(cache=True, nogil=True)
 def _tangents(names, normals):  # type: ignore[no-untyped-def]
-    """Two unit vectors (2, 3) across the mean normal of vertices, counter-clockwise seen against it."""
+    """Two unit vectors (2, 3) across the mean normal of vertices, counter-clockwise seen against it.
+
+    Without a case distinction but the sign (Duff et al. 2017).
+    """
     x, y, z = 0.0, 0.0, 0.0
     for n in names:
         x, y, z = x + normals[n, 0], y + normals[n, 1], z + normals[n, 2]
@@ -87,7 +92,7 @@ def _tangents(names, normals):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _flat(across, at, v, n):  # type: ignore[no-untyped-def]
-    """Place of vertex n in the tangent plane about v, mm."""
+    """Position of vertex n in the tangent plane about v, mm."""
     dx, dy, dz = at[n, 0] - at[v, 0], at[n, 1] - at[v, 1], at[n, 2] - at[v, 2]
     return (
         dx * across[0, 0] + dy * across[0, 1] + dz * across[0, 2],
@@ -97,9 +102,9 @@ def _flat(across, at, v, n):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _spread(across, at, v, names, flat, inverse):  # type: ignore[no-untyped-def]
-    """Vertices by name in the tangent plane about v, and their inversions in the unit circle.
+    """Positions of vertices in the tangent plane about v, and their inversions in the unit circle.
 
-    flat, inverse : (n, 2), changed in place; mm and 1/mm. What lies on v has no inversion: not a number.
+    flat, inverse : (n, 2), filled in place; mm and 1/mm. A vertex that lies on v has no inversion: not a number.
     """
     for i in range(len(names)):
         flat[i, 0], flat[i, 1] = _flat(across, at, v, names[i])
@@ -110,10 +115,11 @@ def _spread(across, at, v, names, flat, inverse):  # type: ignore[no-untyped-def
 
 @nb.njit(cache=True, nogil=True)
 def delaunay_ring(inverse):  # type: ignore[no-untyped-def]
-    """Delaunay neighbours of the origin, counter-clockwise: the convex hull of the points' inversions (n, 2).
+    """Delaunay neighbours of the origin, counter-clockwise, from the convex hull of the points' inversions.
 
-    A circle through the origin becomes a line: it is empty where all inversions lie on the origin's side of it. Of
-    neighbours on one circle the two outermost.
+    The points are inverted in the unit circle. A circle through the origin becomes a line, and is empty where all
+    inversions lie on the origin's side of that line. Of neighbours on one circle the two outermost are taken.
+    inverse : (n, 2). Returns indices.
     """
     n = len(inverse)
     first, farthest = -1, 0.0
@@ -121,9 +127,9 @@ def delaunay_ring(inverse):  # type: ignore[no-untyped-def]
         away = inverse[i, 0] ** 2 + inverse[i, 1] ** 2
         if away > farthest:
             first, farthest = i, away
-    ring, count, here = np.empty(n, np.int64), 0, first
+    neighbours, count, here = np.empty(n, np.int64), 0, first
     while here >= 0 and count < n:
-        ring[count] = here
+        neighbours[count] = here
         count += 1
         ahead, reach = -1, 0.0
         for j in range(n):
@@ -134,12 +140,12 @@ def delaunay_ring(inverse):  # type: ignore[no-untyped-def]
             if side < 0 or (side == 0 and step > reach):
                 ahead, reach = j, step
         here = -1 if ahead == first else ahead
-    return ring[:count]
+    return neighbours[:count]
 
 
 @nb.njit(cache=True, nogil=True)
 def _beside(points, a, b, c):  # type: ignore[no-untyped-def]
-    """Twice the area of the triangle of three points (n, 2) by number, positive counter-clockwise."""
+    """Twice the area of the triangle of three of the points (n, 2), positive counter-clockwise."""
     return (points[b, 0] - points[a, 0]) * (points[c, 1] - points[a, 1]) - (points[b, 1] - points[a, 1]) * (
         points[c, 0] - points[a, 0]
     )
@@ -147,7 +153,7 @@ def _beside(points, a, b, c):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _gap(across, at, v, behind, ahead):  # type: ignore[no-untyped-def]
-    """Direction of the border edge that comes in to v, and the angle counter-clockwise to the one that goes out."""
+    """Direction of the border edge that enters v, and the angle from it counter-clockwise to the one that leaves."""
     x, y = _flat(across, at, v, behind)
     begin = math.atan2(y, x)
     x, y = _flat(across, at, v, ahead)
@@ -168,12 +174,12 @@ def _fits(b, c, begin, opening, thinnest):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def _crossed(i, own, flat, names, place, start, onward):  # type: ignore[no-untyped-def]
-    """Whether the segment from the origin to point i crosses a border edge that has neither as an end."""
+def _crossed(i, own, flat, names, position, start, onward):  # type: ignore[no-untyped-def]
+    """Whether the segment from the origin to point i crosses a border edge that ends at neither."""
     tx, ty = flat[i, 0], flat[i, 1]
     for j in range(len(names)):
         for e in range(start[names[j]], start[names[j] + 1]):
-            k = place[onward[e]]
+            k = position[onward[e]]
             if k < 0 or own in (j, k) or i in (j, k):
                 continue
             px, py, qx, qy = flat[j, 0], flat[j, 1], flat[k, 0], flat[k, 1]
@@ -186,7 +192,7 @@ def _crossed(i, own, flat, names, place, start, onward):  # type: ignore[no-unty
 
 @nb.njit(cache=True, nogil=True)
 def _from_smallest(a, b, c):  # type: ignore[no-untyped-def]
-    """The same triangle, its smallest index first."""
+    """Corners of a triangle rotated so that the smallest index comes first."""
     if a < b and a < c:
         return a, b, c
     return (b, c, a) if b < c else (c, a, b)

@@ -1,9 +1,9 @@
-"""Gaps between surfaces closed with triangles over the vertices that are there.
+"""Stitching of the gaps between surfaces, with triangles between vertices that are there.
 
-Every border vertex is looked at in its own tangent plane: the Delaunay triangles of its neighbourhood that touch it
-are its star. A triangle is taken when it is in the stars of all three of its corners, lies beside the triangles that
-are there, crosses none of their borders and has no edge longer than the bridge. What the stars do not agree on (four
-points on a circle, a border that is not Delaunay) is left to :mod:`ringdic.pairs.merging.fill`.
+Every border vertex is considered in its own tangent plane: the Delaunay triangles of its neighbourhood that touch it
+are its star. A triangle is accepted when it is in the stars of all three of its corners, lies beside the triangles that
+are there, crosses none of their borders and has no edge longer than the bridge. Where the stars do not agree (four
+points on a circle, a border that is not Delaunay) the gap is left to :mod:`ringdic.pairs.merging.fill`.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from ringdic.mesh.nearest import cubes
 from ringdic.pairs.merging.stars import stars
 
 _SAME_SIDE = 0.2  # least cosine between the normals of vertices of one side of the body
-THINNEST = 0.1  # least height of a new triangle over its longest edge: thinner ones have no direction and no strain
+THINNEST = 0.1  # least height of a new triangle over its longest edge: a thinner one has no usable normal or strain
 
 
 def stitch(mesh: Mesh, group: Indices, bridge: float) -> Indices:
-    """Triangles (K, 3) that join what belongs to different groups, turned as the surface is.
+    """Join different groups of vertices with triangles across the gaps between them.
 
-    mesh : sound pieces side by side. group : (N,) of each vertex; only near where groups meet are gaps closed.
-    bridge : mm, longest edge of a new triangle.
+    mesh : sound pieces side by side. group : (N,) int, of each vertex; gaps are closed only where groups meet.
+    bridge : mm, longest edge of a new triangle. Returns (K, 3) indices, turned as the surface is.
     """
     border = mesh.boundary_edges()
     if not len(border):
@@ -39,28 +39,28 @@ def stitch(mesh: Mesh, group: Indices, bridge: float) -> Indices:
     start = np.searchsorted(edges[:, 0], np.arange(len(used) + 1))
     back = np.full(len(used), -1)
     back[edges[:, 1]] = edges[:, 0]
-    found = stars(
+    triangles_of_stars = stars(
         cubes(at, bridge / 2), np.unique(edges), at, normals, group[used], start, edges[:, 1].copy(), back,
         bridge, _SAME_SIDE, THINNEST,
     )  # fmt: skip
-    triangles, first, votes = np.unique(found, axis=0, return_index=True, return_counts=True)
+    triangles, first, votes = np.unique(triangles_of_stars, axis=0, return_index=True, return_counts=True)
     agreed = np.argsort(first[votes == 3])
     return used[_consistent(triangles[votes == 3][agreed], at, edges)]
 
 
 def _consistent(candidates: Indices, at: Floats, edges: Indices) -> Indices:
-    """Of triangles (K, 3), those that fit to the border edges and to one another, the ones with short edges first."""
+    """Triangles (K, 3) that fit to the border edges and to one another, those with short edges first."""
     corners = at[candidates]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1, initial=0.0)
-    taken = set(map(tuple, edges.tolist()))
-    count = Counter((min(a, b), max(a, b)) for a, b in taken)
-    chosen = []
+    half_edges = set(map(tuple, edges.tolist()))
+    count = Counter((min(a, b), max(a, b)) for a, b in half_edges)
+    consistent = []
     for a, b, c in candidates[np.argsort(longest, kind="stable")].tolist():
         half = ((a, b), (b, c), (c, a))
         undirected = [(min(e), max(e)) for e in half]
-        if any(e in taken for e in half) or any(count[e] > 1 for e in undirected):
+        if any(e in half_edges for e in half) or any(count[e] > 1 for e in undirected):
             continue
-        taken.update(half)
+        half_edges.update(half)
         count.update(undirected)
-        chosen.append((a, b, c))
-    return np.array(chosen, np.int64).reshape(-1, 3)
+        consistent.append((a, b, c))
+    return np.array(consistent, np.int64).reshape(-1, 3)

@@ -15,7 +15,7 @@ from ringdic.mesh.topology import (
     overlap_area,
     pieces,
 )
-from ringdic.pairs.merging import HEURISTICS, Merged, Seam, SurfacePart, merge
+from ringdic.pairs.merging import HEURISTICS, MergedSurface, Seam, SurfacePart, merge
 
 RADIUS = 40.0
 
@@ -47,7 +47,7 @@ def ring(count: int = 6, width: float = 100.0, noise: float = 0.02) -> list[Surf
     return [strip(360 / count * k, width, seed=k, noise=noise) for k in range(count)]
 
 
-def joined(sheets: Sequence[SurfacePart], merged: Merged) -> Mesh:
+def joined(sheets: Sequence[SurfacePart], merged: MergedSurface) -> Mesh:
     return Mesh(np.concatenate([sheet.vertices for sheet in sheets]), merged.faces)
 
 

@@ -1,4 +1,4 @@
-"""Where the cameras stand: a turned target is followed, cameras taken for one another and turned images are refused."""
+"""Azimuths of the cameras: a rotated target is recognised, exchanged cameras and rotated images are refused."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from ringdic.calibration.azimuths import AzimuthCandidates, azimuth_candidates, camera_azimuths
 from ringdic.calibration.dots import Dots, find_dots
-from ringdic.calibration.labels import has_labels, read_labels
-from ringdic.calibration.survey import Sight, sight, survey
-from ringdic.calibration.target import identify, possible_azimuths
+from ringdic.calibration.labels import column_labels, has_labels
+from ringdic.calibration.target import identify_dots, possible_azimuths
 from ringdic.errors import InputError
 from ringdic.session.rig import Rig, RigCamera, read_rig
 
@@ -38,16 +38,18 @@ def dots(images, rig) -> dict[str, Dots]:
 
 
 @pytest.fixture(scope="module")
-def look(rig, images, dots) -> Callable[..., dict[str, Sight]]:
-    """Sights of all cameras, with nominal azimuths off by ``off`` degrees and images taken from other cameras."""
+def look(rig, images, dots) -> Callable[..., dict[str, AzimuthCandidates]]:
+    """Possible azimuths of all cameras, with nominal ones off by ``off`` degrees and images of other cameras."""
 
-    def seen(off: float = 0.0, swapped: dict[str, str] | None = None, **azimuths: float) -> dict[str, Sight]:
-        sights = {}
+    def seen(
+        off: float = 0.0, swapped: dict[str, str] | None = None, **azimuths: float
+    ) -> dict[str, AzimuthCandidates]:
+        candidates = {}
         for camera in rig.cameras:
-            taken = (swapped or {}).get(camera.id, camera.id)
+            source = (swapped or {}).get(camera.id, camera.id)
             entry = replace(camera, azimuth_deg=azimuths.get(camera.id, camera.azimuth_deg + off))
-            sights[camera.id] = sight(images[taken], dots[taken], entry, rig.target)
-        return sights
+            candidates[camera.id] = azimuth_candidates(images[source], dots[source], entry, rig.target)
+        return candidates
 
     return seen
 
@@ -65,27 +67,27 @@ def test_an_image_alone_tells_the_azimuth_but_for_the_column(rig, dots) -> None:
 
 
 def test_cameras_are_found_where_the_rig_has_them(rig, look) -> None:
-    found = survey(look(), rig.target)
-    assert abs(found.turn_deg) < 1.0
-    assert found.warnings == ()
-    assert np.abs(deviations(rig, found.azimuths)).max() < 1.5
+    result = camera_azimuths(look(), rig.target)
+    assert abs(result.turn_deg) < 1.0
+    assert result.warnings == ()
+    assert np.abs(deviations(rig, result.azimuths)).max() < 1.5
 
 
 @pytest.mark.parametrize("turn", [36.2, -6.03, 150.0])  # three columns, half of one, a camera's place and more
 def test_a_turned_target_is_followed_by_all_cameras(rig, look, turn) -> None:
-    found = survey(look(off=-turn), rig.target)
-    assert found.turn_deg == pytest.approx(turn, abs=1.0)
-    assert np.abs(deviations(rig, found.azimuths)).max() < 1.5
-    assert "target is turned by" in found.warnings[0]
+    result = camera_azimuths(look(off=-turn), rig.target)
+    assert result.turn_deg == pytest.approx(turn, abs=1.0)
+    assert np.abs(deviations(rig, result.azimuths)).max() < 1.5
+    assert "target is turned by" in result.warnings[0]
 
 
 def test_without_the_printed_numbers_those_that_see_the_seam_tell_the_others(rig, look) -> None:
     bare = {id_: replace(each, labels={}) for id_, each in look(off=-36.2).items()}
-    found = survey(bare, rig.target)
+    result = camera_azimuths(bare, rig.target)
     # The others are taken to be where the rig has them, turned alike: a start good to some degrees.
-    assert np.abs(deviations(rig, found.azimuths)).max() < 3.0
+    assert np.abs(deviations(rig, result.azimuths)).max() < 3.0
     blind = {id_: each for id_, each in bare.items() if len(each.azimuths) > 1}
-    assert survey(blind, rig.target).azimuths == {
+    assert camera_azimuths(blind, rig.target).azimuths == {
         id_: pytest.approx(each.camera.azimuth_deg % 360) for id_, each in blind.items()
     }
 
@@ -96,39 +98,39 @@ def test_exchanged_cameras_are_refused_by_name(rig, look, pair) -> None:
     with pytest.raises(
         InputError, match=rf"camera ({a}|{b}) stands at .* where rig.toml has camera ({a}|{b}), .* exchanged"
     ):
-        survey(look(swapped={a: b, b: a}), rig.target)
+        camera_azimuths(look(swapped={a: b, b: a}), rig.target)
 
 
 def test_one_wrong_azimuth_is_refused_by_name(rig, look) -> None:
     with pytest.raises(InputError, match=r"camera cam_06 stands at azimuth 150°, rig.toml says 165°"):
-        survey(look(cam_06=165.0), rig.target)
+        camera_azimuths(look(cam_06=165.0), rig.target)
 
 
 def test_images_that_lie_or_stand_on_their_head_are_refused_with_the_remedy(rig, images) -> None:
     camera: RigCamera = rig.cameras[4]
-    for turned, told in (
+    for turned, message in (
         (90, r"on its side .* rotation_deg = (90|270)"),
         (180, "upside down: give rotation_deg = 180"),
     ):
         image = np.ascontiguousarray(np.rot90(images[camera.id], -turned // 90))
-        found = find_dots(image, rig.target)
-        with pytest.raises(InputError, match=rf"camera cam_05: .*{told}"):
-            sight(image, found, camera, rig.target)
-        righted = sight(image, found, replace(camera, rotation_deg=float(turned)), rig.target)
+        result = find_dots(image, rig.target)
+        with pytest.raises(InputError, match=rf"camera cam_05: .*{message}"):
+            azimuth_candidates(image, result, camera, rig.target)
+        righted = azimuth_candidates(image, result, replace(camera, rotation_deg=float(turned)), rig.target)
         assert abs(righted.azimuths[0] - camera.azimuth_deg) < 1.5
 
 
 def test_a_camera_that_sees_no_target_is_left_to_its_calibration(rig, images, dots) -> None:
     empty = dots["cam_05"][np.arange(5)]
-    found = sight(images["cam_05"], empty, rig.cameras[4], rig.target)
-    assert found.azimuths == ()
-    assert survey({"cam_05": found}, rig.target).azimuths == {}
+    result = azimuth_candidates(images["cam_05"], empty, rig.cameras[4], rig.target)
+    assert result.azimuths == ()
+    assert camera_azimuths({"cam_05": result}, rig.target).azimuths == {}
 
 
 def test_numbers_are_seen_where_they_are_printed(shared_data, rig) -> None:
     real = replace(rig.target, columns=14)
     for camera, azimuth in (("201", 61.0), ("202", 92.0)):
         image = grey(shared_data / "multidic_rig" / "calibration" / f"{camera}.jpg")
-        observed = identify(find_dots(image, real), real, azimuth)
-        assert has_labels(read_labels(image, observed, real))
-        assert not has_labels(read_labels(image, observed, real, below=True))
+        observed = identify_dots(find_dots(image, real), real, azimuth)
+        assert has_labels(column_labels(image, observed, real))
+        assert not has_labels(column_labels(image, observed, real, below=True))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from ringdic.correlation import CorrelationSettings, Status, prepare_reference
 from ringdic.correlation.lattice_field import interpolate_lattice
-from ringdic.pairs.tracking import CameraMatches, camera_grid, match_camera, places
+from ringdic.pairs.tracking import CameraMatches, camera_grid, interpolate_matches, match_camera
 
 STEP = 10
 RNG = np.random.default_rng(3)
@@ -54,7 +54,7 @@ def test_a_place_is_lost_with_the_points_about_it_and_says_why() -> None:
         np.where(lost, Status.NO_CONVERGENCE, Status.GOOD).astype(np.int8),
     )  # fmt: skip
     at = np.array([[52.0, 41.0], [25.0, 43.0], [63.0, 40.0], [np.nan, 1.0], [500.0, 500.0]])
-    seen = places(found, at)
+    seen = interpolate_matches(found, at)
     assert seen.status.tolist() == [Status.NO_CONVERGENCE, 0, 0, Status.NOT_REACHED, Status.NOT_REACHED]
     np.testing.assert_array_equal(np.isfinite(seen.px).all(axis=1), seen.status == 0)
     # All four corners about the second place; beside the hole the two that are left go on as straight lines.
@@ -107,7 +107,7 @@ def test_places_between_the_points_are_found_as_well_as_the_points(order: int) -
     np.testing.assert_array_equal(grid.xy, own)
     found = match_camera(prepare_reference(reference, grid.region, settings), current, grid, settings)
     at = RNG.uniform(40, [220, 200], (500, 2))
-    on, off = places(found, grid.xy), places(found, at)
+    on, off = interpolate_matches(found, grid.xy), interpolate_matches(found, at)
     assert (off.status == 0).all()
     errors = [np.sqrt(np.mean((seen.px - xy - motion(xy)) ** 2)) for seen, xy in ((on, grid.xy), (off, at))]
     assert errors[1] < 1.1 * errors[0]

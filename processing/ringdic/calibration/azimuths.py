@@ -1,0 +1,171 @@
+"""Azimuths of all cameras from their images of the target, with detection of a rotated target and of exchanged cameras.
+
+The image of one camera determines its azimuth up to the number of its columns. It determines that too where it shows
+the seam of the columns, and the printed numbers carry it from camera to camera. A deviation from the rig that is common
+to most cameras is a rotation of the target; a deviation of a single camera means that it stands elsewhere.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.calibration.dots import Dots
+from ringdic.calibration.labels import Labels, column_labels, column_shift, has_labels, mean_label
+from ringdic.calibration.target import identify_dots, possible_azimuths
+from ringdic.errors import InputError
+from ringdic.geometry.camera import signed_degrees
+from ringdic.session.rig import RigCamera, Target
+
+log = logging.getLogger(__name__)
+
+#: Deviation of a camera from its azimuth on the rotated target from which it stands elsewhere; rotation of the target
+#: that the operator is told. Degrees.
+_ELSEWHERE, _TURNED = 8.0, 5.0
+
+
+@dataclass(frozen=True)
+class AzimuthCandidates:
+    """Possible azimuths of one camera by its own image of the target.
+
+    camera : its entry in the rig.
+    azimuths : possible azimuths, degrees, the nearest to the nominal one first; empty where no target is seen.
+    labels : prints above its columns, by the columns' numbers for azimuths[0]; empty where there are none.
+    """
+
+    camera: RigCamera
+    azimuths: tuple[float, ...]
+    labels: Labels
+
+
+@dataclass(frozen=True)
+class CameraAzimuths:
+    """Azimuths of all cameras.
+
+    azimuths : by camera id, degrees. turn_deg : rotation of the target about its axis from where the azimuths in
+    rig.toml have it. warnings : sentences for the operator.
+    """
+
+    azimuths: dict[str, float]
+    turn_deg: float
+    warnings: tuple[str, ...]
+
+
+def azimuth_candidates(image: NDArray[np.generic], dots: Dots, camera: RigCamera, target: Target) -> AzimuthCandidates:
+    """Possible azimuths of a camera, in degrees, from its image of the target.
+
+    image : (height, width) grey levels. dots : the spots of this image. camera : its entry in the rig.
+
+    Raises InputError where the image is upside down or lies on its side.
+    """
+    possible = possible_azimuths(dots, target, camera.rotation_deg)
+    if not len(possible):
+        for turn in (90.0, 270.0):
+            other = (camera.rotation_deg + turn) % 360.0
+            if len(possible_azimuths(dots, target, other)):
+                raise InputError(
+                    f"camera {camera.id}: the target lies on its side in the image; give rotation_deg = {other:.0f} or "
+                    f"{(other + 180) % 360:.0f} in rig.toml, or turn the camera"
+                )
+    azimuths = tuple(sorted((float(a) for a in possible), key=lambda a: abs(signed_degrees(a - camera.azimuth_deg))))
+    if not azimuths:
+        return AzimuthCandidates(camera, (), {})
+    try:
+        observed = identify_dots(
+            dots, target, azimuths[0], camera=camera.id, rotation_deg=camera.rotation_deg, height_mm=camera.height_mm
+        )
+    except InputError:
+        return AzimuthCandidates(camera, (), {})  # the calibration of this camera reports the error
+    labels = column_labels(image, observed, target) if observed.rows.max() == target.rows else {}
+    if not has_labels(labels):
+        upside_down = observed.rows.min() == 1 and has_labels(column_labels(image, observed, target, below=True))
+        if upside_down:
+            other = (camera.rotation_deg + 180.0) % 360.0
+            raise InputError(
+                f"camera {camera.id}: the numbers of the target's columns stand below the lowest row; the image is "
+                f"upside down: give rotation_deg = {other:.0f} in rig.toml, or turn the camera"
+            )
+        labels = {}
+    return AzimuthCandidates(camera, azimuths, labels)
+
+
+def camera_azimuths(candidates: Mapping[str, AzimuthCandidates], target: Target) -> CameraAzimuths:
+    """Azimuths of all cameras from the possible azimuths of each.
+
+    candidates : by camera id. Raises InputError, naming the camera, where one stands elsewhere than the rig says.
+    """
+    seen = {id_: each for id_, each in candidates.items() if each.azimuths}
+    off = {
+        id_: signed_degrees(_azimuth_after_shift(seen[id_], columns, target) - seen[id_].camera.azimuth_deg)
+        for id_, columns in _column_shifts(seen, target).items()
+    }
+    turn = _middle(list(off.values())) if off else 0.0
+    for id_, each in off.items():
+        if abs(signed_degrees(each - turn)) > _ELSEWHERE:
+            raise InputError(_elsewhere(id_, seen, off, turn))
+    shared = turn if abs(turn) > _TURNED else 0.0
+    azimuths = {id_: (each.camera.azimuth_deg + off.get(id_, shared)) % 360.0 for id_, each in seen.items()}
+    warnings: tuple[str, ...] = ()
+    if abs(turn) > _TURNED:
+        warnings = (
+            f"the calibration target is turned by {turn:+.1f}° from where the azimuths in rig.toml have it; the world "
+            "turns with it. Turn it back, or change azimuth_deg of all cameras",
+        )
+    log.info("target turned by %+.1f°, %d of %d cameras numbered for certain", turn, len(off), len(candidates))
+    return CameraAzimuths(azimuths, turn, warnings)
+
+
+def _azimuth_after_shift(each: AzimuthCandidates, columns: int, target: Target) -> float:
+    """The candidate nearest to the first one plus the angle of some columns; the seam has not a column's full width."""
+    about = each.azimuths[0] + columns * math.degrees(target.column_angle)
+    return min(each.azimuths, key=lambda a: abs(signed_degrees(a - about)))
+
+
+def _column_shifts(seen: dict[str, AzimuthCandidates], target: Target) -> dict[str, int]:
+    """Columns by which the first candidate of a camera is off, for those cameras whose azimuth is determined."""
+    sure = {id_: 0 for id_, each in seen.items() if len(each.azimuths) == 1}
+    labelled = [id_ for id_, each in seen.items() if each.labels]
+    if not sure or not labelled:
+        return sure
+    mean = mean_label(seen[id_].labels for id_ in labelled)
+    queue = [id_ for id_ in sure if id_ in labelled]
+    while queue:
+        known = queue.pop(0)
+        for other in labelled:
+            if other not in sure:
+                shift = column_shift(seen[known].labels, seen[other].labels, mean, target.columns)
+                if shift is not None:
+                    sure[other] = sure[known] + shift
+                    queue.append(other)
+    return sure
+
+
+def _elsewhere(id_: str, seen: dict[str, AzimuthCandidates], off: dict[str, float], turn: float) -> str:
+    """Message that a camera stands elsewhere than the rig says; off : deviations of all cameras, degrees."""
+    nominal = seen[id_].camera.azimuth_deg
+    stands = (nominal + off[id_] - turn) % 360.0
+    there = [
+        other
+        for other, each in seen.items()
+        if other != id_ and abs(signed_degrees(each.camera.azimuth_deg - stands)) <= _ELSEWHERE
+    ]
+    if there:
+        return (
+            f"camera {id_} stands at azimuth {stands:.0f}°, where rig.toml has camera {there[0]}, and not at "
+            f"{nominal:.0f}°: their images or their ids are exchanged; put the images, or azimuth_deg and the order of "
+            "[[cameras]], right"
+        )
+    return (
+        f"camera {id_} stands at azimuth {stands:.0f}°, rig.toml says {nominal:.0f}° and the other cameras agree with "
+        "it; correct azimuth_deg of this camera"
+    )
+
+
+def _middle(angles: list[float]) -> float:
+    """The one of some angles from which the sum of distances to the others is least, degrees."""
+    return min(angles, key=lambda a: sum(abs(signed_degrees(a - b)) for b in angles))

@@ -1,0 +1,124 @@
+"""Fields drawn into matplotlib axes, for notebooks and scripts: over a photograph, and on the surface in space."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib import pyplot
+from matplotlib.axes import Axes
+from matplotlib.tri import Triangulation
+from numpy.typing import NDArray
+
+from ringdic.arrays import Floats, Pixels
+from ringdic.errors import missing_extra
+from ringdic.mesh.mesh import Mesh
+from ringdic.pictures.scale import Scale, face_colours, on_faces
+from ringdic.pictures.views import from_side, mean_azimuth
+from ringdic.results.evaluation import EvaluatedResults
+
+if TYPE_CHECKING:
+    from pyvista import Plotter
+
+_INNER_SIDE = (0.86, 0.87, 0.89, 1.0)
+_HEIGHT = 900  # px of the painted surface
+
+
+def draw_over_image(
+    axes: Axes | None,
+    image: NDArray,
+    xy: Pixels,
+    faces: NDArray[np.integer],
+    values: Floats,
+    scale: Scale,
+    opacity: float = 0.65,
+) -> Axes:
+    """Draw values of points in colours over a photograph, with a colour bar; returns the axes.
+
+    Parameters
+    ----------
+    axes : where to draw; None makes a new figure.
+    image : (height, width), grey levels.
+    xy : (n, 2) px, positions of the points in the image.
+    faces : (m, 3), indices of the points of each triangle.
+    values : (n,), in the scale's unit; triangles with a NaN corner stay clear.
+    scale : colours, limits and title.
+    opacity : of the colours, 0 to 1.
+    """
+    axes = _axes(axes)
+    axes.imshow(image, cmap="gray")
+    colours = scale.mappable()
+    look: dict[str, Any] = {"cmap": colours.cmap, "norm": colours.norm, "alpha": opacity}
+    of_faces = np.ma.masked_invalid(values[faces].mean(axis=1))
+    if of_faces.count():
+        look["facecolors"] = of_faces
+        axes.tripcolor(Triangulation(xy[:, 0], xy[:, 1], faces), **look)
+    else:  # points too far apart, or too few, for a triangle
+        axes.scatter(xy[:, 0], xy[:, 1], c=values, **look)
+    axes.set_xlabel("x, px")
+    axes.set_ylabel("y, px")
+    axes.figure.colorbar(colours, ax=axes, label=scale.title)
+    return axes
+
+
+def draw_surface(
+    axes: Axes | None,
+    results: EvaluatedResults,
+    scale: Scale,
+    step: int,
+    azimuth: float | None = None,
+    elevation: float = 15.0,
+) -> Axes:
+    """Draw the surface at a step as seen from afar, coloured by a field, with a colour bar; returns the axes.
+
+    Parameters
+    ----------
+    axes : where to draw; None makes a new figure.
+    results : under the evaluation that the field is to have.
+    scale : the field, its colours and limits.
+    step : number of the step, from 0, the reference.
+    azimuth : direction about z from which the surface is seen, degrees from +x; None takes the side that it faces.
+    elevation : angle from which it is seen above the horizontal, degrees.
+    """
+    axes = _axes(axes)
+    mesh = Mesh(results.positions(step), results.results.faces)
+    towards = mean_azimuth(results.results.mesh) if azimuth is None else float(np.radians(azimuth))
+    view = from_side(mesh, towards, _HEIGHT, float(np.radians(elevation)))
+    picture = face_colours(view.faces, _on_faces(results, scale, step), scale)
+    picture[view.inside] = _INNER_SIDE
+    axes.imshow(picture, extent=view.extent, interpolation="antialiased")
+    axes.set_xlabel("mm, to the right")
+    axes.set_ylabel("mm, upwards")
+    axes.set_title(results.steps[step], fontsize="medium", loc="left")
+    axes.figure.colorbar(scale.mappable(), ax=axes, label=scale.title)
+    return axes
+
+
+def surface_in_viewer(results: EvaluatedResults, scale: Scale, step: int) -> Plotter:
+    """A pyvista plotter with the surface at a step coloured by a field, to be turned and zoomed with the mouse.
+
+    results : under the evaluation that the field is to have. scale : the field, its colours and limits. step : number
+    of the step, from 0, the reference. Raises InputError where the extra ``viewer`` is not installed.
+    """
+    try:
+        import pyvista
+    except ModuleNotFoundError as error:
+        raise missing_extra(error) or error from error
+    mesh, _, measured = results.measured(step)
+    body = pyvista.PolyData.from_regular_faces(mesh.vertices, mesh.faces)
+    body.cell_data[scale.title] = _on_faces(results, scale, step)[measured]
+    plotter = pyvista.Plotter()
+    bar: dict[str, Any] = {"title": scale.title}
+    limits = (scale.low, scale.high)
+    plotter.add_mesh(body, scalars=scale.title, cmap=scale.mappable().cmap, clim=limits, scalar_bar_args=bar)
+    plotter.add_text(results.steps[step], font_size=10)
+    return plotter
+
+
+def _on_faces(results: EvaluatedResults, scale: Scale, step: int) -> Floats:
+    """Values of the scale's field on all triangles, (M,); NaN where not measured."""
+    return on_faces(results, scale.field, results.step(step).scalar(scale.field), step)
+
+
+def _axes(axes: Axes | None) -> Axes:
+    return pyplot.subplots(layout="constrained")[1] if axes is None else axes
