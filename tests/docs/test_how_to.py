@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from ringdic.results.evaluation import evaluated
+from ringdic.results.evaluation import evaluate_results
 from ringdic.session.images import read_gray
 
 
@@ -29,7 +29,7 @@ def block(page: Path, word: str) -> dict[str, Any]:
 
 def test_a_field(tutorial: Any, pages: Path) -> None:
     entry = block(pages / "how_to/field.md", "stretch_ratio = Field(")["stretch_ratio"]
-    step = evaluated(tutorial.results).step(2)
+    step = evaluate_results(tutorial.results).step(2)
     ratio = step.scalar(entry)
     measured = np.isfinite(ratio)
     assert measured.any()
@@ -38,11 +38,11 @@ def test_a_field(tutorial: Any, pages: Path) -> None:
 
 
 def test_an_export(tutorial: Any, pages: Path, tmp_path: Path) -> None:
-    seen = evaluated(tutorial.results)
-    block(pages / "how_to/export.md", "def export_xyz")["export_xyz"](seen, tmp_path)
-    assert sorted(path.stem for path in tmp_path.iterdir()) == sorted(seen.steps)
-    for step, name in enumerate(seen.steps):
-        positions = seen.positions(step)
+    results = evaluate_results(tutorial.results)
+    block(pages / "how_to/export.md", "def export_xyz")["export_xyz"](results, tmp_path)
+    assert sorted(path.stem for path in tmp_path.iterdir()) == sorted(results.steps)
+    for step, name in enumerate(results.steps):
+        positions = results.positions(step)
         written = np.loadtxt(tmp_path / f"{name}.xyz")
         np.testing.assert_allclose(written, positions[np.isfinite(positions).all(axis=1)], atol=1e-4)
 

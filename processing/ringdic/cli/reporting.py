@@ -59,16 +59,16 @@ def overlay_command(
     from ringdic.pictures.overlay import overlay, photograph, with_bar
     from ringdic.session.folder import open_session
 
-    seen = results_of(session, run, reference, without_rigid_motion, window)
-    scale = _scale(seen, field, limits)
-    number = _step(seen, step)
+    results = results_of(session, run, reference, without_rigid_motion, window)
+    scale = _scale(results, field, limits)
+    number = _step(results, step)
     captured = open_session(session)
-    name = seen.steps[number]
-    cameras = camera or _photographed(captured, name, seen)
+    name = results.steps[number]
+    cameras = camera or _photographed(captured, name, results)
     out.mkdir(parents=True, exist_ok=True)
     written = []
     for id_ in cameras:
-        picture = overlay(seen, id_, photograph(captured, name, id_), scale, number, opacity)
+        picture = overlay(results, id_, photograph(captured, name, id_), scale, number, opacity)
         path = out / f"{field.replace(':', '-')}-{name}-{id_}.png"
         Image.fromarray(with_bar(picture, scale) if bar else picture).save(path)
         written.append(path)
@@ -98,21 +98,21 @@ def animate_command(
 
     if camera is not None and azimuth is not None:
         raise InputError("--camera shows its photographs, --azimuth the body without them; give one of them")
-    seen = results_of(session, run, reference, without_rigid_motion, window)
-    scale = _scale(seen, field, limits)
+    results = results_of(session, run, reference, without_rigid_motion, window)
+    scale = _scale(results, field, limits)
     if camera is not None:
-        frames = overlay_frames(seen, open_session(session), camera, scale, size, opacity)
+        frames = overlay_frames(results, open_session(session), camera, scale, size, opacity)
     else:
-        front = mean_azimuth(seen.results.mesh) if azimuth is None else math.radians(azimuth)
-        frames = surface_frames(seen, scale, front, size)
+        front = mean_azimuth(results.results.mesh) if azimuth is None else math.radians(azimuth)
+        frames = surface_frames(results, scale, front, size)
     write_animation(out, list(frames), seconds)
     _tell_written([out], as_json)
 
 
-def _scale(seen: EvaluatedResults, field: str, limits: str | None) -> Scale:
+def _scale(results: EvaluatedResults, field: str, limits: str | None) -> Scale:
     from ringdic.pictures.scale import scale_of
 
-    return scale_of(seen, field, None if limits is None else _two(limits))
+    return scale_of(results, field, None if limits is None else _two(limits))
 
 
 def _two(text: str) -> tuple[float, float]:
@@ -123,8 +123,8 @@ def _two(text: str) -> tuple[float, float]:
     return low, high
 
 
-def _step(seen: EvaluatedResults, step: int | None) -> int:
-    count = len(seen.steps)
+def _step(results: EvaluatedResults, step: int | None) -> int:
+    count = len(results.steps)
     if step is None:
         return count - 1
     if not 0 <= step < count:
@@ -132,10 +132,10 @@ def _step(seen: EvaluatedResults, step: int | None) -> int:
     return step
 
 
-def _photographed(session: Captured, capture_id: str, seen: EvaluatedResults) -> list[str]:
+def _photographed(session: Captured, capture_id: str, results: EvaluatedResults) -> list[str]:
     """Cameras of the run that have an image in a capture."""
     images = {id_ for capture in session.captures if capture.id == capture_id for id_ in capture.images}
-    return [camera.id for camera in seen.results.cameras if camera.id in images]
+    return [camera.id for camera in results.results.cameras if camera.id in images]
 
 
 def _tell_written(written: list[Path], as_json: bool) -> None:

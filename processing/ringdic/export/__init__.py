@@ -93,19 +93,19 @@ def export(
         out = results_path.with_name(format if format in FOLDERS else f"results.{format}")
     out = Path(out)
     _check_place(out, format)
-    seen = evaluate_results(results_path, evaluation)
+    results = evaluate_results(results_path, evaluation)
     if format in _COLOURED:
-        seen.field(colour or DEFAULT_COLOUR)
+        results.field(colour or DEFAULT_COLOUR)
     if format in FOLDERS:
         out.mkdir(exist_ok=True)
         if format in _COLOURED:
-            _COLOURED[format](seen, out, colour or DEFAULT_COLOUR)
+            _COLOURED[format](results, out, colour or DEFAULT_COLOUR)
         else:
-            _WRITERS[format](seen, out)
+            _WRITERS[format](results, out)
         return out
     partial = out.with_name(f".{out.name}.partial")  # a reader never sees half a file
     try:
-        _WRITERS[format](seen, partial)
+        _WRITERS[format](results, partial)
         partial.replace(out)
     finally:
         partial.unlink(missing_ok=True)

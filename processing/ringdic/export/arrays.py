@@ -12,13 +12,13 @@ from ringdic.results.evaluation import EvaluatedResults
 _SCALARS = ("lambda1", "lambda2", "J")
 
 
-def export_npz(seen: EvaluatedResults, out: Path) -> None:
+def export_npz(results: EvaluatedResults, out: Path) -> None:
     """Write the arrays of `arrays` into one npz file."""
     with Path(out).open("wb") as file:  # given a name, savez would append a suffix to it
-        np.savez(file, **arrays(seen))
+        np.savez(file, **arrays(results))
 
 
-def arrays(seen: EvaluatedResults) -> dict[str, Any]:
+def arrays(results: EvaluatedResults) -> dict[str, Any]:
     """The arrays of the npz by name, in full precision, for F steps of N points and M triangles.
 
     ``vertices_ref`` (N, 3) and ``vertices`` (F, N, 3) mm, world frame; ``faces`` (M, 3); ``lambda1``, ``lambda2`` and
@@ -28,27 +28,27 @@ def arrays(seen: EvaluatedResults) -> dict[str, Any]:
     triangle joins two camera pairs. Step 0 is the reference, with identity deformation. NaN where not measured. With a
     strain window, the arrays of deformation also as ``window_…``.
     """
-    results = seen.results
-    F, M = len(results.steps), len(results.faces)
-    prefixes = ("", "window_") if seen.window is not None else ("",)
+    source = results.results
+    F, M = len(source.steps), len(source.faces)
+    prefixes = ("", "window_") if results.window is not None else ("",)
     found: dict[str, Any] = {prefix + name: np.empty((F, M)) for prefix in prefixes for name in _SCALARS}
     found |= {f"{prefix}E": np.empty((F, M, 3, 3)) for prefix in prefixes}
     for step in range(F):
-        fields = seen.step(step)
+        fields = results.step(step)
         for prefix in prefixes:
             for name in _SCALARS:
                 found[prefix + name][step] = fields.face[prefix + name]
             found[f"{prefix}E"][step] = square(fields.face[f"{prefix}E_tensor"])
-    by_cameras = {} if results.sigma_calibration is None else {"sigma_calibration": results.sigma_calibration}
+    by_cameras = {} if source.sigma_calibration is None else {"sigma_calibration": source.sigma_calibration}
     return {
-        "vertices_ref": results.vertices_ref,
-        "vertices": np.stack([seen.positions(step) for step in range(F)]),
-        "faces": results.faces,
+        "vertices_ref": source.vertices_ref,
+        "vertices": np.stack([results.positions(step) for step in range(F)]),
+        "faces": source.faces,
         **found,
-        "correlation": results.correlation,
-        "sigma_xyz": results.sigma_xyz,
+        "correlation": source.correlation,
+        "sigma_xyz": source.sigma_xyz,
         **by_cameras,
-        "pair": results.pair,
+        "pair": source.pair,
     }
 
 

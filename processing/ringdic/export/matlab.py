@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 _LARGEST = 2**31 - 2**20  # bytes of one variable of a level 5 file
 
 
-def export_mat(seen: EvaluatedResults, out: Path) -> None:
+def export_mat(results: EvaluatedResults, out: Path) -> None:
     """Write a level 5 MAT file; indices in it count from 1.
 
     ``DIC3DPPresults`` is the structure that MultiDIC's post-processing makes and its plots read: Points3D, Faces, Disp,
@@ -34,59 +34,59 @@ def export_mat(seen: EvaluatedResults, out: Path) -> None:
 
     Raises InputError where a level 5 file cannot hold it.
     """
-    results = seen.results
-    values = arrays(seen)
-    values["faces"] = np.asarray(results.faces, dtype=float) + 1
-    values["pair"] = np.asarray(results.pair, dtype=float) + 1
-    values["steps"] = np.array(results.steps, dtype=object)
-    values["settings"] = results.settings
-    values["DIC3DPPresults"] = post_processing(seen)
+    source = results.results
+    values = arrays(results)
+    values["faces"] = np.asarray(source.faces, dtype=float) + 1
+    values["pair"] = np.asarray(source.pair, dtype=float) + 1
+    values["steps"] = np.array(source.steps, dtype=object)
+    values["settings"] = source.settings
+    values["DIC3DPPresults"] = post_processing(results)
     with Path(out).open("wb") as file:
         savemat(file, values, do_compression=True, oned_as="column")
 
 
-def post_processing(seen: EvaluatedResults) -> dict[str, Any]:
+def post_processing(results: EvaluatedResults) -> dict[str, Any]:
     """The structure DIC3DPPresults by field; cells are object arrays (1, F)."""
-    results = seen.results
-    F = len(results.steps)
-    structure = _surface(seen)
-    bytes_each = F * len(results.faces) * 4 * _floats_a_face()
+    source = results.results
+    F = len(source.steps)
+    structure = _surface(results)
+    bytes_each = F * len(source.faces) * 4 * _floats_a_face()
     if bytes_each > _LARGEST:
         raise InputError(
-            f"{F} steps of {len(results.faces):,} triangles are more than a MAT file of level 5 can hold; "
+            f"{F} steps of {len(source.faces):,} triangles are more than a MAT file of level 5 can hold; "
             "export npz or vtkhdf"
         )
     wanted: list[tuple[str, bool, StrainWindow | None]] = [("Deform", False, None)]
-    if seen.window is not None:
-        wanted.append(("Deform_window", False, seen.window))
+    if results.window is not None:
+        wanted.append(("Deform_window", False, results.window))
     wanted.append(("Deform_ARBM", True, None))
     room = _LARGEST // bytes_each
     for name, removed, window in wanted[:room]:
-        structure[name] = _deform(seen, removed, window)
+        structure[name] = _deform(results, removed, window)
     for name, _, _ in wanted[room:]:
         log.warning("%s is left out: with it, the file would be larger than MATLAB's level 5 allows", name)
     return structure
 
 
-def _surface(seen: EvaluatedResults) -> dict[str, Any]:
+def _surface(results: EvaluatedResults) -> dict[str, Any]:
     """Points, triangles, displacements and rigid motions."""
-    results, F = seen.results, len(seen.steps)
-    faces = results.faces
-    motions = [_motion(seen, step) for step in range(F)]
-    points = [seen.positions(step) for step in range(F)]
+    source, F = results.results, len(results.steps)
+    faces = source.faces
+    motions = [_motion(results, step) for step in range(F)]
+    points = [results.positions(step) for step in range(F)]
     back = [motion.apply(xyz) for motion, xyz in zip(motions, points, strict=True)]
-    moved = [xyz - _before(seen, step) for step, xyz in enumerate(points)]
-    without = [xyz - _before(seen, step) for step, xyz in enumerate(back)]
-    ids = {camera.id: index for index, camera in enumerate(results.cameras, start=1)}
+    moved = [xyz - _before(results, step) for step, xyz in enumerate(points)]
+    without = [xyz - _before(results, step) for step, xyz in enumerate(back)]
+    ids = {camera.id: index for index, camera in enumerate(source.cameras, start=1)}
     return {
         "Points3D": _cells(points),
         "Points3D_ARBM": _cells(back),
         "Faces": faces.astype(float) + 1,
-        "corrComb": _cells([column(results.correlation[step]) for step in range(F)]),
-        "FaceCorrComb": _cells([column(results.correlation[step][faces].max(axis=1)) for step in range(F)]),
-        "FacePairInds": column(results.pair.astype(float) + 1),
-        "PointPairInds": column(results.vertex_pair.astype(float) + 1),
-        "pairIndices": np.array([[_camera_number(name, ids) for name in pair] for pair in results.pairs], dtype=float),
+        "corrComb": _cells([column(source.correlation[step]) for step in range(F)]),
+        "FaceCorrComb": _cells([column(source.correlation[step][faces].max(axis=1)) for step in range(F)]),
+        "FacePairInds": column(source.pair.astype(float) + 1),
+        "PointPairInds": column(source.vertex_pair.astype(float) + 1),
+        "pairIndices": np.array([[_camera_number(name, ids) for name in pair] for pair in source.pairs], dtype=float),
         "Disp": {
             "DispVec": _cells(moved),
             "DispMgn": _cells([column(np.linalg.norm(u, axis=1)) for u in moved]),
@@ -95,7 +95,7 @@ def _surface(seen: EvaluatedResults) -> dict[str, Any]:
         },
         "FaceCentroids": _cells([xyz[faces].mean(axis=1) for xyz in points]),
         "FaceCentroids_ARBM": _cells([xyz[faces].mean(axis=1) for xyz in back]),
-        "FaceIsoInd": _cells([column(seen.step(step).face["isotropy"]) for step in range(F)]),
+        "FaceIsoInd": _cells([column(results.step(step).face["isotropy"]) for step in range(F)]),
         "RBM": {
             "RotMat": _cells([motion.R for motion in motions]),
             "TransVec": _cells([motion.t for motion in motions]),
@@ -103,10 +103,12 @@ def _surface(seen: EvaluatedResults) -> dict[str, Any]:
     }
 
 
-def _deform(seen: EvaluatedResults, rigid_motion_removed: bool, window: StrainWindow | None) -> dict[str, Any]:
-    how = seen.evaluation
+def _deform(results: EvaluatedResults, rigid_motion_removed: bool, window: StrainWindow | None) -> dict[str, Any]:
+    how = results.evaluation
     removed = rigid_motion_removed or how.rigid_motion_removed
-    steps = [_named(seen.results.deformation(step, removed, how.previous, window)) for step in range(len(seen.steps))]
+    steps = [
+        _named(results.results.deformation(step, removed, how.previous, window)) for step in range(len(results.steps))
+    ]
     return {name: _cells([step[name] for step in steps]) for name in steps[0]}
 
 
@@ -142,15 +144,15 @@ def _floats_a_face() -> int:
     return sum(values.size for values in _named(Deformation(**found)).values())
 
 
-def _before(seen: EvaluatedResults, step: int) -> Floats:
-    return seen.results.reference_positions(step, seen.evaluation.previous)
+def _before(results: EvaluatedResults, step: int) -> Floats:
+    return results.results.reference_positions(step, results.evaluation.previous)
 
 
-def _motion(seen: EvaluatedResults, step: int) -> RigidMotion:
+def _motion(results: EvaluatedResults, step: int) -> RigidMotion:
     """Rigid motion that takes exported positions back onto the reference; the identity if it is removed already."""
-    if seen.evaluation.rigid_motion_removed:
+    if results.evaluation.rigid_motion_removed:
         return RigidMotion(np.eye(3), np.zeros(3))
-    return seen.results.motion(step, seen.evaluation.previous)
+    return results.results.motion(step, results.evaluation.previous)
 
 
 def _camera_number(name: str, order: dict[str, int]) -> int:

@@ -20,18 +20,18 @@ _GLTF_FROM_WORLD = 1e-3 * np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0
 DEFAULT_COLOUR = "displacement"
 
 
-def export_ply(seen: EvaluatedResults, out: Path, colour: str = DEFAULT_COLOUR) -> None:
+def export_ply(results: EvaluatedResults, out: Path, colour: str = DEFAULT_COLOUR) -> None:
     """Write ``STEP.ply`` (binary, mm) for every step, with all fields and with colours.
 
     Fields are properties of the vertices or faces. colour : name of the field that is coloured, with one scale for all
     steps.
     """
-    paint = _Paint(seen, colour)
-    for step, name in enumerate(seen.steps):
-        fields = seen.step(step)
-        mesh, kept, whole = seen.measured(step)
+    paint = _Paint(results, colour)
+    for step, name in enumerate(results.steps):
+        fields = results.step(step)
+        mesh, kept, whole = results.measured(step)
         solid = _solid(mesh.vertices, mesh.faces, paint.vertices(fields)[kept])
-        for entry in seen.fields:
+        for entry in results.fields:
             values = fields.scalar(entry).astype(np.float32)
             if entry.location == "point":
                 solid.vertex_attributes[entry.name] = values[kept]
@@ -40,15 +40,15 @@ def export_ply(seen: EvaluatedResults, out: Path, colour: str = DEFAULT_COLOUR) 
         solid.export(out / f"{name}.ply", file_type="ply")
 
 
-def export_glb(seen: EvaluatedResults, out: Path, colour: str = DEFAULT_COLOUR) -> None:
+def export_glb(results: EvaluatedResults, out: Path, colour: str = DEFAULT_COLOUR) -> None:
     """Write ``STEP.glb`` for every step, coloured by a field with one scale for all steps.
 
     By the conventions of glTF lengths are metres and y points upwards (z of the target).
     """
-    paint = _Paint(seen, colour)
-    for step, name in enumerate(seen.steps):
-        mesh, kept, _ = seen.measured(step)
-        solid = _solid(mesh.vertices @ _GLTF_FROM_WORLD.T, mesh.faces, paint.vertices(seen.step(step))[kept])
+    paint = _Paint(results, colour)
+    for step, name in enumerate(results.steps):
+        mesh, kept, _ = results.measured(step)
+        solid = _solid(mesh.vertices @ _GLTF_FROM_WORLD.T, mesh.faces, paint.vertices(results.step(step))[kept])
         solid.export(out / f"{name}.glb", file_type="glb")
 
 
@@ -60,11 +60,11 @@ def _solid(vertices: Floats, faces: Indices, rgba: NDArray[np.uint8]) -> trimesh
 class _Paint:
     """Colours of the vertices by one field; a field of faces is averaged at each vertex over its triangles."""
 
-    def __init__(self, seen: EvaluatedResults, name: str) -> None:
-        self._entry: Field = seen.field(name)
-        self._limits = seen.limits(name)
-        self._faces = seen.results.faces
-        self._count = len(seen.results.vertices_ref)
+    def __init__(self, results: EvaluatedResults, name: str) -> None:
+        self._entry: Field = results.field(name)
+        self._limits = results.limits(name)
+        self._faces = results.results.faces
+        self._count = len(results.results.vertices_ref)
 
     def vertices(self, fields: StepFields) -> NDArray[np.uint8]:
         """Colours of the vertices, RGBA (N, 4) uint8."""

@@ -10,23 +10,23 @@ from numpy.typing import NDArray
 from ringdic.results.evaluation import EvaluatedResults
 
 
-def export_csv(seen: EvaluatedResults, out: Path) -> None:
+def export_csv(results: EvaluatedResults, out: Path) -> None:
     """Write ``STEP-points.csv`` and ``STEP-faces.csv`` for every step into the folder ``out``.
 
     The first line names the columns with their units; vertices count from 0; what was not measured is empty. The
     columns ``…_reference`` hold what the step is compared with.
     """
-    for step, name in enumerate(seen.steps):
+    for step, name in enumerate(results.steps):
         columns: dict[str, list[tuple[str, NDArray[np.generic]]]] = {"point": [], "face": []}
-        positions = seen.positions(step)
-        before = seen.results.reference_positions(step, seen.evaluation.previous)
+        positions = results.positions(step)
+        before = results.results.reference_positions(step, results.evaluation.previous)
         for i, axis in enumerate("xyz"):
             columns["point"].append((f"{axis}_reference [mm]", before[:, i]))
             columns["point"].append((f"{axis} [mm]", positions[:, i]))
         for i in range(3):
-            columns["face"].append((f"vertex{i + 1}", seen.results.faces[:, i]))
-        fields = seen.step(step)
-        for entry in seen.fields:
+            columns["face"].append((f"vertex{i + 1}", results.results.faces[:, i]))
+        fields = results.step(step)
+        for entry in results.fields:
             unit = f" [{entry.unit}]" if entry.unit else ""
             columns[entry.location].append((entry.name + unit, fields.scalar(entry).astype(np.float32)))
         _write(out / f"{name}-points.csv", columns["point"])

@@ -19,50 +19,50 @@ _TYPES = {"f4": "Float32", "f8": "Float64", "u1": "UInt8", "i1": "Int8", "i8": "
 Arrays = dict[str, NDArray[np.generic]]
 
 
-def export_vtkhdf(seen: EvaluatedResults, out: Path) -> None:
+def export_vtkhdf(results: EvaluatedResults, out: Path) -> None:
     """Write the moving surface with all fields, vectors and tensors into one VTKHDF file."""
     with h5py.File(out, "w") as file:
-        group = vtkhdf.create_group(file, seen.results.faces, len(seen.results.vertices_ref), len(seen.steps))
-        for step in range(len(seen.steps)):
-            positions, point, cell = _step(seen, step)
+        group = vtkhdf.create_group(file, results.results.faces, len(results.results.vertices_ref), len(results.steps))
+        for step in range(len(results.steps)):
+            positions, point, cell = _step(results, step)
             vtkhdf.write_step(group, step, positions, point, cell)
 
 
-def export_vtp(seen: EvaluatedResults, out: Path) -> None:
+def export_vtp(results: EvaluatedResults, out: Path) -> None:
     """Write ``STEP.vtp`` for every step and ``series.pvd``, which opens them as one series, into the folder ``out``."""
-    for step, name in enumerate(seen.steps):
-        positions, point, cell = _step(seen, step)
-        _write(out / f"{name}.vtp", _poly_data(positions, seen.results.faces, point, cell))
+    for step, name in enumerate(results.steps):
+        positions, point, cell = _step(results, step)
+        _write(out / f"{name}.vtp", _poly_data(positions, results.results.faces, point, cell))
     series = ET.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
     collection = ET.SubElement(series, "Collection")
-    for step, name in enumerate(seen.steps):
+    for step, name in enumerate(results.steps):
         ET.SubElement(collection, "DataSet", timestep=str(step), part="0", file=f"{name}.vtp")
     _write(out / "series.pvd", series)
 
 
-def _step(seen: EvaluatedResults, step: int) -> tuple[Floats, Arrays, Arrays]:
+def _step(results: EvaluatedResults, step: int) -> tuple[Floats, Arrays, Arrays]:
     """Positions of a step (N, 3) mm, and its arrays of the points and of the triangles.
 
     VTK cannot draw NaN: a lost point stays at its reference position and is marked by the array ``measured``.
     """
-    current = seen.positions(step)
+    current = results.positions(step)
     measured: Mask = np.asarray(np.isfinite(current).all(axis=1))
     flags: Arrays = {
         "measured": measured.astype(np.uint8),
-        "status": seen.results.status[step].astype(np.int8),
+        "status": results.results.status[step].astype(np.int8),
     }
-    fields = seen.step(step)
-    point, cell = (_arrays(seen, fields, location) for location in ("point", "face"))
-    return np.where(measured[:, None], current, seen.results.vertices_ref), point | flags, cell
+    fields = results.step(step)
+    point, cell = (_arrays(results, fields, location) for location in ("point", "face"))
+    return np.where(measured[:, None], current, results.results.vertices_ref), point | flags, cell
 
 
-def _arrays(seen: EvaluatedResults, fields: StepFields, location: str) -> Arrays:
+def _arrays(results: EvaluatedResults, fields: StepFields, location: str) -> Arrays:
     """Vectors and tensors, and the scalar fields that are neither a component nor the length of one of these."""
     arrays = fields.point if location == "point" else fields.face
     wide = {name: values for name, values in arrays.items() if values.ndim > 1}
     scalars = {
         entry.name: fields.scalar(entry)
-        for entry in seen.fields
+        for entry in results.fields
         if entry.location == location and not any(name in wide for name in entry.of)
     }
     return {name: np.asarray(values, dtype=np.float32) for name, values in (wide | scalars).items()}

@@ -2,6 +2,7 @@
 
 ``pipeline``    from the session folder to the results
 ``summary``     the figures of a run
+``run``         a finished run as an object: fields, drawings, measurements, exports
 ``live_step``   one step, while the capturing goes on
 ``serving``     a process with loaded kernels, which carries out one order after the other
 ``warm_up``     compiles the kernels that follow the matching

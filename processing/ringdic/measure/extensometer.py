@@ -14,19 +14,19 @@ from ringdic.results.evaluation import EvaluatedResults
 _UNITS = dict.fromkeys(("along_surface", "straight"), "mm")
 
 
-def extensometer(seen: EvaluatedResults, start: Place, end: Place) -> Table:
+def extensometer(results: EvaluatedResults, start: Place, end: Place) -> Table:
     """Length between two places at every step, in mm, and engineering strain ``L / L0 - 1``; one row a step.
 
     ``along_surface`` is the length of the material line that was the shortest path in the reference; ``straight`` is
     the chord. L0 is the length at the step with which each step is compared. Raises ComputationError if the places lie
     on parts of the surface that do not touch.
     """
-    results = seen.results
-    mesh = results.mesh
+    source = results.results
+    mesh = source.mesh
     path = shortest_path(mesh, start, end)
     rows: list[dict[str, Any]] = []
-    for step, name in enumerate(seen.steps):
-        now, before = results.vertices[step], results.reference_positions(step, seen.evaluation.previous)
+    for step, name in enumerate(results.steps):
+        now, before = source.vertices[step], source.reference_positions(step, results.evaluation.previous)
         row: dict[str, Any] = {"step": step, "capture": name}
         lengths = {
             "along_surface": [path.length(vertices, mesh.faces) for vertices in (now, before)],

@@ -101,7 +101,7 @@ class Listed:
         return chosen
 
 
-def region_statistics(seen: EvaluatedResults, region: Region, fields: Sequence[str] = ()) -> Table:
+def region_statistics(results: EvaluatedResults, region: Region, fields: Sequence[str] = ()) -> Table:
     """Statistics of fields over a region, one row a field and step.
 
     Fields of triangles are taken over the triangles of the region, fields of points over the corners of these.
@@ -110,8 +110,8 @@ def region_statistics(seen: EvaluatedResults, region: Region, fields: Sequence[s
     region); ``min``, ``p5``, ``median``, ``p95``, ``max`` count triangles or points alike; ``measured`` and ``lost``
     are numbers of them. Raises InputError for a region without triangles or a field there is not.
     """
-    entries = [seen.field(name) for name in fields] if fields else list(seen.fields)
-    mesh = seen.results.mesh
+    entries = [results.field(name) for name in fields] if fields else list(results.fields)
+    mesh = results.results.mesh
     inside = region.faces(mesh)
     if not inside.any():
         raise InputError("the region holds no triangle of the surface")
@@ -119,10 +119,10 @@ def region_statistics(seen: EvaluatedResults, region: Region, fields: Sequence[s
     weights = {"face": areas, "point": _shares(mesh, areas)}
     rows: list[dict[str, Any]] = []
     for entry in entries:
-        for step, name in enumerate(seen.steps):
+        for step, name in enumerate(results.steps):
             weight = weights[entry.location]
             held = weight > 0
-            found = statistics(seen.step(step).scalar(entry)[held], weight[held])
+            found = statistics(results.step(step).scalar(entry)[held], weight[held])
             rows.append({"field": entry.name, "unit": entry.unit, "step": step, "capture": name, **found})
     note = f"{int(inside.sum())} triangles, {areas.sum():.2f} mm² in the reference"
     return Table.of_rows(rows, {}, [note])

@@ -65,18 +65,18 @@ class Crossings:
         return np.asarray((first + shares * (second - first)).mean(axis=1))
 
 
-def section(seen: EvaluatedResults, cut: Cut, fields: Sequence[str] = ()) -> Table:
+def section(results: EvaluatedResults, cut: Cut, fields: Sequence[str] = ()) -> Table:
     """Fields along a section: one row a crossed triangle and step.
 
     A row holds the number of the line, the arc length in the reference, the position and the fields. fields : names;
     all fields unless given. Raises InputError for an unknown field or a cut that misses the surface.
     """
-    entries: list[Field] = [seen.field(name) for name in fields] if fields else list(seen.fields)
-    found = crossings(seen.results.mesh, cut)
-    reference = found.at(seen.results.vertices_ref)
+    entries: list[Field] = [results.field(name) for name in fields] if fields else list(results.fields)
+    found = crossings(results.results.mesh, cut)
+    reference = found.at(results.results.vertices_ref)
     rows: list[dict[str, Any]] = []
-    for step, name in enumerate(seen.steps):
-        arrays, now = seen.step(step), found.at(seen.positions(step))
+    for step, name in enumerate(results.steps):
+        arrays, now = results.step(step), found.at(results.positions(step))
         columns = {
             entry.name: found.at(values) if entry.location == "point" else values[found.faces]
             for entry in entries

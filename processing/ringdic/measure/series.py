@@ -12,19 +12,19 @@ from ringdic.measure.table import Table
 from ringdic.results.evaluation import EvaluatedResults
 
 
-def time_series(seen: EvaluatedResults, places: Sequence[Place], fields: Sequence[str] = ()) -> Table:
+def time_series(results: EvaluatedResults, places: Sequence[Place], fields: Sequence[str] = ()) -> Table:
     """Position and fields of places at every step; one row a place and step.
 
     Fields of points are interpolated at the place, fields of triangles are those of its triangle. fields : names; all
     fields unless given. Raises InputError for an unknown field.
     """
-    entries = [seen.field(name) for name in fields] if fields else list(seen.fields)
-    faces = seen.results.faces
+    entries = [results.field(name) for name in fields] if fields else list(results.fields)
+    faces = results.results.faces
     rows: list[dict[str, Any]] = []
-    for step, name in enumerate(seen.steps):
-        arrays = seen.step(step)
+    for step, name in enumerate(results.steps):
+        arrays = results.step(step)
         values = {entry.name: arrays.scalar(entry) for entry in entries}
-        positions = seen.positions(step)
+        positions = results.positions(step)
         for number, place in enumerate(places):
             x, y, z = place.at(positions, faces)
             row: dict[str, Any] = {"place": place.label, "step": step, "capture": name, "x": x, "y": y, "z": z}
@@ -33,13 +33,13 @@ def time_series(seen: EvaluatedResults, places: Sequence[Place], fields: Sequenc
                 row[entry.name] = float(place.at(here, faces) if entry.location == "point" else here[place.face])
             rows.insert((number + 1) * (step + 1) - 1, row)  # the steps of a place follow one another
     units = {"x": "mm", "y": "mm", "z": "mm", **{entry.name: entry.unit for entry in entries}}
-    return Table.of_rows(rows, units, _notes(seen, places))
+    return Table.of_rows(rows, units, _notes(results, places))
 
 
-def _notes(seen: EvaluatedResults, places: Sequence[Place]) -> list[str]:
-    reference = seen.results.vertices_ref
+def _notes(results: EvaluatedResults, places: Sequence[Place]) -> list[str]:
+    reference = results.results.vertices_ref
     return [
         f"{place.label} is in triangle {place.face}, in the reference at "
-        f"({', '.join(f'{c:.3f}' for c in np.asarray(place.at(reference, seen.results.faces)))}) mm"
+        f"({', '.join(f'{c:.3f}' for c in np.asarray(place.at(reference, results.results.faces)))}) mm"
         for place in places
     ]

@@ -23,24 +23,24 @@ _INSIDE = (219, 222, 227)
 
 
 def overlay_frames(
-    seen: EvaluatedResults, session: Session, camera_id: str, scale: Scale, side: int = 720, opacity: float = 0.65
+    results: EvaluatedResults, session: Session, camera_id: str, scale: Scale, side: int = 720, opacity: float = 0.65
 ) -> Iterator[Picture]:
     """Frames of an animation, one a step: a camera's photograph with the field over it, colour bar and step name.
 
     side : px, longest side of a frame. opacity : of the colours, 0 to 1. Frames are (height, width, 3) sRGB.
     """
-    for step, name in enumerate(seen.steps):
-        laid = overlay(seen, camera_id, photograph(session, name, camera_id), scale, step, opacity)
+    for step, name in enumerate(results.steps):
+        laid = overlay(results, camera_id, photograph(session, name, camera_id), scale, step, opacity)
         yield _framed(no_larger(laid, side), scale, f"{step}: {name}, camera {camera_id}")
 
 
-def surface_frames(seen: EvaluatedResults, scale: Scale, azimuth: float, side: int = 720) -> Iterator[Picture]:
+def surface_frames(results: EvaluatedResults, scale: Scale, azimuth: float, side: int = 720) -> Iterator[Picture]:
     """Frames of an animation, one a step: the coloured surface seen from an azimuth (rad).
 
     The surface is drawn where it stood, or freed of its rigid motion if the evaluation removes it. side : px, height of
     a frame. Frames are (height, width, 3) sRGB. Raises ComputationError if no step has a measured triangle.
     """
-    meshes = [Mesh(seen.positions(step), seen.results.faces) for step in range(len(seen.steps))]
+    meshes = [Mesh(results.positions(step), results.results.faces) for step in range(len(results.steps))]
     extents = np.array([side_extent(mesh, azimuth) for mesh in meshes if mesh.whole_faces().any()])
     if not len(extents):
         raise ComputationError("no step of the run has a measured triangle; there is nothing to draw")
@@ -48,11 +48,11 @@ def surface_frames(seen: EvaluatedResults, scale: Scale, azimuth: float, side: i
     common: Extent = (float(low[0]), float(high[1]), float(low[2]), float(high[3]))
     for step, mesh in enumerate(meshes):
         view = from_side(mesh, azimuth, height=2 * side, extent=common)  # twice as fine, for smooth rims
-        values = on_faces(seen, scale.field, seen.step(step).scalar(scale.field), step)
+        values = on_faces(results, scale.field, results.step(step).scalar(scale.field), step)
         drawn = face_colours(view.faces, values, scale)
         picture = np.where(drawn[..., 3:] > 0, np.rint(255.0 * drawn[..., :3]), 255.0).astype(np.uint8)
         picture[view.inside] = _INSIDE
-        yield _framed(no_larger(picture, side), scale, f"{step}: {seen.steps[step]}")
+        yield _framed(no_larger(picture, side), scale, f"{step}: {results.steps[step]}")
 
 
 def write_animation(path: Path, frames: Sequence[Picture], seconds: float = 0.8) -> None:

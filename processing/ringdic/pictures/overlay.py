@@ -17,7 +17,7 @@ from ringdic.session.images import read_gray
 
 
 def overlay(
-    seen: EvaluatedResults, camera_id: str, image: Image, scale: Scale, step: int, opacity: float = 0.65
+    results: EvaluatedResults, camera_id: str, image: Image, scale: Scale, step: int, opacity: float = 0.65
 ) -> Picture:
     """A photograph with a field drawn over it, (height, width, 3) uint8 sRGB.
 
@@ -27,7 +27,7 @@ def overlay(
 
     Raises InputError for a camera that the run does not have, a photograph of another size, an opacity beyond 0 to 1.
     """
-    camera = camera_of(seen, camera_id)
+    camera = camera_of(results, camera_id)
     if image.shape != (camera.size[1], camera.size[0]):
         raise InputError(
             f"camera {camera_id}: the photograph is {image.shape[1]} x {image.shape[0]} px, but the camera was "
@@ -35,8 +35,8 @@ def overlay(
         )
     if not 0.0 <= opacity <= 1.0:
         raise InputError(f"the opacity of an overlay is from 0 to 1, not {opacity:g}")
-    mesh = Mesh(seen.results.vertices[step], seen.results.faces)
-    values = on_faces(seen, scale.field, seen.step(step).scalar(scale.field), step)
+    mesh = Mesh(results.results.vertices[step], results.results.faces)
+    values = on_faces(results, scale.field, results.step(step).scalar(scale.field), step)
     drawn = face_colours(through_camera(mesh, camera), values, scale)
     weight = opacity * drawn[..., 3:]
     grey = np.asarray(image, dtype=float) / np.iinfo(image.dtype).max
@@ -51,12 +51,12 @@ def photograph(session: Session, capture_id: str, camera_id: str) -> Image:
     raise InputError(f"{session.path}: camera {camera_id} has no image in {capture_id}; choose another camera or step")
 
 
-def camera_of(seen: EvaluatedResults, camera_id: str) -> Camera:
+def camera_of(results: EvaluatedResults, camera_id: str) -> Camera:
     """The calibrated camera of this id. Raises InputError if the run has none."""
-    for camera in seen.results.cameras:
+    for camera in results.results.cameras:
         if camera.id == camera_id:
             return camera
-    known = ", ".join(camera.id for camera in seen.results.cameras)
+    known = ", ".join(camera.id for camera in results.results.cameras)
     raise InputError(f"the run has no camera '{camera_id}'; it has {known}")
 
 

@@ -69,21 +69,21 @@ class Scale:
         return whole
 
 
-def scale_of(seen: EvaluatedResults, name: str, limits: tuple[float, float] | None = None) -> Scale:
+def scale_of(results: EvaluatedResults, name: str, limits: tuple[float, float] | None = None) -> Scale:
     """Colour scale of a field, between ``limits`` or limits that suit all steps. Raises InputError if unknown."""
-    low, high = seen.limits(name) if limits is None else limits
-    return Scale(seen.field(name), float(low), float(high))
+    low, high = results.limits(name) if limits is None else limits
+    return Scale(results.field(name), float(low), float(high))
 
 
-def on_faces(seen: EvaluatedResults, entry: Field, values: Floats, step: int) -> Floats:
+def on_faces(results: EvaluatedResults, entry: Field, values: Floats, step: int) -> Floats:
     """Values of a field on the triangles (M,), in its unit, NaN where a corner was not measured at the step.
 
     values : (N,) or (M,) of the field, by its location; values of points are averaged over a triangle's corners.
     """
-    faces = seen.results.faces
+    faces = results.results.faces
     if entry.location == "point":
         values = values[faces].mean(axis=1)
-    lost = ~np.isfinite(seen.results.vertices[step]).all(axis=1)
+    lost = ~np.isfinite(results.results.vertices[step]).all(axis=1)
     return np.asarray(np.where(lost[faces].any(axis=1), np.nan, values))
 
 

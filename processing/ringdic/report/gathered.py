@@ -35,39 +35,39 @@ class Gathered:
 
 
 def gather(
-    seen: EvaluatedResults,
+    results: EvaluatedResults,
     names: Sequence[str],
     shown: Sequence[int],
     progress: Callable[[float], None] = lambda _: None,
 ) -> Gathered:
     """Gather those of the named fields that the run has. shown : steps whose values are kept for maps."""
-    fields = [entry for name in names for entry in seen.fields if entry.name == name]
+    fields = [entry for name in names for entry in results.fields if entry.name == name]
     ranges = Ranges(fields)
-    weights = _weights(seen)
+    weights = _weights(results)
     faces: dict[tuple[str, int], NDArray[np.float32]] = {}
     values: dict[tuple[str, int], NDArray[np.float32]] = {}
     found: dict[tuple[str, int], dict[str, Any]] = {}
-    for step in range(len(seen.steps)):
-        arrays = seen.step(step)
+    for step in range(len(results.steps)):
+        arrays = results.step(step)
         ranges.add(arrays)
         for entry in fields:
             scalar = arrays.scalar(entry)
             found[entry.name, step] = statistics(scalar, weights[entry.location])
             if step in shown:
                 values[entry.name, step] = scalar[np.isfinite(scalar)].astype(np.float32)
-                faces[entry.name, step] = on_faces(seen, entry, scalar, step).astype(np.float32)
-        progress((step + 1) / len(seen.steps))
+                faces[entry.name, step] = on_faces(results, entry, scalar, step).astype(np.float32)
+        progress((step + 1) / len(results.steps))
     scales = {entry.name: _scale(entry, row) for entry, row in zip(fields, ranges.table(), strict=True)}
-    return Gathered(seen.steps, tuple(shown), scales, faces, values, found)
+    return Gathered(results.steps, tuple(shown), scales, faces, values, found)
 
 
 def _scale(entry: Field, row: dict[str, Any]) -> Scale:
     return Scale(entry, *even_limits(row["range"], entry.centre))
 
 
-def _weights(seen: EvaluatedResults) -> dict[str, Floats]:
+def _weights(results: EvaluatedResults) -> dict[str, Floats]:
     """Weights in mm²: the reference area of each triangle, and for each point a third of that of its triangles."""
-    mesh = seen.results.mesh
+    mesh = results.results.mesh
     areas = mesh.areas
     shares = np.bincount(mesh.faces.ravel(), np.repeat(areas / 3.0, 3), len(mesh.vertices))
     return {"face": areas, "point": np.asarray(shares, dtype=float)}

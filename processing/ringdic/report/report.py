@@ -51,25 +51,25 @@ def write_report(
     out = results_path.parent / "report.html" if out is None else Path(out)
     if out.is_dir() or not out.parent.is_dir():
         raise InputError(f"{out}: not a file in a folder that is there; give the name of an HTML file")
-    session, seen = open_session(session_path), evaluate_results(results_path)
-    results = seen.results
+    session, results = open_session(session_path), evaluate_results(results_path)
+    source = results.results
     document = Document(
         f"{session.name}: report of run {results_path.parent.name}",
-        f"Rig {results.rig}, {len(results.cameras)} cameras, {len(results.steps) - 1} steps after the reference; "
+        f"Rig {source.rig}, {len(source.cameras)} cameras, {len(source.steps) - 1} steps after the reference; "
         f"measured by RingDIC {_version()}",
     )
-    _summary(document, results)
+    _summary(document, source)
     gathered = gather(
-        seen,
+        results,
         list(dict.fromkeys((*_MAPS, *_CERTAINTY, *STATED))),
-        shown_steps(len(seen.steps)),
+        shown_steps(len(results.steps)),
         lambda s: progress(0.3 * s),
     )
-    _describe(document, session, results, gathered)
+    _describe(document, session, source, gathered)
     progress(0.5)
-    _pictures(document, seen, gathered, lambda share: progress(0.5 + 0.45 * share))
+    _pictures(document, results, gathered, lambda share: progress(0.5 + 0.45 * share))
     document.section("settings", "Settings of the run")
-    document.verbatim("settings-toml", results.settings)
+    document.verbatim("settings-toml", source.settings)
     aside = out.with_name(f".{out.name}.{uuid4().hex}.partial")
     try:
         aside.write_text(document.to_html(), encoding="utf-8")
@@ -106,7 +106,7 @@ def _describe(document: Document, session: Session, results: Results, gathered: 
 
 
 def _pictures(
-    document: Document, seen: EvaluatedResults, gathered: Gathered, progress: Callable[[float], None]
+    document: Document, results: EvaluatedResults, gathered: Gathered, progress: Callable[[float], None]
 ) -> None:
     document.section("courses", "Courses and statistics")
     document.picture(
@@ -120,13 +120,13 @@ def _pictures(
         plots.histograms(gathered, [name for name in (*_MAPS, *_CERTAINTY) if name in gathered.scales]),
         "Shares of points or triangles; what lies beyond a scale's limits is counted at its ends.",
     )
-    views = _views(seen, gathered.shown)
+    views = _views(results, gathered.shown)
     progress(0.2)
     done = 0
     for key, title, chosen in (("maps", "Maps", _MAPS), ("certainty", "Maps of uncertainty and quality", _CERTAINTY)):
         document.section(key, title)
         if key == "maps":
-            document.text(_how_to_read(seen, gathered.shown))
+            document.text(_how_to_read(results, gathered.shown))
         for name in chosen:
             if name in gathered.scales:
                 scale = gathered.scales[name]
@@ -163,25 +163,27 @@ def shown_steps(count: int) -> list[int]:
     return sorted({int(k) for k in np.rint(np.linspace(1, count - 1, min(_STEPS_SHOWN, count - 1)))})
 
 
-def _views(seen: EvaluatedResults, steps: Sequence[int]) -> list[plots.StepViews]:
+def _views(results: EvaluatedResults, steps: Sequence[int]) -> list[plots.StepViews]:
     """The views of the steps shown. Maps are drawn over the reference, so that a material place stays where it is."""
-    reference = unrolled(seen.results.mesh)
-    front = mean_azimuth(seen.results.mesh)
+    reference = unrolled(results.results.mesh)
+    front = mean_azimuth(results.results.mesh)
     made = []
     for step in steps:
-        mesh = Mesh(seen.positions(step), seen.results.faces)
+        mesh = Mesh(results.positions(step), results.results.faces)
         sides: list[tuple[str, View]] = []
         for azimuth in (front, front + np.pi) if mesh.whole_faces().any() else ():
             view = from_side(mesh, azimuth)
             if not sides or view.outside_share > _WORTHWHILE:
                 sides.append((f"from {np.degrees(azimuth) % 360:.0f}°", view))
-        made.append(plots.StepViews(step, seen.steps[step], reference, sides))
+        made.append(plots.StepViews(step, results.steps[step], reference, sides))
     fewest = min(len(step.sides) for step in made)
     return [plots.StepViews(each.step, each.name, each.unrolled, each.sides[:fewest]) for each in made]
 
 
-def _how_to_read(seen: EvaluatedResults, steps: Sequence[int]) -> str:
-    which = "all steps" if len(steps) >= len(seen.steps) - 1 else f"{len(steps)} of the {len(seen.steps) - 1} steps"
+def _how_to_read(results: EvaluatedResults, steps: Sequence[int]) -> str:
+    which = (
+        "all steps" if len(steps) >= len(results.steps) - 1 else f"{len(steps)} of the {len(results.steps) - 1} steps"
+    )
     return (
         f"Shown are {which}: left the surface unrolled over azimuth and height of the reference, so that a place of "
         "the material stays where it is; right the body as it stood, from 15° above. Blank: not measured. Light grey: "
