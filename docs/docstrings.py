@@ -1,7 +1,7 @@
 """Docstrings as Markdown: what mkdocstrings is given in place of the reStructuredText habits of the code.
 
-An extension of griffe, named in ``mkdocs.yml``. Literal blocks that ``::`` opens, definition lists, simple tables and
-roles are rewritten; everything else is Markdown as it stands.
+An extension of griffe, named in ``mkdocs.yml``. Headings, lists of parameters, literal blocks that ``::`` opens,
+examples, definition lists, simple tables and roles are rewritten; everything else is Markdown as it stands.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ from typing import Any
 import griffe
 
 _ROLE = re.compile(r":(?:class|func|meth|mod|attr|data):`~?([^`]+)`")
-_TERM = re.compile(r"^(?P<term>\S[^\n]*)\n(?P<body>(?:    [^\n]*(?:\n|\Z))+)", re.MULTILINE)
-_TABLE = re.compile(r"^(?:=+ +)+=+\n(?:.*\n)+?(?:=+ +)+=+\n(?:(?:.*\n)+?(?:=+ +)+=+(?:\n|\Z))?", re.MULTILINE)
+_RULE = r"^(?:=+ +)+=+\n"
+_TABLE = re.compile(rf"{_RULE}(?:.*\n)+?{_RULE}(?:(?:.*\n)+?(?:=+ +)+=+(?:\n|\Z))?", re.MULTILINE)
+_EXAMPLE = re.compile(r"^>>> .*(?:\n\S.*)*", re.MULTILINE)
 _TITLE = re.compile(r"^(\S.*)\n-{3,}\n", re.MULTILINE)
 _NAMED = re.compile(r"\n+``(\w+)`` {2,}(?=\S)")
 _PARAMETER = re.compile(r"\n+(\w+(?:, \w+)*) : (?=\S)")
-_SECTIONS = {"Parameters", "Attributes", "Returns", "Yields", "Raises", "Notes", "Examples", "See Also", "References"}
+_TERM = re.compile(r"^(?P<term>[^\s-][^\n]*)\n(?P<body>(?:    [^\n]*(?:\n|\Z))+)", re.MULTILINE)
 
 
 def markdown(text: str) -> str:
@@ -27,9 +28,12 @@ def markdown(text: str) -> str:
     whole = _prose(parts[0])
     for opening, rest in zip(parts[1::2], parts[2::2], strict=True):
         block, after = _literal(rest)
-        whole += f"{opening[:-2].rstrip()}\n\n" if opening == "::" else f"{opening[:-1]}\n\n"
-        whole += f"```text\n{block}\n```\n\n{_prose(after)}"
+        whole += f"\n\n{opening[:-1].rstrip(':')}\n\n{_fenced(block)}{_prose(after)}"
     return whole
+
+
+def _fenced(block: str, language: str = "text") -> str:
+    return f"\n\n```{language}\n{block.rstrip()}\n```\n\n"
 
 
 def _literal(text: str) -> tuple[str, str]:
@@ -41,19 +45,19 @@ def _literal(text: str) -> tuple[str, str]:
 
 
 def _prose(text: str) -> str:
-    """Text without literal blocks: simple tables become blocks, everything between them paragraphs and lists."""
-    pieces, end = [], 0
-    for table in _TABLE.finditer(text):
-        pieces += [_paragraphs(text[end : table.start()]), f"```text\n{table[0].rstrip()}\n```\n"]
-        end = table.end()
-    return "".join([*pieces, _paragraphs(text[end:])])
+    """Text without literal blocks: tables and examples become blocks, everything between them paragraphs and lists."""
+    blocks = [(found.span(), _fenced(found[0])) for found in _TABLE.finditer(text)]
+    blocks += [(found.span(), _fenced(found[0], "pycon")) for found in _EXAMPLE.finditer(text)]
+    whole, end = "", 0
+    for (start, stop), block in sorted(blocks):
+        whole += _paragraphs(text[end:start]) + block
+        end = stop
+    return whole + _paragraphs(text[end:])
 
 
 def _paragraphs(text: str) -> str:
-    text = _TITLE.sub(lambda match: match[0] if match[1] in _SECTIONS else f"**{match[1]}**\n\n", text)
+    text = _TITLE.sub(r"**\1**\n\n", text)
     text = _NAMED.sub(r"\n\n- `\1`: ", text)
-    if _SECTIONS & set(text.splitlines()):  # numpydoc: the parser of docstrings knows these indentations
-        return text
     text = _PARAMETER.sub(r"\n\n- `\1`: ", text)
     return _TERM.sub(lambda match: f"{match['term']}\n:   {match['body'].strip()}\n\n", text)
 
