@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from ringdic_controller.archive.importing import import_folder
+from ringdic import import_folder
 from ringdic_node.virtual_rig.__main__ import main
 
 
