@@ -128,8 +128,7 @@ def correlate_points(
 def correlate_independently(
     reference: Reference, current: Current, xy: Pixels, settings: CorrelationSettings, start: Floats
 ) -> Correlation:
-    """Match points of a reference image each from its own start value, without propagation and without a test of
-    outliers.
+    """Match points of a reference image each from its own start value, without propagation and test of outliers.
 
     Parameters
     ----------
@@ -137,6 +136,8 @@ def correlate_independently(
         where a subset leaves that, the point is lost.
     xy : (n, 2) float64, px, points of the reference image.
     start : (n, 6) or (n, 12) float64, px and derivatives, as for :func:`correlate_points`; NaN leaves a point out.
+
+    Raises InputError if there is no point, or if the images were prepared for other settings.
     """
     xy = _check_points(reference, current, xy, settings)
     load_kernels()
@@ -151,8 +152,9 @@ def correlate_independently(
 
 
 def _check_points(reference: Reference, current: Current, xy: Pixels, settings: CorrelationSettings) -> Pixels:
-    """The points (n, 2) px as the kernels take them. Raises InputError where they or the images do not fit the
-    settings.
+    """The points (n, 2) px as the kernels take them.
+
+    Raises InputError where they or the images do not fit the settings.
     """
     xy = np.ascontiguousarray(xy, dtype=np.float64)
     if current.degree != settings.degree:

@@ -20,9 +20,7 @@ _COLUMNS = 64  # columns that one thread takes at a time: 2000 rows of them are 
 
 @nb.njit(cache=True, nogil=True)
 def mirror_index(at, count):  # type: ignore[no-untyped-def]
-    """Index of the pixel shown at position ``at``, inside or beyond a row of ``count`` pixels that is mirrored at its
-    ends.
-    """
+    """Index of the pixel shown at position ``at``, inside a row of ``count`` pixels or mirrored at its ends."""
     while at < 0 or at >= count:
         at = -at if at < 0 else 2 * (count - 1) - at
     return at

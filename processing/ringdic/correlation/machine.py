@@ -52,9 +52,7 @@ class KernelCost:
     bytes: float
 
     def bound(self, machine: Machine) -> float:
-        """Largest number of points per second that one core can reach: the arithmetic's bound or the memory's, the
-        lower of the two.
-        """
+        """Largest number of points per second that one core can reach, bounded by its arithmetic or its memory."""
         return 1.0 / max(self.operations / machine.operations, self.bytes / machine.bandwidth)
 
 

@@ -108,10 +108,9 @@ def _extrapolate_displacement(xy, parameters, source, target, at):  # type: igno
 
 @nb.njit(cache=True, nogil=True, parallel=True)
 def _deviations(xy, parameters, good, near, stale, deviation):  # type: ignore[no-untyped-def]
-    """Distance (n,) px of each good point from the median of its neighbours' extrapolations, into deviation; NaN
-    without any.
+    """Fill deviation (n,) px, the distance of good points from the median of their neighbours' extrapolations.
 
-    Only points that are stale (n,) or have a stale neighbour are computed.
+    NaN without any. Only points that are stale (n,) or have a stale neighbour are computed.
     """
     for k in nb.prange(len(xy)):
         changed = stale[k]

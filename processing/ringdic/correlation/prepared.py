@@ -1,6 +1,4 @@
-"""Reference and current images prepared for correlation: gradients and B-spline coefficients, computed once for all
-pairs.
-"""
+"""Reference and current images with their gradients and B-spline coefficients, computed once for all pairs."""
 
 from __future__ import annotations
 
@@ -144,11 +142,9 @@ class Current:
         return Current(self.image, box, self.degree, self.precision)
 
     def crop_by_affine_fit(self, at: Pixels, to: Pixels, xy: Pixels, radius: int) -> Current:
-        """The current image with its box reduced to where all points will lie, extrapolated from the matches of some of
-        them.
+        """The current image with its box reduced to where an affine fit of some matches puts all points.
 
-        at, to : (k, 2) float64, px, reference and current positions of the matched points; an affine map is fitted to
-            them.
+        at, to : (k, 2) float64, px, reference and current positions of the matched points.
         xy : (n, 2) float64, px, reference positions of all points. radius : px, of the subset; the margin is three of
             it and 32 px.
         """

@@ -196,7 +196,7 @@ class Propagation:
         self.filtering += time.perf_counter() - began
 
     def _initial_region(self, start: Floats, index: Indices) -> Current:
-        """The part of the current image where all points will lie, extrapolated from start values (k, 12) of points
+        """The part of the current image where all points will lie, by an affine fit of start values (k, 12) of points
         (k,).
         """
         known = np.isfinite(start).all(axis=1)
@@ -315,8 +315,7 @@ def textureless_points(reference: Reference, xy: Pixels, settings: CorrelationSe
 
 
 def _texture(reference: Reference, radius: int) -> tuple[NDArray[np.float32], int]:
-    """Smaller eigenvalue of the structure tensor over a square of the subset's size, for the pixels of the reference's
-    box.
+    """Smaller eigenvalue of the structure tensor over a square of the subset's size, at pixels of the reference's box.
 
     It is computed from every ``thin``-th pixel each way, and for those. Returns the eigenvalues (rows, columns), in
     squared grey levels per px², and ``thin``.

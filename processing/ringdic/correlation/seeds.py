@@ -21,10 +21,9 @@ _SEARCH = 160  # px, largest displacement of the template search
 
 
 def even_sample(xy: Pixels, count: int = _SEEDS) -> Indices:
-    """Sample about ``count`` points spread evenly over the area of all: in each cell of a grid the point nearest to its
-    middle.
+    """Sample of about ``count`` points spread evenly over the area of all.
 
-    xy : (n, 2) float64, px. Returns indices (k,), ascending.
+    xy : (n, 2) float64, px. Returns indices (k,), ascending: in each cell of a grid the point nearest to its middle.
     """
     if len(xy) <= count:
         return np.arange(len(xy))

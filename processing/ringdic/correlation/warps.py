@@ -69,8 +69,9 @@ def variance(L, y, n, which):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _warp_matrix(p, M):  # type: ignore[no-untyped-def]
-    """Fill M (6, 6), the matrix of a warp p (12,) acting on (x², xy, y², x, y, 1), third powers dropped (Gao et al.
-    2015).
+    """Fill M (6, 6), the matrix of a warp p (12,) that acts on (x², xy, y², x, y, 1) (Gao et al. 2015).
+
+    Third powers are dropped.
     """
     u, ux, uy, uxx, uxy, uyy = p[0], 1.0 + p[1], p[2], p[3], p[4], p[5]
     v, vx, vy, vxx, vxy, vyy = p[6], p[7], 1.0 + p[8], p[9], p[10], p[11]
@@ -117,8 +118,7 @@ def compose_inverse(p, d, A, B):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def compose_inverse_affine(p, d):  # type: ignore[no-untyped-def]
-    """Compose the affine part of the warp p (12,) with the inverse of that of d (12,), in place and exactly: p ← p ∘
-    d⁻¹.
+    """Compose the affine part of the warp p (12,) with the inverse of that of d (12,), in place: p ← p ∘ d⁻¹, exactly.
 
     The second derivatives of p stay as they are. False where d cannot be inverted.
     """

@@ -165,9 +165,7 @@ def lattice_region(points: ImageLattice, good: Mask, size: tuple[int, int]) -> M
 
 
 def _difference(xyz: Points, axis: int) -> Vectors:
-    """Differences (rows, columns, 3) of points along a lattice axis: central, or one-sided where a neighbour is
-    missing.
-    """
+    """Differences (rows, columns, 3) of points along a lattice axis, central or, beside a missing point, one-sided."""
     forward = np.full_like(xyz, np.nan)
     backward = np.full_like(xyz, np.nan)
     lower = [slice(None)] * 3
