@@ -6,10 +6,13 @@ BIN := $(VENV)/bin
 # A processor without AVX-512, as numba is told of it.
 NARROW := +sse,+sse2,+sse3,+ssse3,+sse4.1,+sse4.2,+avx,+avx2,+fma,+bmi,+bmi2,+popcnt,+lzcnt,+cmov,+cx8,+cx16,+f16c,+fxsr,+mmx,+movbe,+sahf,+xsave
 
+# The oldest numba that pyproject.toml allows.
+OLDEST := $(shell sed -n 's/.*"numba>=\([0-9.]*\),.*/\1/p' pyproject.toml | head -1)
+
 # Fails unless the bundled page lies in the installed package.
 HAS_PAGE := from importlib.resources import files; files('ringdic_controller').joinpath('web/static/index.html').read_text()
 
-.PHONY: install demo test test-narrow test-dist lint bench dist clean
+.PHONY: install demo test test-narrow test-numba test-dist lint bench dist clean
 
 $(VENV)/.installed: pyproject.toml
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
@@ -41,6 +44,11 @@ test: lint                             ## style, types and the whole suite
 test-narrow: $(VENV)/.installed-test   ## the kernels compiled for an x86-64 processor without AVX-512
 	NUMBA_CPU_NAME=haswell NUMBA_CPU_FEATURES="$(NARROW)" NUMBA_CACHE_DIR=build/narrow \
 	  $(BIN)/python -m pytest tests/processing/correlation/test_single_precision_kernel.py
+
+test-numba:                            ## the kernels as compiled by the oldest numba; `make test` has the newest
+	test -d build/numba || $(PYTHON) -m venv build/numba
+	RINGDIC_SKIP_PAGE=1 build/numba/bin/python -m pip install --quiet ".[processing]" "numba==$(OLDEST).*" pytest
+	cd build && numba/bin/python -P -m pytest --noconftest ../tests/processing/correlation/test_single_precision_kernel.py
 
 bench: install                         ## speed and memory
 	$(BIN)/ringdic bench

@@ -103,7 +103,7 @@ class ImageCorrelation:
 
     @property
     def status(self) -> Indices:
-        """Status of each point, (n,): 0 for a match, else the reason why there is none."""
+        """Status of each point as an int, (n,): 0 for a match, else the reason why there is none."""
         return self.matches.status
 
     @property

@@ -1,10 +1,11 @@
-"""``python -m ringdic.jobs SESSION``: process a session and tell about it in lines of JSON on standard output.
+"""``python -m ringdic.jobs SESSION`` processes a session and reports on it in lines of JSON on standard output.
 
-This is what the controller runs as a child process. Every line is one object: ``{"stage", "done", "rate",
-"left_s", "message"}`` while at work, at last ``{"state": "done", "run", "summary"}`` or
-``{"state": "failed", "error"}``. Exit codes: 0 done, 2 bad input, 3 could not be computed, 1 a bug.
+The controller runs it as a child process. Every line is one object: ``{"stage", "done", "rate", "left_s", "message"}``
+during the work, ``{"state": "done", "run", "summary"}`` or ``{"state": "failed", "error"}`` at the end. Exit codes: 0
+done, 2 bad input, 3 could not be computed, 1 a bug.
 
-``python -m ringdic.jobs --serve`` stays warm and takes its orders from standard input; see `ringdic.jobs.serving`.
+``python -m ringdic.jobs --serve`` keeps running and takes one order after the other from standard input, as described
+in `ringdic.jobs.serving`.
 """
 
 from __future__ import annotations
@@ -19,16 +20,17 @@ from typing import Any
 
 from ringdic.errors import RingdicError
 from ringdic.jobs.allocation import keep_freed_memory
-from ringdic.jobs.serving import carry_out, compile_kernels, serve, told
+from ringdic.jobs.serving import carry_out, compile_kernels, progress_values, serve
+from ringdic.progress import Progress
 
 
 def main() -> int:
-    """Parse the command line, process, report; the exit code."""
+    """Read the command line, do what it asks for and return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m ringdic.jobs", description="Process a session folder.")
-    what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("session", type=Path, nargs="?")
-    what.add_argument("--serve", action="store_true", help="take orders from standard input")
-    what.add_argument("--compile", action="store_true", help="compile the kernels at low priority, and end")
+    choice = parser.add_mutually_exclusive_group(required=True)
+    choice.add_argument("session", type=Path, nargs="?")
+    choice.add_argument("--serve", action="store_true", help="take orders from standard input")
+    choice.add_argument("--compile", action="store_true", help="compile the kernels at low priority, and end")
     parser.add_argument("--settings", type=Path)
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="NAME=VALUE")
     arguments = parser.parse_args()
@@ -40,7 +42,9 @@ def main() -> int:
     if arguments.serve:
         return _serve_to_the_end()
     try:
-        _line(carry_out(arguments.session, arguments.settings, arguments.overrides, lambda at: _line(told(at))))
+        _line(
+            carry_out(arguments.session, arguments.settings, arguments.overrides, lambda at: _line(progress_values(at)))
+        )
     except RingdicError as error:
         _line({"state": "failed", "error": str(error)})
         return error.exit_code
@@ -56,6 +60,10 @@ def _serve_to_the_end() -> int:
     return 0
 
 
+def _line_of_progress(progress: Progress) -> None:
+    _line(progress_values(progress))
+
+
 def _line(value: dict[str, Any]) -> None:
     sys.stdout.write(json.dumps(value) + "\n")
     sys.stdout.flush()
@@ -65,5 +73,6 @@ if __name__ == "__main__":
     code = main()
     sys.stdout.flush()
     sys.stderr.flush()
-    # At once: all is written, taking arrays and kernels down takes half a second, and who reads the orders never ends.
+    # Ends at once: everything is written, freeing arrays and kernels would take half a second, and the thread that
+    # reads the orders never ends by itself.
     os._exit(code)

@@ -1,10 +1,12 @@
-"""A warm processing: kernels loaded, what was read is kept, and one order after the other is carried out.
+"""A warm processing: a process that keeps its kernels loaded and carries out one order after the other.
 
-Orders come as lines of JSON, ``{"order": 1, "session": PATH, "step": null | CAPTURE, "settings": null | FILE}``;
-``{"stop": 1}`` asks order 1 to stop at its next report of progress. Told, as lines of JSON too, are
-``{"worker": "warming", "compiling": true}`` and ``{"worker": "ready", "seconds": 1.2}``, and of an order what
-`ringdic.jobs.__main__` tells, with ``{"state": "stopped"}`` as a third outcome. It ends when no orders can come any
-more.
+Orders are lines of JSON on standard input, ``{"order": 1, "session": PATH, "step": null | CAPTURE, "settings": null |
+FILE}``; with a ``step`` that capture alone is processed, at once. ``{"stop": 1}`` asks order 1 to stop at its next
+report of progress.
+
+Reports are lines of JSON too. At the start come ``{"worker": "warming", "compiling": true}``, where kernels have to be
+compiled, and ``{"worker": "ready", "seconds": 1.2}``. Of an order come the lines that `ringdic.jobs.__main__`
+describes, with ``{"state": "stopped"}`` as a third outcome. The process ends when its standard input does.
 """
 
 from __future__ import annotations
@@ -28,16 +30,17 @@ from ringdic.settings import load_settings
 from ringdic.tasks import process_memory
 
 Say = Callable[[dict[str, Any]], None]
-_MOST_KEPT, _USUAL_MEMORY = 4 << 30, 8 << 30  # bytes
+_MOST_KEPT = 4 << 30  # bytes of prepared images that stay in memory between orders
+_TYPICAL_MEMORY = 8 << 30  # bytes, where the system does not say how much there is
 _NICE = 10  # compiling must not slow a capture down
 
 
 def _memory() -> int:
-    """Bytes to keep between orders: all reference images of a ring of twelve, prepared, take 1.5 GB."""
+    """Bytes of prepared images to keep between orders; the reference images of a ring of twelve take 1.5 GB."""
     try:
         whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, OSError, ValueError):  # not told on this system
-        whole = _USUAL_MEMORY
+    except (AttributeError, OSError, ValueError):  # this system does not say
+        whole = _TYPICAL_MEMORY
     return int(min(_MOST_KEPT, max(process_memory.limit, whole // 4)))
 
 
@@ -46,7 +49,7 @@ class StoppedError(Exception):
 
 
 def serve(lines: Iterable[str], say: Say) -> None:
-    """Carry out the orders of ``lines``, warmed up before the first."""
+    """Load all kernels, then carry out the orders of ``lines`` until they end. ``say`` is called with each report."""
     orders = _Orders(lines)
     began = time.monotonic()
     process_memory.limit = _memory()
@@ -58,7 +61,7 @@ def serve(lines: Iterable[str], say: Say) -> None:
 
 
 def compile_and_load() -> None:
-    """Have the kernels compiled at low priority, where they are not yet, and load them."""
+    """Load all kernels; those that are not in the cache are compiled first, by a process of low priority."""
     lowered = getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0)
     command = [sys.executable, "-P", "-m", "ringdic.jobs", "--compile"]
     subprocess.run(command, check=False, stdin=subprocess.DEVNULL, creationflags=lowered)
@@ -74,7 +77,10 @@ def _load_kernels() -> None:
 
 
 def compile_kernels(say: Say) -> None:
-    """Compile the kernels into their cache, where they are not there, at low priority; tells if it does compile."""
+    """Compile the kernels that are not in the cache yet, at low priority.
+
+    ``say`` is called once if there are any.
+    """
     if hasattr(os, "nice"):
         os.nice(_NICE)
     from ringdic.correlation.warming import on_compiling
@@ -86,8 +92,10 @@ def compile_kernels(say: Say) -> None:
 def carry_out(
     session: Path, settings: Path | None, overrides: list[str], report: Report, step: str | None = None
 ) -> dict[str, Any]:
-    """Process a session, or a step of it at once; the outcome as JSON values.
+    """Process a session and return the outcome as JSON values.
 
+    session : its folder. settings : a TOML file, or None for the defaults. overrides : "group.name=value". report : is
+    called with the progress. step : a capture to process alone and at once; None processes all.
     Raises RingdicError for what an operator can mend.
     """
     if step is not None:
@@ -98,8 +106,8 @@ def carry_out(
     return {"state": "done", "run": run.name, "summary": summary}
 
 
-def told(progress: Progress) -> dict[str, Any]:
-    """A report of progress as JSON values."""
+def progress_values(progress: Progress) -> dict[str, Any]:
+    """A report of progress as the JSON values of one line."""
     return {name: getattr(progress, name) for name in ("stage", "done", "message", "rate", "left_s")}
 
 
@@ -107,7 +115,7 @@ def _carried_out(order: dict[str, Any], say: Say, orders: _Orders) -> dict[str, 
     def report(progress: Progress) -> None:
         if orders.stopped(order["order"]):
             raise StoppedError
-        say(told(progress))
+        say(progress_values(progress))
 
     settings = order.get("settings")
     try:
@@ -120,7 +128,7 @@ def _carried_out(order: dict[str, Any], say: Say, orders: _Orders) -> dict[str, 
 
 
 class _Orders:
-    """Orders as they come, read by a thread, so that an order can be stopped while it is carried out."""
+    """Orders as they arrive. A thread reads them, so that an order can be stopped while it is carried out."""
 
     def __init__(self, lines: Iterable[str]) -> None:
         self._waiting: SimpleQueue[dict[str, Any] | None] = SimpleQueue()
@@ -129,11 +137,11 @@ class _Orders:
         Thread(target=self._read, args=(lines,), name="orders", daemon=True).start()
 
     def next(self) -> dict[str, Any] | None:
-        """The next order, waited for; None when there will be none."""
+        """The next order; waits for it. None when no more can arrive."""
         return self._waiting.get()
 
     def stopped(self, number: int) -> bool:
-        """Whether an order is not wanted any more."""
+        """Whether an order is to stop: it was asked to, or nobody is left who could read its outcome."""
         return self._over or self._stop == number
 
     def _read(self, lines: Iterable[str]) -> None:
