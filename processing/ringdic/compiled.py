@@ -99,25 +99,31 @@ def _use(folder: Path) -> None:
     is_new = not folder.is_dir()
     while True:
         folder.mkdir(parents=True, exist_ok=True)
-        mark = os.open(folder / _IN_USE, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            mark = os.open(folder / _IN_USE, os.O_RDWR | os.O_CREAT, 0o666)
+        except FileNotFoundError:  # another process has just removed the folder
+            continue
         if fcntl is None:
             break
         with contextlib.suppress(OSError):  # a file system without locks
             fcntl.flock(mark, fcntl.LOCK_SH)
         if os.fstat(mark).st_nlink:
             break
-        os.close(mark)  # another process has just removed the folder
+        os.close(mark)  # the folder was removed in between
     os.utime(folder)
     if is_new:
         _remove_old(folder.parent)
 
 
 def _remove_old(parent: Path) -> None:
-    """Remove the folders that were used longest ago, all but ``KEPT`` of them and those in use."""
+    """Remove folders that no process uses: those without kernels, and all but the ``KEPT`` that were used last."""
     with contextlib.suppress(OSError):  # another process removes them too
         folders = [path for path in parent.iterdir() if _NAME.fullmatch(path.name)]
-        for folder in sorted(folders, key=lambda path: path.stat().st_mtime, reverse=True)[KEPT:]:
-            _remove(folder)
+        filled = [path for path in folders if any(entry.name != _IN_USE for entry in path.iterdir())]
+        newest = sorted(filled, key=lambda path: path.stat().st_mtime)[-KEPT:]
+        for folder in folders:
+            if folder not in newest:
+                _remove(folder)
 
 
 def _remove(folder: Path) -> None:

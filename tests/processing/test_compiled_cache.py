@@ -86,9 +86,10 @@ def folders(cache: Path) -> set[str]:
 def test_the_folders_used_longest_ago_are_removed_but_never_one_in_use(tmp_path: Path) -> None:
     old = [tmp_path / "ringdic" / f"kernels-{k:016x}" for k in range(compiled.KEPT + 3)]
     for k, folder in enumerate(old):
-        folder.mkdir(parents=True)
+        (folder / "mesh_0").mkdir(parents=True)
         os.utime(folder, (k, k))
-    (tmp_path / "ringdic" / "notes").mkdir()
+    for name in ("notes", "kernels-ffffffffffffffff"):  # not ours, and one in which nothing was compiled
+        (tmp_path / "ringdic" / name).mkdir()
     in_use = subprocess.Popen(
         [sys.executable, "-P", "-c", f"from ringdic import compiled\nfrom pathlib import Path\n"
          f"compiled._use(Path({str(old[0])!r}))\nprint(flush=True)\ninput()"],
@@ -99,7 +100,7 @@ def test_the_folders_used_longest_ago_are_removed_but_never_one_in_use(tmp_path:
         in_use.stdout.readline()
         os.utime(old[0], (0, 0))
         new = Path(run(SHOW_FOLDER, tmp_path)[0])
-        newest = {folder.name for folder in old[-(compiled.KEPT - 1) :]}
+        newest = {folder.name for folder in old[-compiled.KEPT :]}
         assert folders(tmp_path) == {"notes", new.name, old[0].name} | newest
     finally:
         in_use.communicate("\n", timeout=60)
