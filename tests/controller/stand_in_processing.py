@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from ringdic.geometry.camera import Camera
 from ringdic.results.results import Results
-from ringdic.results.series import part
+from ringdic.results.series import select_steps
 from ringdic.results.writer import write_results
 from ringdic.session.folder import new_live, new_run, open_session
 
@@ -71,7 +71,7 @@ def process(session: Path, step: str | None, seconds: float) -> dict:
     if step is not None:
         with new_live(session, step) as folder:
             whole, at = tube(steps), sorted({0, steps.index(step)})
-            write_results(folder / "results.h5", part(whole, at))
+            write_results(folder / "results.h5", select_steps(whole, at))
         return {"state": "done", "live": step}
     results = tube(steps)
     with new_run(session) as run:

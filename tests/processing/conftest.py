@@ -7,9 +7,9 @@ import cv2
 import pytest
 from ringdic.calibration.calibrated_rig import calibrate_rig
 from ringdic.session.folder import open_session
+from ringdic.session.importing import import_folder
 from ringdic.settings import CalibrationGroup
 from ringdic.tasks import kept
-from ringdic_controller.archive.importing import import_folder
 from ringdic_node.virtual_rig.render import render
 from ringdic_node.virtual_rig.rig import VirtualRig, paper_rig
 from ringdic_node.virtual_rig.scenes import scene

@@ -72,7 +72,7 @@ def import_(
     as_json: AsJson = False,
 ) -> None:
     """Make a session of a folder of images."""
-    from ringdic_controller.archive.importing import import_folder
+    from ringdic.session.importing import import_folder
 
     import_folder(source, session)
     if as_json:

@@ -453,20 +453,3 @@ def judge(
     if archived[manifest.node] == sha256:
         return Judgement("repeat")
     return Judgement("archive")
-
-
-@dataclass(frozen=True)
-class Skew:
-    """Spread of the frames' measured times, ns."""
-
-    skew_ns: int | None
-    exceeded: bool | None
-
-    @classmethod
-    def of(cls, times_ns: Iterable[int | None], tolerance_ns: int | None) -> Skew:
-        """From the measured times; None where fewer than two cameras measured one."""
-        known = [time for time in times_ns if time is not None]
-        if len(known) < 2:
-            return cls(None, None)
-        skew = max(known) - min(known)
-        return cls(skew, None if tolerance_ns is None else skew > tolerance_ns)

@@ -10,9 +10,10 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from ringdic.errors import ComputationError
+from ringdic.session.records import CaptureRecord
+from ringdic.session.writer import CaptureWriter, SessionWriter
 from ringdic_node.wire import Arm, CaptureKey, Manifest, Trigger
 
-from ringdic_controller.archive.writer import CaptureWriter, SessionWriter
 from ringdic_controller.rig import capture as steps
 from ringdic_controller.rig.capture import SECOND, CaptureRound, Timing
 
@@ -54,7 +55,7 @@ def run_round(
     settings: dict[str, Any],
     on_event: Callable[[dict[str, Any]], None],
     wall_ns: Callable[[], int] = time.time_ns,
-) -> dict[str, Any]:
+) -> CaptureRecord:
     """Run one capture round to its end; return the closed record.
 
     `events` brings what happens meanwhile: archived images, failures, nodes that go and come back.
@@ -104,7 +105,7 @@ class _Performer:
         canonical = json.dumps(settings, sort_keys=True, separators=(",", ":")).encode()
         self._arm = Arm(session.name, kind, settings, hashlib.sha256(canonical).hexdigest(), cameras)
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> CaptureRecord:
         """The capture's record as it stands."""
         assert self._writer is not None
         return self._writer.record()
@@ -192,10 +193,8 @@ class _Performer:
         )
 
 
-def capture_event(record: dict[str, Any]) -> dict[str, Any]:
-    """What those who watch are told of a capture's record."""
-    told = {name: record[name] for name in ("session", "capture_id", "kind", "state", "skew_ns", "skew_exceeded")}
-    cameras = {
-        camera: {"status": entry["status"], "reason": entry["reason"]} for camera, entry in record["cameras"].items()
-    }
-    return {"type": "capture", **told, "cameras": cameras}
+def capture_event(record: CaptureRecord) -> dict[str, Any]:
+    """The event, as JSON values, that tells how a capture stands."""
+    names = ("session", "capture_id", "kind", "state", "skew_ns", "skew_exceeded")
+    cameras = {camera: {"status": entry.status, "reason": entry.reason} for camera, entry in record.cameras.items()}
+    return {"type": "capture", **{name: getattr(record, name) for name in names}, "cameras": cameras}

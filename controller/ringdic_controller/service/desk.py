@@ -11,6 +11,8 @@ from threading import Event, Lock, Thread
 from typing import Any, Protocol
 
 from ringdic.errors import InputError
+from ringdic.session.names import CAPTURE_KINDS
+from ringdic.session.records import CaptureRecord
 from ringdic.session.rig import Rig, parse_rig
 
 from ringdic_controller.archive.catalogue import Catalogue
@@ -20,8 +22,6 @@ from ringdic_controller.service.events import Live
 
 logger = logging.getLogger(__name__)
 
-KINDS = ("board", "target", "specimen", "static")
-
 
 class Ring(Protocol):
     """The nodes, as the desk needs them: `ringdic_controller.rig.link.RigLink`, or a stand-in."""
@@ -29,12 +29,12 @@ class Ring(Protocol):
     def roster(self) -> list[dict[str, Any]]:
         """One dictionary a camera: id, alive, state, armed, spool_free, spool_images, versions, …"""
 
-    def capture(self, session: Any, kind: str, *, override: bool = False) -> dict[str, Any]:
+    def capture(self, session: Any, kind: str, *, override: bool = False) -> CaptureRecord:
         """Capture with every camera and archive it; blocks to the end; the record."""
 
 
 class Sessions(Protocol):
-    """The archive, as the desk needs it: `ringdic_controller.archive.writer.Archive`."""
+    """The archive, as the desk needs it: `ringdic.session.writer.Archive`."""
 
     def create_session(self, name: str, rig_toml: str) -> Any:
         """A new session folder; InputError if the name is unusable or taken."""
@@ -265,8 +265,8 @@ class Desk:
 
     def capture(self, kind: str, *, override: bool = False) -> Round:
         """Begin a capture in the current session; it goes on in a thread. RefusedError says why not."""
-        if kind not in KINDS:
-            raise InputError(f"'{kind}' is no kind of capture; use {', '.join(KINDS)}")
+        if kind not in CAPTURE_KINDS:
+            raise InputError(f"'{kind}' is no kind of capture; use {', '.join(CAPTURE_KINDS)}")
         refusal = self.why_no_capture()
         if refusal:
             raise RefusedError(refusal)
@@ -336,10 +336,10 @@ class Desk:
         except BaseException as error:
             self._end_round(started, state="refused", error=f"The capture failed: {error!r}; see the controller's log.")
             raise
-        self._publish_capture(started.session, record["capture_id"])
+        self._publish_capture(started.session, record.capture_id)
         if started.kind == "specimen":
-            self._process(started.session, record["capture_id"])
-        self._end_round(started, state="closed", capture_id=record["capture_id"])
+            self._process(started.session, record.capture_id)
+        self._end_round(started, state="closed", capture_id=record.capture_id)
 
     def _process(self, session: str, capture_id: str) -> None:
         """Have a new step processed at once, and the whole session when no more follow soon.

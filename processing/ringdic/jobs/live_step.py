@@ -7,7 +7,6 @@ whatever the run is told: these alone need nothing of the steps between.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -60,8 +59,7 @@ def _calibrated(session: Session, settings: CalibrationGroup, told: Callable[[fl
     """The ring as calibrated, kept in memory while its images and settings stay."""
     captures = [capture for capture in session.captures if capture.kind in ("board", "target")]
     rig = (session.path / "rig.toml").read_text(encoding="utf-8")
-    records = json.dumps([(each.id, each.record) for each in captures])
-    key = digest("live calibration", str(session.path), rig, settings, records)
+    key = digest("live calibration", str(session.path), rig, settings, [each.record for each in captures])
     return kept.get(key, lambda: calibrate_rig(session, settings, told), lambda _: _RING_BYTES)
 
 

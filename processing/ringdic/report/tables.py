@@ -56,7 +56,7 @@ def hardware(document: Document, session: Session, results: Results, cameras: Se
 def _hardware(session: Session, results: Results, cameras: Sequence[CameraFacts]) -> dict[str, Any]:
     angles = [row["angle_deg"] for row in results.summary.get("calibration", {}).get("pairs", [])]
     captures = [capture for capture in session.captures if capture.id in results.steps]
-    skew = [capture.record["skew_ns"] / 1e3 for capture in captures if capture.record.get("skew_ns") is not None]
+    skew = [capture.record.skew_ns / 1e3 for capture in captures if capture.record.skew_ns is not None]
     return {
         "Cameras": f"{len(cameras)} in a ring, {len(results.pairs)} pairs ({_pairs(results)})",
         "Camera model": None,
@@ -240,7 +240,7 @@ def _span(values: set[str]) -> str:
 
 
 def _interval(captures: Sequence[Capture]) -> str:
-    times = [capture.record.get("fire_at_ns") for capture in captures]
+    times = [capture.record.fire_at_ns for capture in captures]
     if len(times) < 2 or any(time is None for time in times):
         return ", times not recorded"
     apart = np.diff(np.array(times, dtype=float)) / 1e9
@@ -248,7 +248,7 @@ def _interval(captures: Sequence[Capture]) -> str:
 
 
 def _opened(capture: Capture | None) -> str:
-    text = "" if capture is None else str(capture.record.get("opened_at") or "")
+    text = "" if capture is None else capture.record.opened_at or ""
     return text[:19].replace("T", " ")
 
 

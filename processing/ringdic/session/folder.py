@@ -1,4 +1,4 @@
-"""The session folder: the interface between capture and processing. Standard library only.
+"""The session folder: the interface between capture and processing.
 
 ::
 
@@ -24,35 +24,35 @@
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from shutil import rmtree
-from typing import Any
 from uuid import uuid4
 
 from ringdic.errors import InputError
+from ringdic.session.names import CAPTURE_KINDS, split_capture_id
+from ringdic.session.records import REMEDY, CaptureRecord, SessionError, read_capture_record, read_session_record
 from ringdic.session.rig import Rig, read_rig
 
-KINDS = ("board", "target", "specimen", "static")
-_MEND = "copy it back, or import the session again"
 _LIVE_KEPT = 5  # the operator may stay at one while newer ones come
-_CAPTURE_NAME = re.compile(r"(\d{4,})-(board|target|specimen|static)")
 
 
 @dataclass(frozen=True)
 class Capture:
-    """One capture of a session. ``images`` maps camera ids to the image files that arrived."""
+    """One capture of a session.
+
+    id : name of its folder, of which `number` and `kind` are the parts. images : the image files that arrived, by
+    camera.
+    """
 
     id: str
     number: int
     kind: str
     folder: Path
     images: dict[str, Path]
-    record: dict[str, Any]
+    record: CaptureRecord
 
 
 @dataclass(frozen=True)
@@ -79,12 +79,15 @@ class Session:
 
 
 def open_session(path: Path) -> Session:
-    """The session of a folder; InputError says what is missing."""
+    """Read a session folder: its rig, its records, and where its images lie.
+
+    InputError says which file is missing or damaged.
+    """
     path = Path(path)
     _require_session(path)
-    header = _read_json(path / "session.json")
+    record = read_session_record(path / "session.json")
     captures = sorted(_captures(path / "captures"), key=lambda capture: capture.number)
-    return Session(path, str(header.get("session", path.name)), read_rig(path / "rig.toml"), tuple(captures))
+    return Session(path, record.session, read_rig(path / "rig.toml"), tuple(captures))
 
 
 def runs(path: Path) -> tuple[Path, ...]:
@@ -117,8 +120,8 @@ def live_results(path: Path) -> tuple[Path, ...]:
     live = Path(path) / "live"
     if not live.is_dir():
         return ()
-    found = [folder for folder in live.iterdir() if _CAPTURE_NAME.fullmatch(folder.name)]
-    return tuple(sorted(found, key=lambda folder: int(folder.name.partition("-")[0])))
+    numbered = [(parts[0], folder) for folder in live.iterdir() if (parts := _capture_of(folder))]
+    return tuple(folder for _, folder in sorted(numbered))
 
 
 @contextmanager
@@ -191,31 +194,25 @@ def _require_session(path: Path) -> None:
 
 
 def _captures(folder: Path) -> Iterator[Capture]:
+    """The captures in a folder, in no order. SessionError where an image that a record names is not there."""
     if not folder.is_dir():
         return
     for path in folder.iterdir():
-        match = _CAPTURE_NAME.fullmatch(path.name)
-        if not match or not (path / "capture.json").is_file():
+        parts = _capture_of(path)
+        if parts is None or not (path / "capture.json").is_file():
             continue
-        record = _read_json(path / "capture.json")
-        frames = record.get("cameras", {})
-        if not isinstance(frames, dict) or not all(isinstance(frame, dict) for frame in frames.values()):
-            raise InputError(f"{path / 'capture.json'}: 'cameras' must have one record a camera; {_MEND}")
-        images = {camera_id: path / frame["file"] for camera_id, frame in frames.items() if frame.get("file")}
-        for camera_id, image in images.items():
+        record = read_capture_record(path / "capture.json")
+        images = {camera: path / entry.file for camera, entry in record.cameras.items() if entry.file}
+        for camera, image in images.items():
             if not image.is_file():
-                raise InputError(
-                    f"{image}: the record of {path.name} names this image of camera {camera_id}, but it is not there; "
-                    f"{_MEND}"
+                raise SessionError(
+                    f"{image}: the record of {path.name} names this image of camera {camera}, but it is not there; "
+                    f"{REMEDY}"
                 )
-        yield Capture(path.name, int(match[1]), match[2], path, images, record)
+        yield Capture(path.name, *parts, path, images, record)
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error}); {_MEND}") from error
-    if not isinstance(value, dict):
-        raise InputError(f"{path}: not a record of a session; {_MEND}")
-    return value
+def _capture_of(folder: Path) -> tuple[int, str] | None:
+    """Number and kind of the capture that a folder is named by; None where it is named otherwise."""
+    parts = split_capture_id(folder.name)
+    return parts if parts is not None and parts[1] in CAPTURE_KINDS else None

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from ringdic.errors import ComputationError, InputError
+from ringdic.session.records import CameraRecord
 
 Arrays = Mapping[str, NDArray[Any]]
 #: Told of a task that has ended, what came of it, and how many of how many have.
@@ -121,10 +122,10 @@ def code_stamp() -> str:
     return digest([(str(path.relative_to(root).as_posix()), path.read_bytes()) for path in sources])
 
 
-def file_digest(path: Path, told: Mapping[str, Any] | None = None) -> str:
-    """The SHA-256 of a file. told : its capture's record of it, believed where the size in bytes agrees."""
-    if told and told.get("sha256") and told.get("bytes") == path.stat().st_size:
-        return str(told["sha256"])
+def file_digest(path: Path, record: CameraRecord | None = None) -> str:
+    """The SHA-256 of a file, hexadecimal. record : its capture's entry, believed where the size in bytes agrees."""
+    if record is not None and record.sha256 and record.bytes == path.stat().st_size:
+        return record.sha256
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -1,11 +1,12 @@
 """Captures: begin one, follow it, read its record and images."""
 
 from dataclasses import asdict
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response, status
 from fastapi.responses import FileResponse
 from pydantic import BaseModel
+from ringdic.session.names import CaptureKind
 
 from ringdic_controller.rig.preview import preview_jpeg
 from ringdic_controller.service.desk import Desk, NotFoundError, Round
@@ -18,7 +19,7 @@ router = APIRouter(tags=["captures"])
 class NewCapture(BaseModel):
     """``override``: fire although cameras are missing or not armed; those end as failed."""
 
-    kind: Literal["board", "target", "specimen", "static"]
+    kind: CaptureKind
     override: bool = False
 
 

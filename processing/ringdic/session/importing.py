@@ -24,10 +24,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ringdic.errors import InputError
+from ringdic.session.files import place
 from ringdic.session.images import read_gray, read_mask
 from ringdic.session.rig import Rig, parse_rig, read_rig
-
-from ringdic_controller.archive.writer import SessionExistsError, SessionWriter, place
+from ringdic.session.writer import SessionExistsError, SessionWriter
 
 log = logging.getLogger(__name__)
 
