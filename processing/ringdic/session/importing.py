@@ -24,25 +24,28 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ringdic.errors import InputError
-from ringdic.session.files import place
+from ringdic.session.files import PARTIAL, place
 from ringdic.session.images import read_gray, read_mask
-from ringdic.session.rig import Rig, parse_rig, read_rig
+from ringdic.session.names import CAPTURE_KINDS, CaptureKind
+from ringdic.session.rig import Rig, read_rig
 from ringdic.session.writer import SessionExistsError, SessionWriter
 
 log = logging.getLogger(__name__)
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm")
 
-_COUNTED = {"specimen": "step", "static": "capture"}
+#: Kinds of which every capture needs all cameras, and what one capture is called. Of the others, a camera may have
+#: more views than another.
+_COMPLETE = {"specimen": "step", "static": "capture"}
 
 Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
 class _View:
-    """One image to import: where it goes and how large it must be found to be."""
+    """One image to import, and the capture it belongs to: the `index`-th of its kind."""
 
-    kind: str
+    kind: CaptureKind
     index: int
     camera: str
     path: Path
@@ -55,19 +58,20 @@ def import_folder(
     progress: Progress | None = None,
     wall_ns: Callable[[], int] = time.time_ns,
 ) -> Path:
-    """Make the session folder `session` of the images under `src`; return its path.
+    """Make a session folder of a folder of images; the session's path.
 
     Parameters
     ----------
-    progress : callable (done, total, file name), optional
-    wall_ns : callable
-        The time that the records carry.
+    src : the folder that holds ``rig.toml`` and the images.
+    session : the session folder to make; it must not exist.
+    progress : called with images checked, images in all, and a file's name.
+    wall_ns : the time that the records bear, ns since the Unix epoch.
 
     Raises
     ------
     InputError
-        A missing folder or image, an unreadable or truncated image, images of one camera that differ in size,
-        an empty mask, unequal numbers of steps, or a session that exists already.
+        A missing folder or image, an unreadable or truncated image, images of one camera that differ in size, an
+        empty mask, unequal numbers of steps, or a session that exists already.
     """
     src, session = Path(src), Path(session)
     if session.exists():
@@ -75,80 +79,96 @@ def import_folder(
     if not src.is_dir():
         raise InputError(f"{src}: no such folder; give the folder that holds rig.toml and the images")
     rig = read_rig(src / "rig.toml")
-    views = _find_views(src, rig)
-    sizes = _check_images(views, progress or (lambda done, total, name: None))
-    masks = _check_masks(src, rig, views, sizes)
+    views = _views(src, rig)
+    sizes = _checked_sizes(views, progress or (lambda done, total, name: None))
+    masks = _checked_masks(src, rig, sizes)
     session.parent.mkdir(parents=True, exist_ok=True)
-    partial = session.with_name(f".partial-{session.name}-{os.getpid()}")
+    partial = session.with_name(f"{PARTIAL}{session.name}-{os.getpid()}")
     try:
-        _write(partial, session.name, src, views, sizes, masks, wall_ns)
+        writer = SessionWriter.create(
+            partial, session.name, (src / "rig.toml").read_text(encoding="utf-8"), "import", wall_ns
+        )
+        _copy_lens_files(src, partial, rig)
+        _write_captures(writer, views, sizes)
+        _copy_masks(masks, partial)
         os.rename(partial, session)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return session
 
 
-def _find_views(src: Path, rig: Rig) -> list[_View]:
+def _views(src: Path, rig: Rig) -> list[_View]:
+    """Every image of the folder, capture by capture. InputError where a camera's images are missing."""
     views: list[_View] = []
-    for kind in ("board", "specimen", "static"):
-        if kind == "static" and not (src / kind).is_dir():
-            continue
-        steps: dict[str, int] = {}
-        for camera in rig.cameras:
-            if kind == "board" and camera.intrinsics is not None and not (src / kind / camera.id).is_dir():
-                continue
-            images = _images(src / kind / camera.id, kind, camera.id)
-            steps[camera.id] = len(images)
-            views += [_View(kind, index, camera.id, path) for index, path in enumerate(images)]
-        if kind != "board" and len(set(steps.values())) > 1:
-            told = ", ".join(f"{camera} {count}" for camera, count in steps.items())
-            raise InputError(
-                f"{src / kind}: the cameras have different numbers of {_COUNTED[kind]}s ({told}); "
-                f"every {_COUNTED[kind]} needs all cameras"
-            )
-        _tell_strangers(src / kind, rig)
-    for camera in rig.cameras:
-        views.append(_View("target", 0, camera.id, _target(src, camera.id)))
-    order = {"board": 0, "target": 1, "specimen": 2, "static": 3}
+    kinds: tuple[CaptureKind, ...] = ("board", "specimen", "static")
+    for kind in kinds:
+        if kind != "static" or (src / kind).is_dir():
+            views += _views_of_kind(src, rig, kind)
+            _warn_of_unknown_cameras(src / kind, rig)
+    views += [_View("target", 0, camera.id, _target(src, camera.id)) for camera in rig.cameras]
+    order = {kind: number for number, kind in enumerate(CAPTURE_KINDS)}
     return sorted(views, key=lambda view: (order[view.kind], view.index))
 
 
+def _views_of_kind(src: Path, rig: Rig, kind: CaptureKind) -> list[_View]:
+    views: list[_View] = []
+    counts: dict[str, int] = {}
+    for camera in rig.cameras:
+        if kind == "board" and camera.intrinsics is not None and not (src / kind / camera.id).is_dir():
+            continue  # its lens is given
+        images = _images(src / kind / camera.id, kind, camera.id)
+        counts[camera.id] = len(images)
+        views += [_View(kind, index, camera.id, path) for index, path in enumerate(images)]
+    if kind in _COMPLETE and len(set(counts.values())) > 1:
+        listed = ", ".join(f"{camera} {count}" for camera, count in counts.items())
+        raise InputError(
+            f"{src / kind}: the cameras have different numbers of {_COMPLETE[kind]}s ({listed}); "
+            f"every {_COMPLETE[kind]} needs all cameras"
+        )
+    return views
+
+
 def _images(folder: Path, kind: str, camera: str) -> list[Path]:
+    """The image files of a camera in natural order; at least one."""
     if not folder.is_dir():
         raise InputError(
             f"{folder}: the {kind} folder of camera '{camera}' is missing; "
             "every camera of rig.toml needs one, named by its id"
         )
-    found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
-    if not found:
+    images = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
+    if not images:
         raise InputError(f"{folder}: no image of camera '{camera}'; use {', '.join(SUFFIXES)}")
-    return sorted(found, key=natural_order)
+    return sorted(images, key=natural_order)
 
 
 def _target(src: Path, camera: str) -> Path:
+    """The one image of the calibration object that a camera has."""
     folder = src / "target"
-    found = [folder / f"{camera}{suffix}" for suffix in SUFFIXES if (folder / f"{camera}{suffix}").is_file()]
-    found += [p for s in SUFFIXES if (p := folder / f"{camera}{s.upper()}").is_file() and p not in found]
-    if not found:
+    images = [folder / f"{camera}{suffix}" for suffix in SUFFIXES if (folder / f"{camera}{suffix}").is_file()]
+    images += [p for s in SUFFIXES if (p := folder / f"{camera}{s.upper()}").is_file() and p not in images]
+    if not images:
         raise InputError(
             f"{folder}: no image of the calibration object for camera '{camera}'; "
             f"put it there as {camera}.png, .jpg or .tif"
         )
-    if len(found) > 1:
-        names = ", ".join(path.name for path in found)
+    if len(images) > 1:
+        names = ", ".join(path.name for path in images)
         raise InputError(f"{folder}: more than one image for camera '{camera}' ({names}); keep one")
-    return found[0]
+    return images[0]
 
 
-def _tell_strangers(folder: Path, rig: Rig) -> None:
+def _warn_of_unknown_cameras(folder: Path, rig: Rig) -> None:
     known = {camera.id for camera in rig.cameras}
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
         if path.is_dir() and path.name not in known:
             log.warning("%s is left out: rig.toml has no camera '%s'", path, path.name)
 
 
-def _check_images(views: Sequence[_View], progress: Progress) -> dict[str, tuple[int, int]]:
-    """Decode every image; return (height, width) a camera."""
+def _checked_sizes(views: Sequence[_View], progress: Progress) -> dict[str, tuple[int, int]]:
+    """Decode every image; the size of each camera's images, (height, width) px.
+
+    InputError where an image is damaged, or two images of a camera differ in size.
+    """
     sizes: dict[str, tuple[int, int]] = {}
     first: dict[str, Path] = {}
     for done, view in enumerate(views):
@@ -165,13 +185,11 @@ def _check_images(views: Sequence[_View], progress: Progress) -> dict[str, tuple
     return sizes
 
 
-def _check_masks(src: Path, rig: Rig, views: Sequence[_View], sizes: dict[str, tuple[int, int]]) -> dict[str, Path]:
-    folder = src / "mask"
-    if not folder.is_dir():
-        return {}
+def _checked_masks(src: Path, rig: Rig, sizes: dict[str, tuple[int, int]]) -> dict[str, Path]:
+    """The masks by camera. sizes : (height, width) px of each camera's images. InputError where one does not fit."""
     known = {camera.id for camera in rig.cameras}
     masks = {}
-    for path in sorted(folder.glob("*.png")):
+    for path in sorted((src / "mask").glob("*.png")):
         if path.stem not in known:
             raise InputError(f"{path}: rig.toml has no camera '{path.stem}'; name a mask by its camera's id")
         read_mask(path, sizes[path.stem])
@@ -179,21 +197,8 @@ def _check_masks(src: Path, rig: Rig, views: Sequence[_View], sizes: dict[str, t
     return masks
 
 
-def _write(
-    folder: Path,
-    name: str,
-    src: Path,
-    views: Sequence[_View],
-    sizes: dict[str, tuple[int, int]],
-    masks: dict[str, Path],
-    wall_ns: Callable[[], int],
-) -> None:
-    rig_toml = (src / "rig.toml").read_text(encoding="utf-8")
-    writer = SessionWriter.create(folder, name, rig_toml, "import", wall_ns)
-    for camera in parse_rig(rig_toml).cameras:
-        if camera.intrinsics is not None:
-            _copy_intrinsics(src, folder, camera.intrinsics, camera.id)
-    captures: dict[tuple[str, int], list[_View]] = {}
+def _write_captures(writer: SessionWriter, views: Sequence[_View], sizes: dict[str, tuple[int, int]]) -> None:
+    captures: dict[tuple[CaptureKind, int], list[_View]] = {}
     for view in views:
         captures.setdefault((view.kind, view.index), []).append(view)
     for (kind, _), members in captures.items():
@@ -202,22 +207,30 @@ def _write(
             height, width = sizes[view.camera]
             capture.store_file(view.camera, view.path, width, height)
         capture.close()
+
+
+def _copy_masks(masks: dict[str, Path], folder: Path) -> None:
     if masks:
         (folder / "mask").mkdir()
-    for camera_id, path in masks.items():
-        place(folder / "mask" / f"{camera_id}.png", path.read_bytes())
+    for camera, path in masks.items():
+        place(folder / "mask" / f"{camera}.png", path.read_bytes())
 
 
-def _copy_intrinsics(src: Path, folder: Path, name: str, camera: str) -> None:
-    """The file that rig.toml names beside itself stays beside it."""
-    source, copy = src / name, (folder / name).resolve()
-    if not source.is_file():
-        raise InputError(f"{source}: the intrinsics file of camera '{camera}' is missing")
-    if not copy.is_relative_to(folder.resolve()):
-        raise InputError(f"the intrinsics file '{name}' of camera '{camera}' must lie in the folder of rig.toml")
-    if not copy.exists():
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        place(copy, source.read_bytes())
+def _copy_lens_files(src: Path, folder: Path, rig: Rig) -> None:
+    """Copy the lens files that ``rig.toml`` names beside itself. InputError where one is missing or lies elsewhere."""
+    for camera in rig.cameras:
+        if camera.intrinsics is None:
+            continue
+        source, copy = src / camera.intrinsics, (folder / camera.intrinsics).resolve()
+        if not source.is_file():
+            raise InputError(f"{source}: the intrinsics file of camera '{camera.id}' is missing")
+        if not copy.is_relative_to(folder.resolve()):
+            raise InputError(
+                f"the intrinsics file '{camera.intrinsics}' of camera '{camera.id}' must lie in the folder of rig.toml"
+            )
+        if not copy.exists():
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            place(copy, source.read_bytes())
 
 
 def natural_order(path: Path) -> list[tuple[int, int, str]]:

@@ -57,7 +57,19 @@ class Archive:
         self._lock = threading.RLock()
 
     def create_session(self, name: str, rig_toml: str, *, source: str = "capture") -> SessionWriter:
-        """Make a new, empty session."""
+        """Make a new, empty session.
+
+        Parameters
+        ----------
+        name : of the session and its folder.
+        rig_toml : text of its rig file.
+        source : "capture" or "import".
+
+        Raises
+        ------
+        InputError
+            The name is not usable or taken, or the rig file names no rig.
+        """
         path = self.root / checked_name("the session name", name)
         with self._lock:
             if path.exists():
@@ -120,7 +132,22 @@ class SessionWriter:
         wall_ns: Callable[[], int],
         lock: threading.RLock | None = None,
     ) -> SessionWriter:
-        """Make a new session folder."""
+        """Make a new session folder.
+
+        Parameters
+        ----------
+        path : the folder; its parents are made.
+        name : of the session.
+        rig_toml : text of its rig file.
+        source : "capture" or "import".
+        wall_ns : the time, ns since the Unix epoch.
+        lock : held while records are changed; that of the archive where the session lies in one.
+
+        Raises
+        ------
+        SessionError
+            `rig_toml` is not TOML with a rig's name.
+        """
         try:
             rig_name = tomllib.loads(rig_toml)["rig"]["name"]
         except (tomllib.TOMLDecodeError, KeyError, TypeError) as error:
@@ -158,7 +185,16 @@ class SessionWriter:
         tolerance_ns: int | None = None,
         override: bool = False,
     ) -> CaptureWriter:
-        """Begin a capture: a folder with an open record in which every camera is pending."""
+        """Begin a capture: a folder with an open record in which every camera is pending.
+
+        Parameters
+        ----------
+        kind : one of `ringdic.session.names.CAPTURE_KINDS`.
+        expected : ids of the cameras.
+        fire_at_ns : planned moment of the exposure, ns since the Unix epoch.
+        tolerance_ns : skew between the cameras that is not flagged, ns.
+        override : whether it is captured although cameras are missing.
+        """
         if kind not in CAPTURE_KINDS:
             raise InputError(f"the capture kind '{kind}' is none of {', '.join(CAPTURE_KINDS)}")
         with self._lock:
@@ -248,7 +284,16 @@ class CaptureWriter:
         return self._store(camera, entry, image)
 
     def store_file(self, camera: str, source: Path, width: int, height: int, *, link: bool = False) -> ArchivedImage:
-        """Archive an image file byte for byte, with its extension."""
+        """Archive an image file byte for byte, with its extension.
+
+        Parameters
+        ----------
+        camera : one of those that the capture expects.
+        source : the image file.
+        width, height : of the image, px.
+        link : share the file on the disk instead of copying it, where the file system can; for a source that nobody
+            writes to any more.
+        """
         image = source.read_bytes()
         entry = CameraRecord(
             file=f"{camera}{source.suffix.lower()}",
