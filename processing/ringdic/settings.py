@@ -27,6 +27,11 @@ class _Group(BaseModel):
     model_config = ConfigDict(**TABLE, frozen=True)
 
 
+def name_without_unit(name: str) -> str:
+    """A setting's name inside the correlation, where all lengths are in px."""
+    return name.removesuffix("_px")
+
+
 class CorrelationGroup(_Group):
     """Settings of the 2D matching: the one place of their names, defaults and bounds.
 
@@ -57,7 +62,26 @@ class CorrelationGroup(_Group):
     @property
     def keywords(self) -> dict[str, Any]:
         """The settings under their names in the correlation, which are without units."""
-        return {name.removesuffix("_px"): value for name, value in self}
+        return {name_without_unit(name): value for name, value in self}
+
+    def at_scale(self, scale: float) -> CorrelationGroup:
+        """The settings for smaller images of the same scene, with no fewer pixels than a subset needs.
+
+        scale : size of the images, 1 where these settings hold.
+        """
+        radius, step = max(10, round(self.radius_px * scale)), max(5, round(self.step_px * scale))
+        return self.model_copy(update={"radius_px": radius, "step_px": step})
+
+    @classmethod
+    def limits(cls, name: str) -> dict[str, float]:
+        """The least and the largest value of a numeric setting, as ``min`` and ``max`` where there are such."""
+        info = cls.model_fields[name]
+        choices = get_args(info.annotation)
+        if choices:
+            return {"min": min(choices), "max": max(choices)}
+        limits = {"min": [getattr(each, "ge", None) for each in info.metadata],
+                  "max": [getattr(each, "le", None) for each in info.metadata]}  # fmt: skip
+        return {end: value for end, values in limits.items() for value in values if value is not None}
 
 
 class CalibrationGroup(_Group):

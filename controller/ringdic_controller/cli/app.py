@@ -18,6 +18,7 @@ from ringdic.cli.options import AsJson, Reference, Run, Session, SethHill, Windo
 from ringdic.errors import InputError, RingdicError
 from ringdic.progress import Progress
 from ringdic.session.folder import open_session
+from ringdic.settings import CorrelationGroup
 
 from ringdic_controller.studies.bench.command import bench
 
@@ -29,6 +30,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+_DEFAULTS = CorrelationGroup()
 Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="GROUP.NAME=VALUE", help="Repeatable.")]
 SettingsFile = Annotated[Path | None, typer.Option("--settings", help="Settings as a TOML file.")]
 app.add_typer(measuring.measure)
@@ -113,16 +115,22 @@ def process(
         show_table(f"{session}: results in {run}", summary["table"])
 
 
+def _setting(name: str, text: str) -> Any:
+    """An option with the bounds of a setting of the correlation."""
+    limits: dict[str, Any] = CorrelationGroup.limits(name)
+    return typer.Option(**limits, help=text)
+
+
 @app.command()
 def correlate(
     ref: Annotated[Path, typer.Argument(metavar="REF", help="Reference image.")],
     cur: Annotated[Path, typer.Argument(metavar="CUR", help="Current image.")],
     out: Annotated[Path, typer.Option(help="Where the points go (npz).")],
     mask: Annotated[Path | None, typer.Option(help="Region of interest: an image, not 0 inside.")] = None,
-    radius: Annotated[int, typer.Option(min=2, max=500, help="Subset radius, px.")] = 20,
-    step: Annotated[int, typer.Option(min=1, help="Grid step, px.")] = 10,
-    order: Annotated[int, typer.Option(min=1, max=2, help="Order of the shape function.")] = 1,
-    subset: Annotated[str, typer.Option(help="circle or square.")] = "circle",
+    radius: Annotated[int, _setting("radius_px", "Subset radius, px.")] = _DEFAULTS.radius_px,
+    step: Annotated[int, _setting("step_px", "Grid step, px.")] = _DEFAULTS.step_px,
+    order: Annotated[int, _setting("order", "Order of the shape function.")] = _DEFAULTS.order,
+    subset: Annotated[str, typer.Option(help="circle or square.")] = _DEFAULTS.subset,
     threads: Annotated[int | None, typer.Option(min=1, help="Threads; all cores unless given.")] = None,
     as_json: AsJson = False,
 ) -> None:

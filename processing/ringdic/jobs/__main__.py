@@ -20,6 +20,7 @@ from typing import Any
 from ringdic.errors import RingdicError
 from ringdic.jobs.allocation import keep_freed_memory
 from ringdic.jobs.serving import carry_out, compile_kernels, serve, told
+from ringdic.settings import load_settings
 
 
 def main() -> int:
@@ -40,7 +41,8 @@ def main() -> int:
     if arguments.serve:
         return _serve_to_the_end()
     try:
-        _line(carry_out(arguments.session, arguments.settings, arguments.overrides, lambda at: _line(told(at))))
+        settings = load_settings(arguments.settings, arguments.overrides)
+        _line(carry_out(arguments.session, settings, lambda at: _line(told(at))))
     except RingdicError as error:
         _line({"state": "failed", "error": str(error)})
         return error.exit_code

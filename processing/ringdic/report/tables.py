@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,7 +14,7 @@ from ringdic.report.document import UNKNOWN, Document, figure
 from ringdic.report.hardware import CameraFacts
 from ringdic.results.results import Results
 from ringdic.session.folder import Capture, Session
-from ringdic.settings import Settings
+from ringdic.settings import settings_of_run
 
 _REASONS: dict[int, str] = {
     Status.GOOD: "measured",
@@ -79,7 +78,7 @@ def _hardware(session: Session, results: Results, cameras: Sequence[CameraFacts]
 
 def analysis(document: Document, results: Results, version: str, floor: dict[str, str]) -> None:
     """How it was evaluated; ``floor`` are the rows of the noise floors."""
-    settings = Settings.model_validate(tomllib.loads(results.settings))
+    settings = settings_of_run(results.settings)
     correlation, surface = settings.correlation, settings.surface
     alone, over = gauge(results, 0.0), gauge(results, results.window_mm)
     width = 2 * correlation.radius_px + 1
@@ -120,7 +119,7 @@ def calibration(document: Document, session: Session, results: Results) -> None:
     """How the cameras were calibrated and how well."""
     summary, target, board = results.summary, session.rig.target, session.rig.board
     found = summary.get("calibration", {})
-    settings = Settings.model_validate(tomllib.loads(results.settings)).calibration
+    settings = settings_of_run(results.settings).calibration
     methods = {"dlt": "direct linear transformation, each camera alone",
                "bundle": "all cameras, lenses and the target adjusted together (bundle), from the direct linear "
                "transformation"}  # fmt: skip

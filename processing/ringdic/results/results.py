@@ -19,7 +19,6 @@ What follows from the stored arrays is computed when it is read: a step takes ab
 from __future__ import annotations
 
 import json
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -35,6 +34,7 @@ from ringdic.mesh.mesh import Mesh
 from ringdic.results import vtkhdf
 from ringdic.results.fields import Field, StepFields, StepQuality, available, compute_fields
 from ringdic.results.fields import field as field_of
+from ringdic.settings import settings_of_run
 from ringdic.strain.deformation import Deformation, deformation
 from ringdic.strain.rigid_motion import RigidMotion, motion_to_reference
 from ringdic.strain.window import StrainWindow
@@ -132,12 +132,13 @@ class Results:
     @property
     def window_mm(self) -> float:
         """Width of the strain window that the run was told to use; 0 for the triangles alone."""
-        return float(tomllib.loads(self.settings).get("strain", {}).get("window_mm", 0.0))
+        return settings_of_run(self.settings).strain.window_mm
 
     @property
     def radius_px(self) -> int | None:
         """Radius of the subsets that the run was told to use; None where the settings do not say."""
-        return tomllib.loads(self.settings).get("correlation", {}).get("radius_px")
+        group = settings_of_run(self.settings).correlation
+        return group.radius_px if "radius_px" in group.model_fields_set else None
 
     @property
     def pixels_a_mm(self) -> float:

@@ -12,7 +12,6 @@ the reference position alone holds a part; and what else that match is off by mo
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -27,6 +26,7 @@ from ringdic.calibration.parameters import PER_CAMERA
 from ringdic.geometry.camera import Camera
 from ringdic.results.results import Matches, Results
 from ringdic.results.series import InMemory, join_steps
+from ringdic.settings import settings_of_run
 from ringdic.strain.deformation import Deformation
 from ringdic.uncertainty.calibration import (
     CameraCovariance,
@@ -143,15 +143,14 @@ class _Scatter:
 
     def __init__(self, reference: Results, noise: Sequence[Floats]) -> None:
         self._shares = [_share_of_noise(level) for level in noise]
-        group = tomllib.loads(reference.settings).get("correlation", {})
-        radius, order = int(group.get("radius_px", 20)), int(group.get("order", 1))
+        correlation = settings_of_run(reference.settings).correlation
         cameras = {camera.id: camera for camera in reference.cameras}
         with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
             self._pairs = list(pool.map(partial(_Pair.of, reference, cameras), range(len(reference.matches))))
         px = np.full((2, len(reference.vertices_ref), 2), np.nan)
         for pair in self._pairs:
             px[:, pair.vertex[pair.held]] = pair.px
-        alike = corners_alike(px, reference.faces, radius, order)
+        alike = corners_alike(px, reference.faces, correlation.radius_px, correlation.order)
         self._alike = np.concatenate([alike, alike])
 
     def of(self, results: Results, step: int, found: Deformation) -> dict[str, Floats]:

@@ -199,7 +199,7 @@ class CaptureRecord(_Record):
         document = _without_schema(document)
         entries = document.get("cameras", {})
         if not isinstance(entries, Mapping):
-            raise SessionError(f"'cameras' must be a table with an entry for each camera, not {entries!r}")
+            raise SessionError(f"'cameras' must have one record a camera, not {entries!r}")
         cameras = {}
         for camera, entry in entries.items():
             try:

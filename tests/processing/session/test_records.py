@@ -61,7 +61,7 @@ def test_fields_of_a_later_version_survive_what_the_writer_changes(tmp_path) -> 
         ({"number": 2}, "'capture_id' '0001-board' is not that of number 2"),
         ({"override": 1}, "'override' must be true or false, not 1"),
         ({"state": "ajar"}, "'state' is 'open' or 'closed', not 'ajar'"),
-        ({"cameras": []}, "'cameras' must be a table"),
+        ({"cameras": []}, "'cameras' must have one record a camera"),
         ({"cameras": {"201": 3}}, "camera '201': a table of fields is wanted, not 3"),
         ({"cameras": {"201": {"status": "lost"}}}, "camera '201': 'status' is one of pending, ok, late, failed"),
         ({"cameras": {"201": {"file": "../202.pgm"}}}, "camera '201': 'file' must be a name in the capture's folder"),

@@ -55,7 +55,7 @@ def bench(
     if all_ or live:
         from ringdic_controller.studies.bench.live import bench_live
 
-        chosen = load_settings(None, set_ or []).to_toml()
+        chosen = load_settings(None, set_ or [])
         result["live"] = bench_live(out / "live", cameras=cameras, scale=scale, settings=chosen, say=_say)
     if before is not None:
         result["ratios"] = compared(result, before)
