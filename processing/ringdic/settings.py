@@ -79,24 +79,26 @@ class CorrelationGroup(_Group):
         choices = get_args(info.annotation)
         if choices:
             return {"min": min(choices), "max": max(choices)}
-        limits = {"min": [getattr(each, "ge", None) for each in info.metadata],
-                  "max": [getattr(each, "le", None) for each in info.metadata]}  # fmt: skip
-        return {end: value for end, values in limits.items() for value in values if value is not None}
+        ends = {"min": "ge", "max": "le"}
+        return {end: getattr(each, kind) for end, kind in ends.items() for each in info.metadata if hasattr(each, kind)}
 
 
 class CalibrationGroup(_Group):
-    """Cameras: the direct linear transformation (dlt), or from there the adjustment of all together (bundle).
+    """Settings of the calibration of the cameras.
 
-    distortion : the lens is measured on the checkerboard and corrected.
-    radial_terms, tangential, skew : terms that the lens may have. terms : it gets as many of them as the checkerboard
-    views determine (largest), or those of the smallest information criterion (criterion).
-    drop_percentile : checkerboard views whose error lies above it are dropped and the rest is fitted again; 100 keeps
-    all views.
-    print_error_mm, radius_error_mm, pitch_error_mm, tilt_error_deg : of the bundle: how far, as standard deviations,
-    the dots, the target's radius, its columns' spacing and the turn of the sheet on it may be from what rig.toml
-    says; 0 holds them.
-    refine_poses : of surface.method global: where cameras have moved between the steps, their poses are found again
-    from the points that they follow.
+    method : each camera by the direct linear transformation (dlt), or from there all cameras, their lenses and the
+        target adjusted together (bundle).
+    distortion : whether the lens is measured on the checkerboard and corrected.
+    radial_terms, tangential, skew : number of radial terms, and whether the lens may have tangential terms and skew.
+    terms : a lens gets as many of these terms as the checkerboard views determine (largest), or those with the smallest
+        information criterion (criterion).
+    drop_percentile : checkerboard views whose error lies above this percentile are left out and the lens is fitted
+        again; 100 keeps all views.
+    print_error_mm, radius_error_mm, pitch_error_mm, tilt_error_deg : of method bundle; standard deviations of the dots'
+        positions, the target's radius, the spacing of its columns and the turn of the printed sheet about what rig.toml
+        says; 0 holds a quantity at that.
+    refine_poses : of surface.method global; where cameras have moved between the steps, their poses are estimated anew
+        from the points that they track.
     """
 
     method: Literal["dlt", "bundle"] = "dlt"
@@ -114,18 +116,20 @@ class CalibrationGroup(_Group):
 
 
 class SurfaceGroup(_Group):
-    """How matches become a surface, and where the surface is looked for.
+    """Settings of the surface: how it is made of matches, and where it is searched.
 
-    method : the surfaces of the camera pairs side by side (pairs), or one lattice over the surface whose points all
-    cameras measure together (global).
-    merge : of the pairs' surfaces into one, and which triangles of an overlap go first: the worst by correlation, by
-    distance to the other surfaces, by orientation against theirs, or by these and the nearness to the border
-    (combined); none leaves the surfaces one over the other.
-    radius_mm : of the cylinder from which the search sets out; 0 takes the target's.
-    reach_mm : how far from it the surface may lie. incidence_deg : the steepest angle of view that is used.
-    sigma_max_px : a point whose match has a larger standard deviation, where the speckle ends, is lost.
-    spacing_mm : of the lattice; 0 takes the correlation's step as the cameras see it. curvature : of the warps between
-    cameras, from the measured shape and held (geometry), or none.
+    method : the surfaces of the camera pairs side by side (pairs), or one lattice of points over the surface, each
+        measured by all cameras that see it (global).
+    merge : how the pairs' surfaces become one: which triangles of an overlap are removed first, those worst by
+        correlation, by distance to the other surfaces, by orientation against theirs, or by all of these and the
+        nearness to the border (combined); none leaves the surfaces one over the other.
+    radius_mm : radius of the cylinder about which the surface is searched; 0 takes the target's.
+    reach_mm : largest distance of the surface from that cylinder.
+    incidence_deg : largest angle between a line of sight and the surface's normal at which a camera is used.
+    sigma_max_px : largest standard deviation of a match; beyond it, where the speckle ends, the point is lost.
+    spacing_mm : spacing of the lattice; 0 takes the correlation's step as the cameras see it.
+    curvature : second derivatives of the warps between cameras, held at those of the measured shape (geometry), or
+        none.
     """
 
     method: Literal["pairs", "global"] = "pairs"
@@ -139,10 +143,12 @@ class SurfaceGroup(_Group):
 
 
 class TrackingGroup(_Group):
-    """How a camera follows its points in time; of the global method.
+    """Settings of the tracking of points in time; of surface.method global.
 
-    two_pass : second derivatives that the neighbours' displacements show are held in a second pass of first order.
-    update_reference : a point lost against the reference image is sought from the last image that showed it.
+    two_pass : whether points are matched a second time with affine shape functions, the warp's second derivatives held
+        at those of the neighbouring points' displacements.
+    update_reference : whether a point that is lost against the reference image is matched from the last image in which
+        it was found.
     """
 
     two_pass: bool = True
@@ -150,13 +156,16 @@ class TrackingGroup(_Group):
 
 
 class StrainGroup(_Group):
-    """Strain. window_mm : width of the window it is fitted over, beside that of each triangle alone; 0: no window."""
+    """Settings of the strain.
+
+    window_mm : width of the window over which strain is fitted, in addition to that of each triangle; 0: no window.
+    """
 
     window_mm: float = Field(default=0.0, ge=0, le=1000)
 
 
 class Settings(_Group):
-    """All settings of a processing run."""
+    """Settings of a processing run, in groups."""
 
     correlation: CorrelationGroup = CorrelationGroup()
     calibration: CalibrationGroup = CalibrationGroup()
@@ -174,16 +183,16 @@ class Settings(_Group):
         return self
 
     def to_toml(self) -> str:
-        """The settings as the text of a TOML file that :func:`load_settings` reads back."""
+        """Write the settings as the text of a TOML file that `load_settings` reads back."""
         lines: list[str] = []
         for group, values in self.model_dump().items():
             lines += [f"[{group}]", *(f"{name} = {_toml(value)}" for name, value in values.items()), ""]
         return "\n".join(lines)
 
 
-#: As the paper measured: cameras by the direct linear transformation, flat subsets, pair by pair.
+#: Settings of the paper: cameras by the direct linear transformation, affine subsets, surfaces pair by pair.
 PAPER = Settings()
-#: The most exact: all cameras adjusted together, one surface with its own curvature, two passes in time.
+#: The most exact settings: all cameras adjusted together, one surface with its own curvature, two passes in time.
 BEST = Settings(calibration=CalibrationGroup(method="bundle"), surface=SurfaceGroup(method="global"))
 
 

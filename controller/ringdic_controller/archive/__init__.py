@@ -1,1 +1,1 @@
-"""The sessions on the disk, and the catalogue of them."""
+"""The catalogue of the sessions on the disk."""

@@ -6,8 +6,9 @@
       rig.toml                    the rig as used
       session.json                schema, session, rig, created, source (capture | import)
       captures/
-        0001-board/               NNNN-kind; kinds: board, target, specimen, static
-          capture.json            the record: per camera status, file, SHA-256, times, exposure, metadata
+        0001-board/               NNNN-kind, see `ringdic.session.names`
+          capture.json            the record, see `ringdic.session.records`: per camera status, file, SHA-256, times,
+                                  exposure, metadata
           201.pgm …               one image a camera, byte for byte as delivered
         0002-target/ …
         0003-specimen/ …          the first specimen capture is the reference, the others are the steps
@@ -36,7 +37,7 @@ from ringdic.session.names import CAPTURE_KINDS, split_capture_id
 from ringdic.session.records import REMEDY, CaptureRecord, SessionError, read_capture_record, read_session_record
 from ringdic.session.rig import Rig, read_rig
 
-_LIVE_KEPT = 5  # the operator may stay at one while newer ones come
+_LIVE_KEPT = 5  # single steps that stay; the operator may look at one while newer ones come
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,10 @@ class Capture:
 
 @dataclass(frozen=True)
 class Session:
-    """A session folder, read. Captures are in order of their number."""
+    """Contents of a session folder: its name, its rig and its captures, in order of their number.
+
+    path : the folder.
+    """
 
     path: Path
     name: str
@@ -65,16 +69,16 @@ class Session:
     captures: tuple[Capture, ...]
 
     def of_kind(self, kind: str) -> tuple[Capture, ...]:
-        """The captures of one kind, in order."""
+        """The captures of a kind, in order. kind : one of `ringdic.session.names.CAPTURE_KINDS`."""
         return tuple(capture for capture in self.captures if capture.kind == kind)
 
     def mask(self, camera_id: str) -> Path | None:
-        """The region of interest given for a camera, if any."""
+        """Image file of the region of interest on a camera's reference image; None where none was drawn."""
         path = self.path / "mask" / f"{camera_id}.png"
         return path if path.is_file() else None
 
     def runs(self) -> tuple[Path, ...]:
-        """Finished processing runs, oldest first."""
+        """Folders of the finished processing runs, oldest first."""
         return runs(self.path)
 
 
@@ -91,7 +95,7 @@ def open_session(path: Path) -> Session:
 
 
 def runs(path: Path) -> tuple[Path, ...]:
-    """Finished processing runs of a session folder, oldest first."""
+    """Folders of the finished processing runs of a session folder, oldest first."""
     results = Path(path) / "results"
     if not results.is_dir():
         return ()
@@ -99,9 +103,17 @@ def runs(path: Path) -> tuple[Path, ...]:
 
 
 def newest_results(path: Path, run: int | None = None) -> Path:
-    """The results file of the newest run, or of the run of a number.
+    """Path of the results file of a processing run.
 
-    InputError if the session has not been processed or has no such run.
+    Parameters
+    ----------
+    path : the session folder.
+    run : the run's number; None takes the newest.
+
+    Raises
+    ------
+    InputError
+        The session has not been processed or has no such run.
     """
     finished = runs(path)
     if run is not None and finished:
@@ -116,7 +128,10 @@ def newest_results(path: Path, run: int | None = None) -> Path:
 
 
 def live_results(path: Path) -> tuple[Path, ...]:
-    """The folders of single steps that were processed at once, oldest first; each is named by its capture."""
+    """Folders of the results of single steps that were processed at once, oldest first.
+
+    Each is named by the step's capture. path : the session folder.
+    """
     live = Path(path) / "live"
     if not live.is_dir():
         return ()
@@ -126,9 +141,14 @@ def live_results(path: Path) -> tuple[Path, ...]:
 
 @contextmanager
 def new_live(path: Path, capture_id: str) -> Iterator[Path]:
-    """A folder to write a single step's results into; it takes its place when everything is written.
+    """Make a folder for the results of a single step, which takes its place once everything is written into it.
 
-    Older ones are taken away, but for the last few: one may be being looked at.
+    Results of older steps are removed, except for the newest few. A step that fails leaves nothing behind.
+
+    Parameters
+    ----------
+    path : the session folder.
+    capture_id : the step's capture.
     """
     live = Path(path) / "live"
     live.mkdir(exist_ok=True)
@@ -149,7 +169,7 @@ def new_live(path: Path, capture_id: str) -> Iterator[Path]:
 
 @dataclass
 class NewRun:
-    """A run being written. ``folder`` is where to write now; ``final`` where it lies once it is whole."""
+    """A processing run that is being written. folder : where to write. final : where it lies once it is whole."""
 
     folder: Path
     final: Path | None = None
@@ -157,9 +177,9 @@ class NewRun:
 
 @contextmanager
 def new_run(path: Path) -> Iterator[NewRun]:
-    """A folder to write a run into; it gets its number when everything is written, and never replaces another.
+    """Make a folder for a processing run, which gets its number once everything is written into it.
 
-    A run that fails leaves nothing behind.
+    It never replaces another run; a run that fails leaves nothing behind. path : the session folder.
     """
     results = Path(path) / "results"
     results.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""A folder of images made into a session of the same form that captures make.
+"""Import of a folder of images: it becomes a session of the form that captures have too.
 
 ::
 
@@ -6,7 +6,7 @@
     SRC/board/<camera>/*.{png,jpg,tif}      checkerboard views, any number a camera
     SRC/target/<camera>.{png,jpg,tif}       calibration object
     SRC/specimen/<camera>/*.{png,jpg,tif}   steps in natural order; the first is the reference configuration
-    SRC/static/<camera>/*.{png,jpg,tif}     optional: the specimen at rest beside the reference, again and again
+    SRC/static/<camera>/*.{png,jpg,tif}     optional: captures of the specimen at rest, beside the reference
     SRC/mask/<camera>.png                   optional region of interest on the reference image
 
 Everything is decoded and checked before the session appears, so a refused folder leaves nothing behind.

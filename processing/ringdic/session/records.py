@@ -75,7 +75,7 @@ _TYPES: dict[str, tuple[str, tuple[type, ...]]] = {
 
 @dataclass(frozen=True)
 class SessionRecord(_Record):
-    """What ``session.json`` says.
+    """Record of a session, kept in ``session.json``: what it is called, of which rig, and whence its images come.
 
     session : name of the session. rig : name of the rig. created : ISO 8601. source : "capture" or "import".
     """
@@ -102,7 +102,7 @@ class SessionRecord(_Record):
 
 @dataclass(frozen=True)
 class ImageDescription:
-    """What is known of an image beside its bytes.
+    """Description of an image that comes from a camera: checksum, size, time of exposure, metadata.
 
     sha256 : hexadecimal digits. width, height : px. time_ns : measured time of the exposure. exposure_us : µs.
     metadata : JSON values that the camera told. format : extension of the file, without the dot.
@@ -163,7 +163,7 @@ class CameraRecord(_Record):
 
 @dataclass(frozen=True)
 class CaptureRecord(_Record):
-    """What ``capture.json`` says of one capture.
+    """Record of one capture, kept in its ``capture.json``: when it was taken, and what became of each camera's image.
 
     capture_id : ``NNNN-kind``, of `number` and `kind`. session : name of the session. state : "open" or "closed".
     opened_at, closed_at : ISO 8601. fire_at_ns : planned moment of the exposure. skew_ns : spread of the cameras'
@@ -251,12 +251,12 @@ class CaptureRecord(_Record):
 
 
 def read_session_record(path: Path) -> SessionRecord:
-    """The record in the ``session.json`` at `path`. Raises SessionError, naming the file and the field at fault."""
+    """Read and check a ``session.json``. SessionError names the file and the field at fault."""
     return _read(path, SessionRecord.from_json)
 
 
 def read_capture_record(path: Path) -> CaptureRecord:
-    """The record in the ``capture.json`` at `path`. Raises SessionError, naming the file and the field at fault."""
+    """Read and check a ``capture.json``. SessionError names the file and the field at fault."""
     return _read(path, CaptureRecord.from_json)
 
 

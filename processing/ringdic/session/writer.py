@@ -1,4 +1,4 @@
-"""Sessions as folders: images, JSON records, checksums. The folders are the truth; nothing is overwritten.
+"""Writing of session folders: images, JSON records, checksums. No image is ever overwritten.
 
 The tree is drawn in `ringdic.session.folder`. An image is written aside, flushed, and linked to its name, which
 refuses to replace another. A capture's record is replaced as a whole whenever a camera's state changes.
@@ -40,14 +40,12 @@ class SessionExistsError(SessionError, FileExistsError):
 
 
 class Archive:
-    """All sessions under one folder.
+    """The sessions under one folder.
 
     Parameters
     ----------
-    root : Path
-        Made if absent.
-    wall_ns : callable
-        The time, ns since the Unix epoch.
+    root : the folder; it is made if absent.
+    wall_ns : the time, ns since the Unix epoch.
     """
 
     def __init__(self, root: Path, wall_ns: Callable[[], int] = time.time_ns) -> None:
@@ -88,7 +86,7 @@ class Archive:
         return sorted(path.parent.name for path in self.root.glob("*/session.json"))
 
     def capture(self, session: str, capture_id: str) -> CaptureWriter | None:
-        """The capture, or None where there is none of that name."""
+        """The writer of a capture; None where there is none of these names."""
         path = self.root / session / "captures" / capture_id
         return CaptureWriter(path, self._wall_ns, self._lock) if (path / "capture.json").is_file() else None
 
@@ -111,7 +109,10 @@ class Archive:
 
 
 class SessionWriter:
-    """One session folder, open for captures."""
+    """Writer of one session folder.
+
+    name : of the session. cameras : ids of the rig's cameras. camera_settings : table ``[capture]`` of the rig file.
+    """
 
     def __init__(self, path: Path, wall_ns: Callable[[], int], lock: threading.RLock | None = None) -> None:
         self.path = Path(path)
@@ -166,14 +167,14 @@ class SessionWriter:
         return sorted(records, key=lambda record: record.number)
 
     def capture(self, capture_id: str) -> CaptureWriter:
-        """The capture of this id. Raises SessionError."""
+        """The writer of a capture. SessionError where the session has none of this id."""
         path = self.path / "captures" / capture_id
         if split_capture_id(capture_id) is None or not (path / "capture.json").is_file():
             raise SessionError(f"the session '{self.name}' has no capture '{capture_id}'")
         return CaptureWriter(path, self._wall_ns, self._lock)
 
     def count(self, kind: str) -> int:
-        """How many captures of a kind there are."""
+        """Number of captures of a kind."""
         return sum(path.name.endswith(f"-{kind}") for path in self.path.glob("captures/*"))
 
     def begin_capture(
@@ -231,7 +232,10 @@ class ArchivedImage:
 
 
 class CaptureWriter:
-    """One capture folder. Every call reads the record afresh, so several writers of one process may be used."""
+    """Writer of one capture folder.
+
+    Every call reads the record afresh, so several writers of one process may be used on a capture.
+    """
 
     def __init__(self, path: Path, wall_ns: Callable[[], int], lock: threading.RLock) -> None:
         self.path = Path(path)
@@ -245,7 +249,7 @@ class CaptureWriter:
         return self.path.name
 
     def record(self) -> CaptureRecord:
-        """The capture's record as it stands."""
+        """The capture's record as it stands on the disk."""
         with self._lock:
             return read_capture_record(self._record_path)
 
