@@ -28,6 +28,8 @@ from typing import Any, ClassVar
 
 SCHEMA = 1
 
+# The kinds of capture and the rule of names are those of `ringdic.session.names`, written here once more: a node has
+# no package `ringdic`. A test holds the two together.
 CAPTURE_KINDS = ("board", "target", "specimen", "static")
 NODE_STATES = ("idle", "arming", "armed", "capturing")
 TRIGGER_VERDICTS = ("accepted", "late", "not armed")

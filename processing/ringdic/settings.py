@@ -1,26 +1,54 @@
-"""What a processing run is told: groups of settings from a TOML file and from ``name=value`` pairs.
+"""Settings of a processing run: groups with names, defaults and bounds, read from TOML and from ``name=value`` pairs.
 
-An unknown name, a wrong type and a choice that this version does not have are refused, never ignored.
+An unknown name, a wrong type and a choice that this version does not have are refused, never ignored. The sentences of
+a refusal serve every TOML file that is checked by a pydantic model: the rig's and the controller's too.
 """
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic.fields import FieldInfo
 
 from ringdic.errors import InputError
 
+#: Of a table in a TOML file: unknown keys are refused, and so are infinite and undefined numbers.
+TABLE = ConfigDict(extra="forbid", allow_inf_nan=False)
+
 
 class _Group(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(**TABLE, frozen=True)
+
+
+def name_without_unit(name: str) -> str:
+    """A setting's name inside the correlation, where all lengths are in px."""
+    return name.removesuffix("_px")
 
 
 class CorrelationGroup(_Group):
-    """2D matching. Radius and step in px; tolerance of the iteration in px."""
+    """Settings of the 2D matching: the one place of their names, defaults and bounds.
+
+    radius_px, step_px : subset radius (half the side of a square, less half a pixel) and spacing of the points, px.
+    order : of the subset's shape functions, 1 affine, 2 quadratic.
+    subset : its shape; always cut by the mask.
+    interpolation : degree of the B-spline of the current image.
+    tolerance : px; iteration stops when the next step would move the subset's rim by less (root mean square). The next
+        step is judged by how the last two shrank (after one: by how those of other points did). It stops too when steps
+        below 1e-5 px shrink no more. Below 1e-6 px all is computed in double precision, at a fifth of the speed.
+    max_iterations : after so many the point is lost, or sooner when its steps foretell that these will not do.
+    zncc_min : zero-mean normalised cross-correlation below which a point is lost.
+
+    What interpolation and tolerance cost in truth, at radius 20 and speckle of 1.0, 1.5, 2.0 px (standard deviation of
+    its blur): a cubic is biased by up to 4.1, 0.75, 0.22 thousandths of a pixel, a quintic by 0.99, 0.06, 0.01. A
+    tolerance of 2e-3 leaves 0.2 thousandths where noise makes 3.5, and a mean of less than 0.01.
+    """
 
     radius_px: int = Field(default=20, ge=2, le=500)
     step_px: int = Field(default=10, ge=1)
@@ -33,32 +61,44 @@ class CorrelationGroup(_Group):
 
     @property
     def keywords(self) -> dict[str, Any]:
-        """The same under the names that the correlation uses inside."""
-        return {
-            "radius": self.radius_px,
-            "step": self.step_px,
-            "order": self.order,
-            "subset": self.subset,
-            "interpolation": self.interpolation,
-            "tolerance": self.tolerance,
-            "max_iterations": self.max_iterations,
-            "zncc_min": self.zncc_min,
-        }
+        """The settings under their names in the correlation, which are without units."""
+        return {name_without_unit(name): value for name, value in self}
+
+    def at_scale(self, scale: float) -> CorrelationGroup:
+        """The settings for smaller images of the same scene, with no fewer pixels than a subset needs.
+
+        scale : size of the images, 1 where these settings hold.
+        """
+        radius, step = max(10, round(self.radius_px * scale)), max(5, round(self.step_px * scale))
+        return self.model_copy(update={"radius_px": radius, "step_px": step})
+
+    @classmethod
+    def limits(cls, name: str) -> dict[str, float]:
+        """The least and the largest value of a numeric setting, as ``min`` and ``max`` where there are such."""
+        info = cls.model_fields[name]
+        choices = get_args(info.annotation)
+        if choices:
+            return {"min": min(choices), "max": max(choices)}
+        ends = {"min": "ge", "max": "le"}
+        return {end: getattr(each, kind) for end, kind in ends.items() for each in info.metadata if hasattr(each, kind)}
 
 
 class CalibrationGroup(_Group):
-    """Cameras: the direct linear transformation (dlt), or from there the adjustment of all together (bundle).
+    """Settings of the calibration of the cameras.
 
-    distortion : the lens is measured on the checkerboard and corrected.
-    radial_terms, tangential, skew : terms that the lens may have. terms : it gets as many of them as the checkerboard
-    views determine (largest), or those of the smallest information criterion (criterion).
-    drop_percentile : checkerboard views whose error lies above it are dropped and the rest is fitted again; 100 keeps
-    all views.
-    print_error_mm, radius_error_mm, pitch_error_mm, tilt_error_deg : of the bundle: how far, as standard deviations,
-    the dots, the target's radius, its columns' spacing and the turn of the sheet on it may be from what rig.toml
-    says; 0 holds them.
-    refine_poses : of surface.method global: where cameras have moved between the steps, their poses are found again
-    from the points that they follow.
+    method : each camera by the direct linear transformation (dlt), or from there all cameras, their lenses and the
+        target adjusted together (bundle).
+    distortion : whether the lens is measured on the checkerboard and corrected.
+    radial_terms, tangential, skew : number of radial terms, and whether the lens may have tangential terms and skew.
+    terms : a lens gets as many of these terms as the checkerboard views determine (largest), or those with the smallest
+        information criterion (criterion).
+    drop_percentile : checkerboard views whose error lies above this percentile are left out and the lens is fitted
+        again; 100 keeps all views.
+    print_error_mm, radius_error_mm, pitch_error_mm, tilt_error_deg : of method bundle; standard deviations of the dots'
+        positions, the target's radius, the spacing of its columns and the turn of the printed sheet about what rig.toml
+        says; 0 holds a quantity at that.
+    refine_poses : of surface.method global; where cameras have moved between the steps, their poses are estimated anew
+        from the points that they track.
     """
 
     method: Literal["dlt", "bundle"] = "dlt"
@@ -76,18 +116,20 @@ class CalibrationGroup(_Group):
 
 
 class SurfaceGroup(_Group):
-    """How matches become a surface, and where the surface is looked for.
+    """Settings of the surface: how it is made of matches, and where it is searched.
 
-    method : the surfaces of the camera pairs side by side (pairs), or one lattice over the surface whose points all
-    cameras measure together (global).
-    merge : of the pairs' surfaces into one, and which triangles of an overlap go first: the worst by correlation, by
-    distance to the other surfaces, by orientation against theirs, or by these and the nearness to the border
-    (combined); none leaves the surfaces one over the other.
-    radius_mm : of the cylinder from which the search sets out; 0 takes the target's.
-    reach_mm : how far from it the surface may lie. incidence_deg : the steepest angle of view that is used.
-    sigma_max_px : a point whose match has a larger standard deviation, where the speckle ends, is lost.
-    spacing_mm : of the lattice; 0 takes the correlation's step as the cameras see it. curvature : of the warps between
-    cameras, from the measured shape and held (geometry), or none.
+    method : the surfaces of the camera pairs side by side (pairs), or one lattice of points over the surface, each
+        measured by all cameras that see it (global).
+    merge : how the pairs' surfaces become one: which triangles of an overlap are removed first, those worst by
+        correlation, by distance to the other surfaces, by orientation against theirs, or by all of these and the
+        nearness to the border (combined); none leaves the surfaces one over the other.
+    radius_mm : radius of the cylinder about which the surface is searched; 0 takes the target's.
+    reach_mm : largest distance of the surface from that cylinder.
+    incidence_deg : largest angle between a line of sight and the surface's normal at which a camera is used.
+    sigma_max_px : largest standard deviation of a match; beyond it, where the speckle ends, the point is lost.
+    spacing_mm : spacing of the lattice; 0 takes the correlation's step as the cameras see it.
+    curvature : second derivatives of the warps between cameras, held at those of the measured shape (geometry), or
+        none.
     """
 
     method: Literal["pairs", "global"] = "pairs"
@@ -101,10 +143,12 @@ class SurfaceGroup(_Group):
 
 
 class TrackingGroup(_Group):
-    """How a camera follows its points in time; of the global method.
+    """Settings of the tracking of points in time; of surface.method global.
 
-    two_pass : second derivatives that the neighbours' displacements show are held in a second pass of first order.
-    update_reference : a point lost against the reference image is sought from the last image that showed it.
+    two_pass : whether points are matched a second time with affine shape functions, the warp's second derivatives held
+        at those of the neighbouring points' displacements.
+    update_reference : whether a point that is lost against the reference image is matched from the last image in which
+        it was found.
     """
 
     two_pass: bool = True
@@ -112,13 +156,16 @@ class TrackingGroup(_Group):
 
 
 class StrainGroup(_Group):
-    """Strain. window_mm : width of the window it is fitted over, beside that of each triangle alone; 0: no window."""
+    """Settings of the strain.
+
+    window_mm : width of the window over which strain is fitted, in addition to that of each triangle; 0: no window.
+    """
 
     window_mm: float = Field(default=0.0, ge=0, le=1000)
 
 
 class Settings(_Group):
-    """All settings of a processing run."""
+    """Settings of a processing run, in groups."""
 
     correlation: CorrelationGroup = CorrelationGroup()
     calibration: CalibrationGroup = CalibrationGroup()
@@ -136,23 +183,31 @@ class Settings(_Group):
         return self
 
     def to_toml(self) -> str:
-        """The settings as the text of a TOML file that :func:`load_settings` reads back."""
+        """Write the settings as the text of a TOML file that `load_settings` reads back."""
         lines: list[str] = []
         for group, values in self.model_dump().items():
             lines += [f"[{group}]", *(f"{name} = {_toml(value)}" for name, value in values.items()), ""]
         return "\n".join(lines)
 
 
-#: As the paper measured: cameras by the direct linear transformation, flat subsets, pair by pair.
+#: Settings of the paper: cameras by the direct linear transformation, affine subsets, surfaces pair by pair.
 PAPER = Settings()
-#: The most exact: all cameras adjusted together, one surface with its own curvature, two passes in time.
+#: The most exact settings: all cameras adjusted together, one surface with its own curvature, two passes in time.
 BEST = Settings(calibration=CalibrationGroup(method="bundle"), surface=SurfaceGroup(method="global"))
 
 
 def load_settings(path: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
-    """Settings from a TOML file (or the defaults), changed by ``group.name=value`` pairs, the last one winning.
+    """Read settings from a TOML file and from ``group.name=value`` pairs.
 
-    Raises InputError : the file cannot be read, or a name, type or value is not known; the sentence names it.
+    Parameters
+    ----------
+    path : the file; None takes the defaults.
+    overrides : pairs that win over the file, the last one over those before.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or a name, type or value is not known; the sentence names it.
     """
     tables: dict[str, Any] = {}
     if path is not None:
@@ -169,10 +224,32 @@ def load_settings(path: Path | None = None, overrides: Sequence[str] = ()) -> Se
         return Settings.model_validate(tables)
     except ValidationError as error:
         source = "settings" if path is None else f"{path} and --set" if overrides else str(path)
-        raise InputError(f"{source}: {'; '.join(_sentence(e) for e in error.errors())}") from error
+        raise InputError(f"{source}: {faults(error, Settings, _SETTINGS)}") from error
+
+
+@lru_cache(maxsize=4)
+def settings_of_run(text: str) -> Settings:
+    """The settings that a run was made with, from the text that its results hold.
+
+    Names of another version's settings are ignored, and settings that the text does not give have their defaults.
+    Raises InputError where the text is not TOML or a value is not one of this version's.
+    """
+    try:
+        tables = tomllib.loads(text)
+        known = {
+            group: {name: value for name, value in values.items() if name in _fields(_inner(Settings, group))}
+            for group, values in tables.items()
+            if group in Settings.model_fields
+        }
+        return Settings.model_validate(known)
+    except (tomllib.TOMLDecodeError, AttributeError) as error:
+        raise InputError(f"the run's settings are not readable as TOML ({error})") from error
+    except ValidationError as error:
+        raise InputError(f"the run's settings: {faults(error, Settings, _SETTINGS)}") from error
 
 
 def _set(tables: dict[str, Any], override: str) -> None:
+    """Enter a ``group.name=value`` pair in the tables."""
     name, equals, text = override.partition("=")
     group, dot, key = name.strip().partition(".")
     if not (equals and dot and group and key):
@@ -197,25 +274,121 @@ def _toml(value: Any) -> str:
     return f'"{value}"' if isinstance(value, str) else repr(value)
 
 
+# What a model refuses, as sentences ---------------------------------------------------------------
+
+#: Where in a file a fault lies: names of tables and keys, and numbers of entries in lists.
+Location = tuple[int | str, ...]
+
 _WANTED = {
-    "int": "a whole number",
-    "float": "a number",
-    "bool": "true or false",
-    "string": "text",
-    "model": "a group of settings",
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "a whole number"),
+    **dict.fromkeys(("float_type", "float_parsing"), "a number"),
+    **dict.fromkeys(("bool_type", "bool_parsing"), "true or false"),
+    **dict.fromkeys(("string_type", "path_type"), "text in quotes"),
+    **dict.fromkeys(("model_type", "dataclass_type"), "a table"),
 }
 
 
-def _sentence(error: Any) -> str:
-    where = ".".join(str(part) for part in error["loc"])
-    if error["type"] == "extra_forbidden":
-        group = Settings.model_fields.get(str(error["loc"][0]))
-        if len(error["loc"]) > 1 and group is not None:
-            known = ", ".join(group.default.__class__.model_fields)
-            return f"unknown setting '{where}'; [{error['loc'][0]}] has {known}"
-        return f"unknown group of settings '{where}'; known are {', '.join(Settings.model_fields)}"
-    if error["type"] == "value_error":
-        return f"{where}: {error['ctx']['error']}".removeprefix(": ")
-    wanted = _WANTED.get(error["type"].split("_")[0])
+def toml_key(model: type, at: Location) -> str:
+    """How an operator finds a place in a TOML file: ``[http] port``, ``[[cameras]] number 1 id``.
+
+    model : what the file is checked by. at : the place; the whole file has no name.
+    """
+    words: list[str] = []
+    for depth, part in enumerate(at):
+        if isinstance(part, int):
+            words.append(f"number {part + 1}")
+        elif depth == 0 and _inner(model, part) is not None:
+            in_list = get_origin(_fields(model)[part].annotation) is tuple
+            words.append(f"[[{part}]]" if in_list else f"[{part}]")
+        else:
+            words.append(part)
+    return " ".join(words)
+
+
+def _unknown_toml_key(model: type, at: Location, known: Sequence[str]) -> str:
+    sentence = f"{toml_key(model, at[:-1])} unknown key {_nearest(str(at[-1]), known)}; known are {', '.join(known)}"
+    return sentence.strip()
+
+
+@dataclass(frozen=True)
+class Wording:
+    """How the sentences about a kind of file call its places.
+
+    key : of the model and a place, its name. unknown : of the model, the place of an unknown key and the keys that
+    there are, the sentence.
+    """
+
+    key: Callable[[type, Location], str] = toml_key
+    unknown: Callable[[type, Location, Sequence[str]], str] = _unknown_toml_key
+
+
+def faults(error: ValidationError, model: type, wording: Wording = Wording()) -> str:
+    """What a model refused, a sentence for each fault: where it lies, what is wrong, what is allowed.
+
+    Parameters
+    ----------
+    error : the refusal.
+    model : the pydantic model or dataclass that refused.
+    wording : how places are called.
+    """
+    return "; ".join(_fault(each, model, wording) for each in error.errors())
+
+
+def _fault(error: Any, model: type, wording: Wording) -> str:
+    kind, at, given = error["type"], error["loc"], error["input"]
+    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
+        return wording.unknown(model, at, _known_keys(model, at))
+    where = wording.key(model, at)
+    if kind == "missing":
+        return f"{where} is missing"
+    if kind == "value_error":
+        return f"{where} {error['ctx']['error']}".strip()
+    if kind == "literal_error" and isinstance(given, str):
+        return f"{where} {given!r} is not known; use {error['ctx']['expected']}"
+    wanted = _WANTED.get(kind)
     must = f"must be {wanted}" if wanted else error["msg"].replace("Input should be", "must be")
-    return f"{where} {must}, not {error['input']!r}"
+    number = isinstance(given, int | float) and not isinstance(given, bool)
+    hint = f' (write "{given}")' if kind == "string_type" and number else ""
+    return f"{where} {must}, not {given!r}{hint}"
+
+
+def _known_keys(model: type, at: Location) -> list[str]:
+    """The keys that may stand where an unknown one does."""
+    table: type | None = model
+    for part in at[:-1]:
+        if isinstance(part, str) and table is not None:
+            table = _inner(table, part)
+    return list(_fields(table))
+
+
+def _nearest(key: str, known: Sequence[str]) -> str:
+    """A key in quotes, with the known one that is spelt most alike, if one is."""
+    near = get_close_matches(key, known, 1)
+    return f"'{key}' (did you mean '{near[0]}'?)" if near else f"'{key}'"
+
+
+def _fields(model: type | None) -> dict[str, FieldInfo]:
+    """The fields of a pydantic model or dataclass; none of anything else."""
+    found: dict[str, FieldInfo] = getattr(model, "model_fields", None) or getattr(model, "__pydantic_fields__", {})
+    return found
+
+
+def _inner(model: type, name: str) -> type | None:
+    """The model of a table, or of each table of a list, that a field holds; None where it holds a plain value."""
+    annotation = _fields(model)[name].annotation if name in _fields(model) else None
+    return next((each for each in (annotation, *get_args(annotation)) if _fields(each)), None)
+
+
+def _setting(_: type, at: Location) -> str:
+    """A setting's name in the interface: ``correlation.radius_px``."""
+    return ".".join(str(part) for part in at)
+
+
+def _unknown_setting(model: type, at: Location, known: Sequence[str]) -> str:
+    if len(at) < 2:
+        return f"unknown group of settings {_nearest(_setting(model, at), known)}; known are {', '.join(known)}"
+    name = _nearest(_setting(model, at), [f"{at[0]}.{key}" for key in known])
+    return f"unknown setting {name}; [{at[0]}] has {', '.join(known)}"
+
+
+_SETTINGS = Wording(_setting, _unknown_setting)

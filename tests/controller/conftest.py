@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 from ringdic.errors import ComputationError
-from ringdic_controller.archive.writer import Archive, SessionWriter
+from ringdic.session.records import CaptureRecord, ImageDescription
+from ringdic.session.writer import Archive, SessionWriter
 from ringdic_controller.jobs.children import WarmChild
 from ringdic_controller.service.app import create_app
 from ringdic_controller.service.desk import Desk
-from ringdic_node.wire import CaptureKey, Manifest
 
 CAMERAS = ("01", "02", "03", "04")
 STAND_IN = [sys.executable, str(Path(__file__).with_name("stand_in_processing.py"))]
@@ -40,7 +40,7 @@ class StandInNodes:
             for name in CAMERAS
         ]
 
-    def capture(self, session: SessionWriter, kind: str, *, override: bool = False) -> dict[str, Any]:
+    def capture(self, session: SessionWriter, kind: str, *, override: bool = False) -> CaptureRecord:
         """One image a camera that is there, fired 10 µs after each other."""
         if self.unarmed and not override:
             raise ComputationError(f"not captured: camera {self.unarmed} is not armed")
@@ -49,23 +49,22 @@ class StandInNodes:
         assert self.gate.wait(20)
         for i, name in enumerate(CAMERAS):
             if name not in self.absent:
-                writer.store(name, *image_of(session.name, writer.capture_id, name, kind, 10**18 + i * 10_000))
+                writer.store(name, *image_of(name, 10**18 + i * 10_000))
                 self._tell(writer.record())
         record = writer.close(dict.fromkeys(self.absent, "the node is not there"))
         self._tell(record)
         return record
 
-    def _tell(self, record: dict[str, Any]) -> None:
+    def _tell(self, record: CaptureRecord) -> None:
         names = ("session", "capture_id", "kind", "state")
-        self._on_event({"type": "capture", **{name: record[name] for name in names}})
+        self._on_event({"type": "capture", **{name: getattr(record, name) for name in names}})
 
 
-def image_of(session: str, capture_id: str, camera: str, kind: str, time_ns: int) -> tuple[Manifest, bytes]:
+def image_of(camera: str, time_ns: int) -> tuple[ImageDescription, bytes]:
     """A ramp of 40 × 30 px that begins with the camera's number."""
     ramp = (np.arange(1200, dtype=np.uint32) + int(camera)).astype(np.uint8)
     pgm = b"P5\n40 30\n255\n" + ramp.tobytes()
-    sha256 = hashlib.sha256(pgm).hexdigest()
-    return Manifest(camera, CaptureKey(session, capture_id, 10**18), kind, sha256, len(pgm), 40, 30, time_ns), pgm
+    return ImageDescription(hashlib.sha256(pgm).hexdigest(), 40, 30, time_ns), pgm
 
 
 @pytest.fixture

@@ -7,7 +7,10 @@ import json
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from ringdic.errors import InputError
+from ringdic.session import names as session_names
 from ringdic_node.wire import (
+    CAPTURE_KINDS,
     IMAGE_LIMIT,
     NETWORK,
     Ack,
@@ -23,6 +26,7 @@ from ringdic_node.wire import (
     Trigger,
     TriggerReply,
     WireError,
+    checked_name,
     decode,
     decode_as,
     encode,
@@ -34,7 +38,7 @@ texts = st.text(min_size=1, max_size=20)
 counts = st.integers(0, 2**62)
 tables = st.dictionaries(st.text(max_size=5), st.one_of(st.integers(), st.text(max_size=5), st.none()), max_size=3)
 keys = st.builds(CaptureKey, names, names, counts)
-kinds = st.sampled_from(["board", "target", "specimen", "static"])
+kinds = st.sampled_from(CAPTURE_KINDS)
 manifests = st.builds(
     Manifest,
     node=names,
@@ -144,3 +148,18 @@ def test_an_image_that_the_network_would_drop_silently_cannot_be_announced():
 def test_a_frozen_receiver_is_given_up_before_its_lease_ends():
     wait_us = NETWORK["transport/link/tx/queue/congestion_control/block/wait_before_close"]
     assert wait_us < 1000 * NETWORK["transport/link/tx/lease"]
+
+
+def test_the_kinds_of_capture_are_those_of_the_session():
+    assert session_names.CAPTURE_KINDS == CAPTURE_KINDS
+
+
+@given(st.one_of(names, st.text(max_size=70), st.from_regex(r"\A[A-Za-z0-9._~/ -]{0,70}\Z")))
+def test_a_name_is_one_in_messages_where_it_is_one_in_a_session(name):
+    def verdict(check, refusal):
+        try:
+            return check("the name", name)
+        except refusal as error:
+            return str(error)
+
+    assert verdict(checked_name, WireError) == verdict(session_names.checked_name, InputError)

@@ -15,9 +15,9 @@ from ringdic.multiview.shape import ReferenceShape
 from ringdic.multiview.surface import reference_pixels
 from ringdic.multiview.tracking import CameraTrack, Tracking, at_reference, track_block
 from ringdic.session.folder import open_session
+from ringdic.session.importing import import_folder
 from ringdic.settings import CalibrationGroup
 from ringdic.tasks import process_memory
-from ringdic_controller.archive.importing import import_folder
 from ringdic_node.virtual_rig.render import render
 from ringdic_node.virtual_rig.rig import VirtualRig, paper_rig
 from ringdic_node.virtual_rig.scenes import scene

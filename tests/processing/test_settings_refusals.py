@@ -1,11 +1,12 @@
 """Settings: defaults, files, overrides, and a clear refusal of everything else."""
 
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 from ringdic.correlation.settings import CorrelationSettings
 from ringdic.errors import InputError
-from ringdic.settings import Settings, load_settings
+from ringdic.settings import CorrelationGroup, Settings, load_settings, settings_of_run
 
 
 def test_the_defaults_are_the_papers() -> None:
@@ -32,6 +33,18 @@ def test_what_is_written_reads_back_the_same(tmp_path: Path) -> None:
     path.write_text(settings.to_toml())
     assert load_settings(path) == settings
     assert load_settings(path) != Settings()
+
+
+def test_the_correlation_has_the_names_and_defaults_of_its_group() -> None:
+    own = {field.name: field.default for field in fields(CorrelationSettings)}
+    assert {name: own[name] for name in CorrelationGroup().keywords} == CorrelationGroup().keywords
+    assert set(own) - set(CorrelationGroup().keywords) == {"texture_min", "noise"}
+
+
+def test_the_command_has_the_bounds_of_the_group() -> None:
+    assert CorrelationGroup.limits("radius_px") == {"min": 2, "max": 500}
+    assert CorrelationGroup.limits("step_px") == {"min": 1}
+    assert CorrelationGroup.limits("order") == {"min": 1, "max": 2}
 
 
 def test_the_correlation_understands_its_group() -> None:
@@ -84,3 +97,17 @@ def test_a_bad_file_is_named(tmp_path: Path) -> None:
     path.write_text("strain = 3\n")
     with pytest.raises(InputError, match="strain"):
         load_settings(path)
+
+
+def test_the_settings_of_a_run_of_another_version_can_be_read() -> None:
+    settings = settings_of_run("[correlation]\nradius_px = 17\nmesh_px = 3\n[clouds]\nheight = 2\n")
+    assert settings.correlation.radius_px == 17
+    assert settings.surface == Settings().surface
+    assert settings_of_run(settings.to_toml()) == settings
+    with pytest.raises(InputError, match="the run's settings"):
+        settings_of_run("[correlation\n")
+
+
+def test_the_nearest_name_is_offered() -> None:
+    with pytest.raises(InputError, match=r"did you mean 'correlation\.radius_px'"):
+        load_settings(None, ["correlation.radius=20"])

@@ -317,7 +317,7 @@ UNPROCESSABLE: dict[str, tuple[Callable[[Path], object], int, list[str]]] = {
         ["0006-specimen/capture.json", "not a record"],
     ),
     "record without cameras": (
-        lambda session: (session / "captures" / STEPS[0] / "capture.json").write_text('{"cameras": [1]}'),
+        lambda session: (session / "captures" / STEPS[0] / "capture.json").write_text('{"schema": 1, "cameras": [1]}'),
         BAD_INPUT,
         ["0006-specimen/capture.json", "one record a camera", "copy it back"],
     ),
@@ -412,7 +412,7 @@ def test_images_that_cannot_be_correlated_are_named(refused: Refusal, work: Work
     assert "empty.png: the mask marks no pixel; paint" in told(reference, current, "--mask", empty)
     assert "small.png: the mask is 493 x 648 px" in told(reference, current, "--mask", small)
     assert "choose a smaller radius" in told(reference, current, "--radius", 300)
-    assert "one of circle, square, not 'star'" in told(reference, current, "--subset", "star")
+    assert "subset 'star' is not known; use 'circle' or 'square'" in told(reference, current, "--subset", "star")
     flat = write(work.src / "flat.png", np.full_like(grey(current), 90))
     sentence = told(reference, flat, code=NOT_COMPUTABLE)
     says(sentence, "flat.png: none of the", "check that")

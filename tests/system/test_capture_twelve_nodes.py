@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from ringdic.errors import InputError
 from ringdic.session.folder import open_session
-from ringdic_controller.archive.writer import Archive, SessionWriter, verify
+from ringdic.session.writer import Archive, SessionWriter, verify
 from ringdic_controller.rig.capture import MS, SECOND, Timing
 from ringdic_controller.rig.link import RigLink
 from ringdic_controller.rig.rounds import CaptureRefusedError
@@ -113,10 +113,10 @@ def assert_archived(session: SessionWriter, capture_id: str, camera: str, kind: 
     """The file is the pattern, and its checksum is what the record says."""
     content = (session.path / "captures" / capture_id / f"{camera}.pgm").read_bytes()
     assert content == expected_file(camera, kind, scene)
-    entry = session.capture(capture_id).record()["cameras"][camera]
-    assert entry["sha256"] == hashlib.sha256(content).hexdigest()
-    assert (entry["bytes"], entry["width"], entry["height"]) == (len(content), WIDTH, HEIGHT)
-    assert entry["exposure_us"] == 4000.0, "the cameras hold what rig.toml asks for"
+    entry = session.capture(capture_id).record().cameras[camera]
+    assert entry.sha256 == hashlib.sha256(content).hexdigest()
+    assert (entry.bytes, entry.width, entry.height) == (len(content), WIDTH, HEIGHT)
+    assert entry.exposure_us == 4000.0, "the cameras hold what rig.toml asks for"
 
 
 def test_a_node_killed_in_the_middle_of_a_capture(twelve: Ring, tmp_path: Path, rig_toml: RigToml):
@@ -131,17 +131,17 @@ def test_a_node_killed_in_the_middle_of_a_capture(twelve: Ring, tmp_path: Path, 
         session = archive.create_session("kill", rig_toml("test-ring", twelve.cameras) + EXPOSURE)
 
         whole = rig.capture(session, "board")
-        assert {c: e["status"] for c, e in whole["cameras"].items()} == dict.fromkeys(twelve.cameras, "ok")
+        assert {c: e.status for c, e in whole.cameras.items()} == dict.fromkeys(twelve.cameras, "ok")
         # Each simulated frame is off by 30 µs (one sigma): the spread of twelve is positive and far below 1 ms.
-        assert 0 < whole["skew_ns"] < 1_000_000
-        assert whole["skew_exceeded"] is False
+        assert 0 < whole.skew_ns < 1_000_000
+        assert whole.skew_exceeded is False
 
         # The victim dies after its trigger, while its sensor reads out; nothing is in its spool yet.
         fired = threading.Event()
 
         def assassin() -> None:
             opened = until(lambda: any(e.get("capture_id") == "0002-target" for e in list(events)), 20)
-            fire_at_ns = session.capture("0002-target").record()["fire_at_ns"] if opened else 0
+            fire_at_ns = session.capture("0002-target").record().fire_at_ns if opened else 0
             while opened and time.time_ns() < fire_at_ns + 200 * MS:
                 time.sleep(0.005)
             twelve.kill(victim)
@@ -152,8 +152,8 @@ def test_a_node_killed_in_the_middle_of_a_capture(twelve: Ring, tmp_path: Path, 
         record = rig.capture(session, "target")
         thread.join(30)
         assert fired.is_set()
-        assert record["state"] == "closed"
-        failed = {c: e["reason"] for c, e in record["cameras"].items() if e["status"] != "ok"}
+        assert record.state == "closed"
+        failed = {c: e.reason for c, e in record.cameras.items() if e.status != "ok"}
         assert list(failed) == [victim]
         assert "disappeared" in failed[victim]
         for camera in others:
@@ -170,7 +170,7 @@ def test_a_node_killed_in_the_middle_of_a_capture(twelve: Ring, tmp_path: Path, 
         twelve.start(victim)
         assert rig.wait_for_nodes(30) == []
         again = rig.capture(session, "specimen")
-        assert {e["status"] for e in again["cameras"].values()} == {"ok"}
+        assert {e.status for e in again.cameras.values()} == {"ok"}
     read = open_session(session.path)
     assert [len(capture.images) for capture in read.captures] == [12, 11, 12]
 
@@ -178,7 +178,7 @@ def test_a_node_killed_in_the_middle_of_a_capture(twelve: Ring, tmp_path: Path, 
 CONTROLLER = """
 import sys
 from pathlib import Path
-from ringdic_controller.archive.writer import Archive
+from ringdic.session.writer import Archive
 from ringdic_controller.rig.capture import MS, SECOND, Timing
 from ringdic_controller.rig.link import RigLink
 from ringdic_controller.rig.rounds import CaptureRefusedError
@@ -204,7 +204,7 @@ def test_a_controller_and_a_node_killed_in_a_burst_lose_nothing(three: Ring, tmp
     try:
         # Dead in the middle of the third capture: its record is open and its cameras are about to fire.
         assert until(lambda: (session.path / "captures/0003-specimen/capture.json").exists(), 40)
-        fire_at_ns = session.capture("0003-specimen").record()["fire_at_ns"]
+        fire_at_ns = session.capture("0003-specimen").record().fire_at_ns
         assert until(lambda: time.time_ns() > fire_at_ns, 5)
     finally:
         process.kill()
@@ -216,16 +216,16 @@ def test_a_controller_and_a_node_killed_in_a_burst_lose_nothing(three: Ring, tmp
     three.start("b")
     with RigLink("test-ring", three.cameras, three.endpoint, Archive(root), lambda event: None, reconcile_s=0.5) as rig:
         assert rig.wait_for_nodes(30) == []
-        assert until(lambda: all(e["file"] for record in session.captures() for e in record["cameras"].values()), 30), (
+        assert until(lambda: all(e.file for record in session.captures() for e in record.cameras.values()), 30), (
             session.captures()
         )
         assert until(lambda: not any(three.spooled(camera) for camera in three.cameras), 10)
     # Killed in the third capture; the fourth had at most begun.
-    assert [record["capture_id"] for record in session.captures()][:3] == [f"000{n}-specimen" for n in (1, 2, 3)]
-    assert all(record["state"] == "closed" for record in session.captures())
+    assert [record.capture_id for record in session.captures()][:3] == [f"000{n}-specimen" for n in (1, 2, 3)]
+    assert all(record.state == "closed" for record in session.captures())
     for record in session.captures():
         for camera in three.cameras:
-            assert_archived(session, record["capture_id"], camera, "specimen", record["number"] - 1)
+            assert_archived(session, record.capture_id, camera, "specimen", record.number - 1)
     assert verify(session.path) == []
 
 
@@ -245,10 +245,10 @@ def test_a_capture_is_refused_while_a_camera_is_absent_unless_the_operator_overr
         assert session.captures() == [], "a refused capture leaves no folder"
 
         record = rig.capture(session, "board", override=True)
-        assert record["override"] is True
-        assert record["cameras"]["ghost"]["status"] == "failed"
-        assert "not connected" in record["cameras"]["ghost"]["reason"]
-        assert [record["cameras"][camera]["status"] for camera in three.cameras] == ["ok"] * 3
+        assert record.override is True
+        assert record.cameras["ghost"].status == "failed"
+        assert "not connected" in record.cameras["ghost"].reason
+        assert [record.cameras[camera].status for camera in three.cameras] == ["ok"] * 3
 
         # Settings that no camera knows are refused by every node, with the name.
         with pytest.raises(CaptureRefusedError, match="unknown camera setting 'iso'"):

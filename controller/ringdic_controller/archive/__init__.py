@@ -1,1 +1,1 @@
-"""The session folders on disk, and their catalogue."""
+"""The catalogue of the sessions on disk."""

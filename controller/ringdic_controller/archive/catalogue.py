@@ -8,13 +8,16 @@ from __future__ import annotations
 import json
 import logging
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import RLock
-from typing import Any
+from typing import Any, TypeVar
 
 from ringdic.session.folder import live_results
+from ringdic.session.records import CaptureRecord, read_capture_record, read_session_record
+
+T = TypeVar("T")
 
 logger = logging.getLogger(__name__)
 
@@ -67,12 +70,12 @@ class Catalogue:
         path = self.root / name
         with self._lock, self._db:
             self._delete(name)
-            header = _read_json(path / "session.json")
+            header = _read(path / "session.json", read_session_record)
             if header is None:
                 return
             self._db.execute(
                 "insert into sessions values (?, ?, ?, ?, ?)",
-                (name, header.get("rig"), header.get("created"), header.get("source"), _signature(path)),
+                (name, header.rig, header.created, header.source, _signature(path)),
             )
             for record in _captures(path):
                 self._insert(name, record)
@@ -87,7 +90,7 @@ class Catalogue:
             record = _record(self.root / name / "captures" / capture_id / "capture.json")
             if record is not None:
                 self._insert(name, record)
-            return record
+            return None if record is None else record.to_json()
 
     def sessions(self) -> list[dict[str, Any]]:
         """One dictionary for each session, newest first.
@@ -150,8 +153,8 @@ class Catalogue:
         (runs,) = self._db.execute("select count(*) from runs where session = ?", (name,)).fetchone()
         return {"captures": counts, "runs": runs}
 
-    def _insert(self, name: str, record: dict[str, Any]) -> None:
-        row = (name, record["capture_id"], record.get("number", 0), record.get("kind"), json.dumps(record))
+    def _insert(self, name: str, record: CaptureRecord) -> None:
+        row = (name, record.capture_id, record.number, record.kind, json.dumps(record.to_json()))
         self._db.execute("insert or replace into captures values (?, ?, ?, ?, ?)", row)
 
     def _delete(self, name: str) -> None:
@@ -166,17 +169,17 @@ class Catalogue:
                     yield path
 
 
-def _captures(path: Path) -> Iterator[dict[str, Any]]:
+def _captures(path: Path) -> Iterator[CaptureRecord]:
     for file in (path / "captures").glob("*/capture.json"):
         record = _record(file)
         if record is not None:
             yield record
 
 
-def _record(file: Path) -> dict[str, Any] | None:
+def _record(file: Path) -> CaptureRecord | None:
     """The record of a capture; None if it is not readable or names another capture than its folder does."""
-    record = _read_json(file)
-    return record if record is not None and record.get("capture_id") == file.parent.name else None
+    record = _read(file, read_capture_record)
+    return record if record is not None and record.capture_id == file.parent.name else None
 
 
 def _runs(path: Path) -> Iterator[tuple[str, str, dict[str, Any]]]:
@@ -184,19 +187,27 @@ def _runs(path: Path) -> Iterator[tuple[str, str, dict[str, Any]]]:
     for folder in sorted(results.iterdir()) if results.is_dir() else ():
         if folder.name.isdigit() and (folder / "results.h5").is_file():
             finished = datetime.fromtimestamp((folder / "results.h5").stat().st_mtime, UTC)
-            yield folder.name, finished.isoformat(timespec="seconds"), _read_json(folder / "summary.json") or {}
+            yield (
+                folder.name,
+                finished.isoformat(timespec="seconds"),
+                _read(folder / "summary.json", _read_summary) or {},
+            )
 
 
-def _read_json(path: Path) -> dict[str, Any] | None:
-    """A JSON object, or None with a warning: one damaged file must not hide the other sessions."""
+def _read(file: Path, read: Callable[[Path], T]) -> T | None:
+    """What a file holds, or None, with a warning where it is damaged: it must not hide the other sessions."""
+    if not file.is_file():
+        return None
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+        return read(file)
+    except (ValueError, OSError) as error:
+        logger.warning("%s is not readable and is left out of the catalogue: %s", file, error)
         return None
-    except (json.JSONDecodeError, UnicodeDecodeError, OSError) as error:
-        logger.warning("%s is not readable and is left out of the catalogue: %s", path, error)
-        return None
-    return value if isinstance(value, dict) else None
+
+
+def _read_summary(file: Path) -> dict[str, Any]:
+    summary = json.loads(file.read_text(encoding="utf-8"))
+    return summary if isinstance(summary, dict) else {}
 
 
 def _signature(path: Path) -> str:

@@ -454,26 +454,3 @@ class CaptureRound:
             return []
         self.outcomes[camera] = outcome
         return [NoteOutcome(camera, outcome)]
-
-
-# Skew --------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Skew:
-    """Spread of the frames' measured times in a capture, ns, and whether it exceeds the tolerance.
-
-    Both are None where fewer than two cameras measured a time, ``exceeded`` also where there is no tolerance.
-    """
-
-    skew_ns: int | None
-    exceeded: bool | None
-
-    @classmethod
-    def of(cls, times_ns: Iterable[int | None], tolerance_ns: int | None) -> Skew:
-        """Skew of some cameras' frames, from the time that each measured, ns, or None where it did not."""
-        times = [time for time in times_ns if time is not None]
-        if len(times) < 2:
-            return cls(None, None)
-        skew = max(times) - min(times)
-        return cls(skew, None if tolerance_ns is None else skew > tolerance_ns)

@@ -14,9 +14,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from ringdic.session.records import ImageDescription
+from ringdic.session.writer import Archive
 from ringdic_node.wire import CaptureKey, Failure, Manifest
 
-from ringdic_controller.archive.writer import Archive
 from ringdic_controller.rig.judgement import judge
 from ringdic_controller.rig.rounds import capture_event
 
@@ -128,8 +129,8 @@ class Intake:
             manifest,
             sha256,
             len(image),
-            record["fire_at_ns"] if record else None,
-            {camera: entry["sha256"] for camera, entry in record["cameras"].items()} if record else {},
+            record.fire_at_ns if record else None,
+            {camera: entry.sha256 for camera, entry in record.cameras.items()} if record else {},
         )
         if judgement.verdict == "corrupt":
             log.error("image of %s from %s refused: %s", manifest.key, manifest.node, judgement.reason)
@@ -140,7 +141,7 @@ class Intake:
             return
         new = judgement.verdict == "archive"
         if new:
-            capture.store(manifest.node, manifest, image, sha256=sha256)
+            capture.store(manifest.node, description_of(manifest), image, sha256=sha256)
         self._acknowledge(manifest, "archived")
         self._on_archived(manifest)
         if new:  # last: whoever watches must not keep the node waiting
@@ -152,13 +153,13 @@ class Intake:
         if capture is None:
             return False
         record = capture.record()
-        if record["fire_at_ns"] != manifest.key.fire_at_ns or manifest.node not in record["cameras"]:
+        if record.fire_at_ns != manifest.key.fire_at_ns or manifest.node not in record.cameras:
             return False
-        if record["cameras"][manifest.node]["sha256"] == manifest.sha256:
+        if record.cameras[manifest.node].sha256 == manifest.sha256:
             self._acknowledge(manifest, "archived")  # the first acknowledgement was lost
             return False
         # While a capture is open, its round pulls the images; a second transfer would compete with that.
-        return bool(record["state"] == "closed")
+        return record.state == "closed"
 
     def note_failure(self, failure: Failure) -> None:
         """Record why a node says it took no image, in place of the general reason in a closed capture's record."""
@@ -166,12 +167,25 @@ class Intake:
         if capture is None:
             return
         record = capture.record()
-        entry = record["cameras"].get(failure.node)
-        if record["fire_at_ns"] != failure.key.fire_at_ns or entry is None or entry["status"] != "failed":
+        entry = record.cameras.get(failure.node)
+        if record.fire_at_ns != failure.key.fire_at_ns or entry is None or entry.status != "failed":
             return
-        if entry["reason"] != failure.reason:
+        if entry.reason != failure.reason:
             capture.fail(failure.node, failure.reason)
             self._on_event(capture_event(capture.record()))
+
+
+def description_of(manifest: Manifest) -> ImageDescription:
+    """What a node tells of an image, as the session's record keeps it."""
+    return ImageDescription(
+        manifest.sha256,
+        manifest.width,
+        manifest.height,
+        manifest.time_ns,
+        manifest.exposure_us,
+        manifest.metadata,
+        manifest.format,
+    )
 
 
 def _image(manifest: Manifest) -> _Image:

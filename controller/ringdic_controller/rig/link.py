@@ -19,6 +19,8 @@ from typing import Any
 
 import zenoh
 from ringdic.errors import ComputationError, InputError
+from ringdic.session.records import CaptureRecord
+from ringdic.session.writer import Archive, SessionWriter
 from ringdic_node.wire import (
     NETWORK,
     Ack,
@@ -38,7 +40,6 @@ from ringdic_node.wire import (
     encode,
 )
 
-from ringdic_controller.archive.writer import Archive, SessionWriter
 from ringdic_controller.rig import capture as steps
 from ringdic_controller.rig.capture import Timing
 from ringdic_controller.rig.intake import Intake
@@ -341,7 +342,7 @@ class RigLink:
         *,
         override: bool = False,
         settings: dict[str, Any] | None = None,
-    ) -> dict[str, Any]:
+    ) -> CaptureRecord:
         """Capture one image with every camera; return the closed record.
 
         Blocks until the round closes, at most the sum of its waits.

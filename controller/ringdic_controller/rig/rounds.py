@@ -10,9 +10,10 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from ringdic.errors import ComputationError
+from ringdic.session.records import CaptureRecord
+from ringdic.session.writer import CaptureWriter, SessionWriter
 from ringdic_node.wire import Arm, CaptureKey, Manifest, Trigger
 
-from ringdic_controller.archive.writer import CaptureWriter, SessionWriter
 from ringdic_controller.rig import capture as steps
 from ringdic_controller.rig.capture import SECOND, CaptureRound, Timing
 
@@ -59,7 +60,7 @@ def run_round(
     settings: dict[str, Any],
     on_event: Callable[[dict[str, Any]], None],
     wall_ns: Callable[[], int] = time.time_ns,
-) -> dict[str, Any]:
+) -> CaptureRecord:
     """Run one capture round to its end and return the closed record.
 
     Parameters
@@ -129,7 +130,7 @@ class _Performer:
         canonical = json.dumps(settings, sort_keys=True, separators=(",", ":")).encode()
         self._arm = Arm(session.name, kind, settings, hashlib.sha256(canonical).hexdigest(), cameras)
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> CaptureRecord:
         """The capture's record as it stands."""
         assert self._writer is not None
         return self._writer.record()
@@ -212,10 +213,8 @@ class _Performer:
         )
 
 
-def capture_event(record: dict[str, Any]) -> dict[str, Any]:
+def capture_event(record: CaptureRecord) -> dict[str, Any]:
     """The event that reports a capture's record: its state, and the status of every camera with its reason."""
-    header = {name: record[name] for name in ("session", "capture_id", "kind", "state", "skew_ns", "skew_exceeded")}
-    cameras = {
-        camera: {"status": entry["status"], "reason": entry["reason"]} for camera, entry in record["cameras"].items()
-    }
-    return {"type": "capture", **header, "cameras": cameras}
+    names = ("session", "capture_id", "kind", "state", "skew_ns", "skew_exceeded")
+    cameras = {camera: {"status": entry.status, "reason": entry.reason} for camera, entry in record.cameras.items()}
+    return {"type": "capture", **{name: getattr(record, name) for name in names}, "cameras": cameras}

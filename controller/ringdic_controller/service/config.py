@@ -18,79 +18,111 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
+from pydantic import AfterValidator, Strict, StrictBool, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 from ringdic.errors import InputError
+from ringdic.settings import TABLE, faults
 
-_KEYS = {"": {"archive", "rig", "settings", "live", "http", "zenoh"}, "http": {"host", "port"}, "zenoh": {"endpoint"}}
+
+def _named_host(host: str) -> str:
+    if not host:
+        raise ValueError("is empty; use 127.0.0.1 for this PC alone")
+    return host
 
 
-@dataclass(frozen=True)
+def _tcp_port(port: int) -> int:
+    if not 0 <= port <= 65535:
+        raise ValueError(f"{port} is not a port; use 0 … 65535")
+    return port
+
+
+def _tcp_endpoint(endpoint: str) -> str:
+    if "/" not in endpoint or ":" not in endpoint:
+        raise ValueError(f"'{endpoint}' is not of the form tcp/ADDRESS:PORT")
+    return endpoint
+
+
+Host = Annotated[str, AfterValidator(_named_host)]
+Port = Annotated[int, Strict(), AfterValidator(_tcp_port)]
+Endpoint = Annotated[str, AfterValidator(_tcp_endpoint)]
+
+
+@dataclass(frozen=True, config=TABLE)
 class ControllerConfig:
-    """Where the controller keeps, listens and serves."""
+    """Configuration of the controller.
+
+    archive : folder of the sessions. rig : the rig file; None where the controller only shows. settings : file of the
+    processing's settings. live : whether each step is processed at once. host, port : of the page. endpoint : where
+    the nodes connect.
+    """
 
     archive: Path = Path("ringdic-archive")
     rig: Path | None = None
     settings: Path | None = None
-    live: bool = True
-    host: str = "127.0.0.1"
-    port: int = 8000
-    endpoint: str = "tcp/127.0.0.1:7447"
+    live: StrictBool = True
+    host: Host = "127.0.0.1"
+    port: Port = 8000
+    endpoint: Endpoint = "tcp/127.0.0.1:7447"
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.port <= 65535:
-            raise InputError(f"[http] port {self.port} is not a port; use 0 … 65535")
-        if not self.host:
-            raise InputError("[http] host is empty; use 127.0.0.1 for this PC alone")
-        if "/" not in self.endpoint or ":" not in self.endpoint:
-            raise InputError(f"[zenoh] endpoint '{self.endpoint}' is not of the form tcp/ADDRESS:PORT")
+
+@dataclass(frozen=True, config=TABLE)
+class _Http:
+    """The table ``[http]``."""
+
+    host: Host = ControllerConfig.host
+    port: Port = ControllerConfig.port
+
+
+@dataclass(frozen=True, config=TABLE)
+class _Zenoh:
+    """The table ``[zenoh]``."""
+
+    endpoint: Endpoint = ControllerConfig.endpoint
+
+
+@dataclass(frozen=True, config=TABLE)
+class _ConfigFile:
+    """The keys and tables of a configuration file."""
+
+    archive: Path = ControllerConfig.archive
+    rig: Path | None = None
+    settings: Path | None = None
+    live: StrictBool = ControllerConfig.live
+    http: _Http = _Http()
+    zenoh: _Zenoh = _Zenoh()
+
+
+_CONFIG_FILE = TypeAdapter(_ConfigFile)
 
 
 def read_controller_config(path: Path | None) -> ControllerConfig:
-    """The configuration of a TOML file, the defaults without one; relative paths are taken from the file's folder.
+    """Read the configuration in a TOML file; without a file, the defaults.
 
-    Raises InputError, naming the file and the key at fault.
+    Relative paths are taken from the file's folder. Raises InputError, naming the file and the key at fault.
     """
     if path is None:
         return ControllerConfig()
     path = Path(path)
     try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-        return _config(tables, path.resolve().parent)
+        file = _CONFIG_FILE.validate_python(tomllib.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such configuration file") from error
-    except (InputError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValidationError as error:
+        raise InputError(f"{path}: {faults(error, _ConfigFile)}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: {error}") from error
-
-
-def _config(tables: dict[str, Any], folder: Path) -> ControllerConfig:
-    _refuse_unknown("", tables)
-    config = ControllerConfig(archive=folder / "ringdic-archive")
-    for name in ("archive", "rig", "settings"):
-        if name in tables:
-            config = replace(config, **{name: folder / _typed(tables[name], str, name)})
-    if "live" in tables:
-        config = replace(config, live=_typed(tables["live"], bool, "live"))
-    for table, types in (("http", {"host": str, "port": int}), ("zenoh", {"endpoint": str})):
-        values = _typed(tables.get(table, {}), dict, f"[{table}]")
-        _refuse_unknown(table, values)
-        for name, kind in types.items():
-            if name in values:
-                config = replace(config, **{name: _typed(values[name], kind, f"[{table}] {name}")})
-    return config
-
-
-def _refuse_unknown(table: str, values: dict[str, Any]) -> None:
-    for key in values:
-        if key not in _KEYS[table]:
-            where = f"[{table}] " if table else ""
-            raise InputError(f"{where}unknown key '{key}'; known are {', '.join(sorted(_KEYS[table]))}")
-
-
-def _typed(value: Any, kind: type, where: str) -> Any:
-    if not isinstance(value, kind) or isinstance(value, bool) is not (kind is bool):
-        wanted = {bool: "true or false", str: "text in quotes", int: "a whole number", dict: "a table"}[kind]
-        raise InputError(f"{where} must be {wanted}, not {value!r}")
-    return value
+    folder = path.resolve().parent
+    config = ControllerConfig(
+        archive=folder / file.archive,
+        live=file.live,
+        host=file.http.host,
+        port=file.http.port,
+        endpoint=file.zenoh.endpoint,
+    )
+    if file.rig is not None:
+        config = replace(config, rig=folder / file.rig)
+    return config if file.settings is None else replace(config, settings=folder / file.settings)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+from ringdic.session.records import CaptureRecord
 from ringdic.session.rig import Rig, parse_rig
 
 _UNKNOWN = {"alive": False, "armed": False, "state": "unknown"}
@@ -15,7 +16,7 @@ class CameraNodes(Protocol):
     def roster(self) -> list[dict[str, Any]]:
         """One dictionary for each camera: id, alive, state, armed, spool_free, spool_images, versions, …"""
 
-    def capture(self, session: Any, kind: str, *, override: bool = False) -> dict[str, Any]:
+    def capture(self, session: Any, kind: str, *, override: bool = False) -> CaptureRecord:
         """Capture with every camera into a session's writer; blocks until the capture closes; its record."""
 
 

@@ -9,7 +9,7 @@ from threading import Lock, Thread
 from typing import Any
 
 from ringdic.errors import InputError
-from ringdic_node.wire import CAPTURE_KINDS
+from ringdic.session.names import CAPTURE_KINDS
 
 from ringdic_controller.service.refusals import NotFoundError, RefusedError
 from ringdic_controller.service.roster import NodeRoster
@@ -146,9 +146,9 @@ class Rounds:
             self._change(new.id, state="refused", error=sentence)
             raise
         try:
-            self._on_archived(new, record["capture_id"])
+            self._on_archived(new, record.capture_id)
         finally:  # whatever became of its processing, the capture has closed
-            self._change(new.id, state="closed", capture_id=record["capture_id"])
+            self._change(new.id, state="closed", capture_id=record.capture_id)
 
     def _change(self, round_id: str, **changes: Any) -> None:
         """Change a round, unless it has ended."""

@@ -15,8 +15,8 @@ from types import FrameType
 import uvicorn
 from ringdic.errors import InputError
 from ringdic.session.rig import parse_rig, read_rig
+from ringdic.session.writer import Archive
 
-from ringdic_controller.archive.writer import Archive
 from ringdic_controller.jobs.children import Command, Processing, WarmChild, serving_command
 from ringdic_controller.rig.capture import Timing
 from ringdic_controller.rig.link import RigLink

@@ -12,7 +12,7 @@ from ringdic_controller.service.refusals import NotFoundError, RefusedError
 
 
 class SessionArchive(Protocol):
-    """Where sessions are created and written: `ringdic_controller.archive.writer.Archive`."""
+    """Where sessions are created and written: `ringdic.session.writer.Archive`."""
 
     def create_session(self, name: str, rig_toml: str) -> Any:
         """Create a session folder and return its writer. Raises InputError if the name is unusable or taken."""

@@ -1,67 +1,64 @@
-"""What a correlation is told."""
+"""Settings of the correlation of one pair of images, under the names that the correlation uses inside."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import ValidationError
 
 from ringdic.errors import InputError
+from ringdic.settings import CorrelationGroup, Location, Wording, faults, name_without_unit
 
-SUBSETS = ("circle", "square")
-INTERPOLATIONS = {"cubic": 3, "quintic": 5}
+_DEFAULTS = CorrelationGroup()
+_DEGREES = {"cubic": 3, "quintic": 5}
 
 
 @dataclass(frozen=True)
 class CorrelationSettings:
     """Settings of the correlation of one pair of images.
 
-    radius, step : px; subset radius (half the side of a square, less half a pixel) and spacing of the points.
+    Names (without their units), defaults and bounds are those of `ringdic.settings.CorrelationGroup`, where each is
+    explained; `texture_min` and `noise` are the correlation's own.
+
+    radius, step : px; subset radius and spacing of the points.
     order : 1 for affine shape functions, 2 for quadratic ones.
-    subset : "circle" or "square"; always cut by the mask.
+    subset : "circle" or "square".
     interpolation : "quintic" or "cubic" B-spline of the current image.
-    interpolation, tolerance : by what they cost in truth. Radius 20, speckle of 1.0, 1.5, 2.0 px (standard deviation of
-        its blur): a cubic is biased by up to 4.1, 0.75, 0.22 thousandths of a pixel, a quintic by 0.99, 0.06, 0.01. A
-        tolerance of 2e-3 leaves 0.2 thousandths where noise makes 3.5, and a mean of less than 0.01.
-    tolerance : px; iteration stops when the next step, judged by how the last two shrank (after one: by how those of
-        other points did), would move the subset's rim by less, in the root mean square sense, or steps below 1e-5 px
-        shrink no more. Below 1e-6 px all is computed in double precision, at a fifth of the speed.
-    max_iterations : after so many the point is lost, or sooner when its steps foretell that these will not do.
+    tolerance : px; the iteration stops when the subset's rim would move by less.
+    max_iterations : after so many the point is lost.
     zncc_min : below this a point is lost.
     texture_min : least root-mean-square gradient along the weakest direction, in 1/255 of the grey range a pixel;
         the rounding to whole grey levels alone makes 0.5.
     noise : standard deviation of the grey levels; None takes it from the residual of each subset.
+
+    Raises InputError where a value is out of bounds.
     """
 
-    radius: int = 20
-    step: int = 10
-    order: int = 1
-    subset: str = "circle"
-    interpolation: str = "quintic"
-    tolerance: float = 2e-3
-    max_iterations: int = 50
-    zncc_min: float = 0.7
+    radius: int = _DEFAULTS.radius_px
+    step: int = _DEFAULTS.step_px
+    order: int = _DEFAULTS.order
+    subset: str = _DEFAULTS.subset
+    interpolation: str = _DEFAULTS.interpolation
+    tolerance: float = _DEFAULTS.tolerance
+    max_iterations: int = _DEFAULTS.max_iterations
+    zncc_min: float = _DEFAULTS.zncc_min
     texture_min: float = 1.0
     noise: float | None = None
 
     def __post_init__(self) -> None:
-        _require(2 <= self.radius <= 500, f"the subset radius must be 2 to 500 px, not {self.radius}")
-        _require(self.step >= 1, f"the step must be at least 1 px, not {self.step}")
-        _require(self.order in (1, 2), f"the order of the subset must be 1 or 2, not {self.order}")
-        _require(self.subset in SUBSETS, f"the subset must be one of {', '.join(SUBSETS)}, not '{self.subset}'")
-        _require(
-            self.interpolation in INTERPOLATIONS,
-            f"the interpolation must be one of {', '.join(INTERPOLATIONS)}, not '{self.interpolation}'",
-        )
-        _require(self.tolerance > 0, f"the tolerance must be positive, not {self.tolerance}")
-        _require(self.max_iterations >= 1, f"max_iterations must be at least 1, not {self.max_iterations}")
-        _require(-1 <= self.zncc_min < 1, f"zncc_min must lie in [-1, 1), not {self.zncc_min}")
-        _require(self.noise is None or self.noise > 0, f"the noise must be positive, not {self.noise}")
+        names = {name_without_unit(name): name for name in CorrelationGroup.model_fields}
+        try:
+            CorrelationGroup.model_validate({name: getattr(self, own) for own, name in names.items()})
+        except ValidationError as error:
+            raise InputError(f"correlation: {faults(error, CorrelationGroup, _WORDING)}") from error
+        if self.noise is not None and not self.noise > 0:
+            raise InputError(f"correlation: noise must be greater than 0, not {self.noise}")
 
     @property
     def degree(self) -> int:
         """Degree of the B-spline."""
-        return INTERPOLATIONS[self.interpolation]
+        return _DEGREES[self.interpolation]
 
     @property
     def precision(self) -> type:
@@ -69,6 +66,8 @@ class CorrelationSettings:
         return np.float64 if self.tolerance < 1e-6 else np.float32
 
 
-def _require(condition: bool, sentence: str) -> None:
-    if not condition:
-        raise InputError(f"correlation: {sentence}")
+def _own_name(_: type, at: Location) -> str:
+    return name_without_unit(str(at[0]))
+
+
+_WORDING = Wording(_own_name)

@@ -22,6 +22,7 @@ from ringdic.errors import RingdicError
 from ringdic.jobs.allocation import keep_freed_memory
 from ringdic.jobs.serving import carry_out, compile_kernels, progress_values, serve
 from ringdic.progress import Progress
+from ringdic.settings import load_settings
 
 
 def main() -> int:
@@ -42,9 +43,8 @@ def main() -> int:
     if arguments.serve:
         return _serve_to_the_end()
     try:
-        _line(
-            carry_out(arguments.session, arguments.settings, arguments.overrides, lambda at: _line(progress_values(at)))
-        )
+        settings = load_settings(arguments.settings, arguments.overrides)
+        _line(carry_out(arguments.session, settings, lambda at: _line(progress_values(at))))
     except RingdicError as error:
         _line({"state": "failed", "error": str(error)})
         return error.exit_code

@@ -7,7 +7,6 @@ settings say, because only pairs need no matches of the steps in between.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -63,8 +62,7 @@ def _calibrated(session: Session, settings: CalibrationGroup, progress: Callable
     """The calibrated rig, cached in memory as long as its images and settings stay the same."""
     captures = [capture for capture in session.captures if capture.kind in ("board", "target")]
     rig = (session.path / "rig.toml").read_text(encoding="utf-8")
-    records = json.dumps([(each.id, each.record) for each in captures])
-    key = digest("live calibration", str(session.path), rig, settings, records)
+    key = digest("live calibration", str(session.path), rig, settings, [each.record for each in captures])
     return process_memory.get(key, lambda: calibrate_rig(session, settings, progress), lambda _: _RIG_BYTES)
 
 

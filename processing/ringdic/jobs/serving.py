@@ -26,7 +26,7 @@ from ringdic.errors import RingdicError
 from ringdic.jobs.live_step import process_step
 from ringdic.jobs.pipeline import process_session
 from ringdic.progress import Progress, Report
-from ringdic.settings import load_settings
+from ringdic.settings import Settings, load_settings
 from ringdic.tasks import process_memory
 
 Say = Callable[[dict[str, Any]], None]
@@ -89,19 +89,17 @@ def compile_kernels(say: Say) -> None:
         _load_kernels()
 
 
-def carry_out(
-    session: Path, settings: Path | None, overrides: list[str], report: Report, step: str | None = None
-) -> dict[str, Any]:
+def carry_out(session: Path, settings: Settings, report: Report, step: str | None = None) -> dict[str, Any]:
     """Process a session and return the outcome as JSON values.
 
-    session : its folder. settings : a TOML file, or None for the defaults. overrides : "group.name=value". report : is
-    called with the progress. step : a capture to process alone and at once; None processes all.
+    session : its folder. settings : of the run. report : is called with the progress. step : a capture to process
+    alone and at once; None processes all.
     Raises RingdicError for what an operator can mend.
     """
     if step is not None:
-        process_step(session, step, load_settings(settings, overrides), report)
+        process_step(session, step, settings, report)
         return {"state": "done", "step": step}
-    run = process_session(session, load_settings(settings, overrides), report)
+    run = process_session(session, settings, report)
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     return {"state": "done", "run": run.name, "summary": summary}
 
@@ -119,8 +117,8 @@ def _carried_out(order: dict[str, Any], say: Say, orders: _Orders) -> dict[str, 
 
     settings = order.get("settings")
     try:
-        chosen = None if settings is None else Path(settings)
-        return carry_out(Path(order["session"]), chosen, [], report, order.get("step"))
+        chosen = load_settings(None if settings is None else Path(settings))
+        return carry_out(Path(order["session"]), chosen, report, order.get("step"))
     except StoppedError:
         return {"state": "stopped"}
     except RingdicError as error:

@@ -11,10 +11,9 @@ from ringdic.arrays import Floats
 from ringdic.errors import InputError
 from ringdic.measure.table import Table
 from ringdic.results.results import Results
+from ringdic.settings import settings_of_run
 from ringdic.strain.deformation import Deformation
 from ringdic.strain.window import Gauge, StrainWindow, strain_window
-
-_RADIUS_PX = 20  # of a subset, where the results do not tell
 
 
 def window_study(results: Results, widths: Sequence[float], previous: bool = False) -> Table:
@@ -52,7 +51,7 @@ def gauge(results: Results, width: float) -> Gauge:
     step = (
         float(np.median(np.linalg.norm(np.diff(mesh.vertices[edges], axis=1)[:, 0], axis=1))) if len(edges) else np.nan
     )
-    radius = _RADIUS_PX if results.radius_px is None else results.radius_px
+    radius = settings_of_run(results.settings).correlation.radius_px
     return Gauge(float(width), step, (2 * radius + 1) / results.pixels_per_mm)
 
 

@@ -76,9 +76,9 @@ def _facts(
             "scale": scale,
             "field": (camera.size[0] / scale, camera.size[1] / scale),
         }
-    record = {} if reference is None else reference.record.get("cameras", {}).get(camera.id, {})
-    metadata = record.get("metadata") or {}
-    found |= {"exposure": record.get("exposure_us"), "gain": metadata.get("AnalogueGain")}
+    record = None if reference is None else reference.record.cameras.get(camera.id)
+    if record is not None:
+        found |= {"exposure": record.exposure_us, "gain": record.metadata.get("AnalogueGain")}
     if reference is not None and camera.id in reference.images and len(px) >= _FEWEST:
         found |= _of_images(camera, px, reference, at_rest)
     return CameraFacts(camera.id, camera.size, **found)  # type: ignore[arg-type]

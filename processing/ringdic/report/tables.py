@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,7 +14,7 @@ from ringdic.report.document import UNKNOWN, Document, figure
 from ringdic.report.hardware import CameraFacts
 from ringdic.results.results import Results
 from ringdic.session.folder import Capture, Session
-from ringdic.settings import Settings
+from ringdic.settings import settings_of_run
 
 _REASONS: dict[int, str] = {
     Status.GOOD: "measured",
@@ -56,7 +55,7 @@ def hardware(document: Document, session: Session, results: Results, cameras: Se
 def _hardware(session: Session, results: Results, cameras: Sequence[CameraFacts]) -> dict[str, Any]:
     angles = [row["angle_deg"] for row in results.summary.get("calibration", {}).get("pairs", [])]
     captures = [capture for capture in session.captures if capture.id in results.steps]
-    skew = [capture.record["skew_ns"] / 1e3 for capture in captures if capture.record.get("skew_ns") is not None]
+    skew = [capture.record.skew_ns / 1e3 for capture in captures if capture.record.skew_ns is not None]
     return {
         "Cameras": f"{len(cameras)} in a ring, {len(results.pairs)} pairs ({_pairs(results)})",
         "Camera model": None,
@@ -79,7 +78,7 @@ def _hardware(session: Session, results: Results, cameras: Sequence[CameraFacts]
 
 def analysis(document: Document, results: Results, version: str, floor: dict[str, str]) -> None:
     """Write the table of the analysis. floor : rows of the noise floors."""
-    settings = Settings.model_validate(tomllib.loads(results.settings))
+    settings = settings_of_run(results.settings)
     correlation, surface = settings.correlation, settings.surface
     alone, over = gauge(results, 0.0), gauge(results, results.window_mm)
     width = 2 * correlation.radius_px + 1
@@ -156,7 +155,7 @@ def calibration(document: Document, session: Session, results: Results) -> None:
 def _calibration(session: Session, results: Results) -> dict[str, Any]:
     """Method, lens, board and target of the calibration, and how well the control points are reconstructed."""
     summary, target, board = results.summary, session.rig.target, session.rig.board
-    settings = Settings.model_validate(tomllib.loads(results.settings)).calibration
+    settings = settings_of_run(results.settings).calibration
     methods = {"dlt": "direct linear transformation, each camera alone",
                "bundle": "all cameras, lenses and the target adjusted together (bundle), from the direct linear "
                "transformation"}  # fmt: skip
@@ -245,7 +244,7 @@ def _span(values: set[str]) -> str:
 
 
 def _interval(captures: Sequence[Capture]) -> str:
-    times = [capture.record.get("fire_at_ns") for capture in captures]
+    times = [capture.record.fire_at_ns for capture in captures]
     if len(times) < 2 or any(time is None for time in times):
         return ", times not recorded"
     apart = np.diff(np.array(times, dtype=float)) / 1e9
@@ -253,7 +252,7 @@ def _interval(captures: Sequence[Capture]) -> str:
 
 
 def _opened(capture: Capture | None) -> str:
-    text = "" if capture is None else str(capture.record.get("opened_at") or "")
+    text = "" if capture is None else capture.record.opened_at or ""
     return text[:19].replace("T", " ")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +12,7 @@ from ringdic.arrays import Floats, Indices, Pixels, Points
 from ringdic.geometry.camera import Camera
 from ringdic.mesh.mesh import Mesh
 from ringdic.results.fields import OPTIONAL_ARRAYS, StepFields, StepQuality, compute_fields
+from ringdic.settings import settings_of_run
 from ringdic.strain.deformation import Deformation, deformation
 from ringdic.strain.rigid_motion import RigidMotion, motion_to_reference
 from ringdic.strain.window import StrainWindow
@@ -117,12 +117,13 @@ class Results:
     @property
     def window_mm(self) -> float:
         """Width of the strain window in the run's settings; 0 for strain of the triangles alone."""
-        return float(tomllib.loads(self.settings).get("strain", {}).get("window_mm", 0.0))
+        return settings_of_run(self.settings).strain.window_mm
 
     @property
     def radius_px(self) -> int | None:
-        """Radius of the subsets in the run's settings; None where the settings have none."""
-        return tomllib.loads(self.settings).get("correlation", {}).get("radius_px")
+        """Radius of the subsets in the run's settings; None where the settings do not give it."""
+        group = settings_of_run(self.settings).correlation
+        return group.radius_px if "radius_px" in group.model_fields_set else None
 
     @property
     def pixels_per_mm(self) -> float:

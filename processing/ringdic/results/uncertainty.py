@@ -15,7 +15,6 @@ the reference one has the error δ₂. Any other error of that match shifts the 
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -30,6 +29,7 @@ from ringdic.calibration.parameters import PER_CAMERA
 from ringdic.geometry.camera import Camera
 from ringdic.results.results import Matches, Results
 from ringdic.results.series import InMemorySeries, join_steps
+from ringdic.settings import settings_of_run
 from ringdic.strain.deformation import Deformation
 from ringdic.uncertainty.calibration import (
     CameraCovariance,
@@ -163,15 +163,14 @@ class _NoiseUncertainty:
 
     def __init__(self, reference: Results, noise: Sequence[Floats]) -> None:
         self._noise_shares = [_share_of_noise(level) for level in noise]
-        group = tomllib.loads(reference.settings).get("correlation", {})
-        radius, order = int(group.get("radius_px", 20)), int(group.get("order", 1))
+        settings = settings_of_run(reference.settings).correlation
         cameras = {camera.id: camera for camera in reference.cameras}
         with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
             self._pairs = list(pool.map(partial(_Pair.of, reference, cameras), range(len(reference.matches))))
         px = np.full((2, len(reference.vertices_ref), 2), np.nan)
         for pair in self._pairs:
             px[:, pair.vertex[pair.rows]] = pair.px
-        correlation = corner_correlations(px, reference.faces, radius, order)
+        correlation = corner_correlations(px, reference.faces, settings.radius_px, settings.order)
         self._correlation = np.concatenate([correlation, correlation])
 
     def arrays(self, results: Results, step: int, deformed: Deformation) -> dict[str, Floats]:

@@ -1,4 +1,4 @@
-"""The session folder: the interface between capture and processing. Standard library only.
+"""The session folder: the interface between capture and processing.
 
 ::
 
@@ -6,8 +6,9 @@
       rig.toml                    the rig as used
       session.json                schema, session, rig, created, source (capture | import)
       captures/
-        0001-board/               NNNN-kind; kinds: board, target, specimen, static
-          capture.json            the record: per camera status, file, SHA-256, times, exposure, metadata
+        0001-board/               NNNN-kind, see `ringdic.session.names`
+          capture.json            the record, see `ringdic.session.records`: per camera status, file, SHA-256, times,
+                                  exposure, metadata
           201.pgm …               one image a camera, byte for byte as delivered
         0002-target/ …
         0003-specimen/ …          the first specimen capture is the reference, the others are the steps
@@ -24,40 +25,43 @@
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from shutil import rmtree
-from typing import Any
 from uuid import uuid4
 
 from ringdic.errors import InputError
+from ringdic.session.names import CAPTURE_KINDS, split_capture_id
+from ringdic.session.records import REMEDY, CaptureRecord, SessionError, read_capture_record, read_session_record
 from ringdic.session.rig import Rig, read_rig
 
-KINDS = ("board", "target", "specimen", "static")
-_MEND = "copy it back, or import the session again"
-_LIVE_KEPT = 5  # the operator may stay at one while newer ones come
-_CAPTURE_NAME = re.compile(r"(\d{4,})-(board|target|specimen|static)")
+_LIVE_KEPT = 5  # single steps that stay; the operator may look at one while newer ones come
 
 
 @dataclass(frozen=True)
 class Capture:
-    """One capture of a session. ``images`` maps camera ids to the image files that arrived."""
+    """One capture of a session.
+
+    id : name of its folder, of which `number` and `kind` are the parts. images : the image files that arrived, by
+    camera.
+    """
 
     id: str
     number: int
     kind: str
     folder: Path
     images: dict[str, Path]
-    record: dict[str, Any]
+    record: CaptureRecord
 
 
 @dataclass(frozen=True)
 class Session:
-    """A session folder, read. Captures are in order of their number."""
+    """Contents of a session folder: its name, its rig and its captures, in order of their number.
+
+    path : the folder.
+    """
 
     path: Path
     name: str
@@ -65,30 +69,33 @@ class Session:
     captures: tuple[Capture, ...]
 
     def of_kind(self, kind: str) -> tuple[Capture, ...]:
-        """The captures of one kind, in order."""
+        """The captures of a kind, in order. kind : one of `ringdic.session.names.CAPTURE_KINDS`."""
         return tuple(capture for capture in self.captures if capture.kind == kind)
 
     def mask(self, camera_id: str) -> Path | None:
-        """The region of interest given for a camera, if any."""
+        """Image file of the region of interest on a camera's reference image; None where none was drawn."""
         path = self.path / "mask" / f"{camera_id}.png"
         return path if path.is_file() else None
 
     def runs(self) -> tuple[Path, ...]:
-        """Finished processing runs, oldest first."""
+        """Folders of the finished processing runs, oldest first."""
         return runs(self.path)
 
 
 def open_session(path: Path) -> Session:
-    """The session of a folder; InputError says what is missing."""
+    """Read a session folder: its rig, its records, and where its images lie.
+
+    InputError says which file is missing or damaged.
+    """
     path = Path(path)
     _require_session(path)
-    header = _read_json(path / "session.json")
+    record = read_session_record(path / "session.json")
     captures = sorted(_captures(path / "captures"), key=lambda capture: capture.number)
-    return Session(path, str(header.get("session", path.name)), read_rig(path / "rig.toml"), tuple(captures))
+    return Session(path, record.session, read_rig(path / "rig.toml"), tuple(captures))
 
 
 def runs(path: Path) -> tuple[Path, ...]:
-    """Finished processing runs of a session folder, oldest first."""
+    """Folders of the finished processing runs of a session folder, oldest first."""
     results = Path(path) / "results"
     if not results.is_dir():
         return ()
@@ -96,9 +103,17 @@ def runs(path: Path) -> tuple[Path, ...]:
 
 
 def newest_results(path: Path, run: int | None = None) -> Path:
-    """The results file of the newest run, or of the run of a number.
+    """Path of the results file of a processing run.
 
-    InputError if the session has not been processed or has no such run.
+    Parameters
+    ----------
+    path : the session folder.
+    run : the run's number; None takes the newest.
+
+    Raises
+    ------
+    InputError
+        The session has not been processed or has no such run.
     """
     finished = runs(path)
     if run is not None and finished:
@@ -113,19 +128,27 @@ def newest_results(path: Path, run: int | None = None) -> Path:
 
 
 def live_results(path: Path) -> tuple[Path, ...]:
-    """The folders of single steps that were processed at once, oldest first; each is named by its capture."""
+    """Folders of the results of single steps that were processed at once, oldest first.
+
+    Each is named by the step's capture. path : the session folder.
+    """
     live = Path(path) / "live"
     if not live.is_dir():
         return ()
-    found = [folder for folder in live.iterdir() if _CAPTURE_NAME.fullmatch(folder.name)]
-    return tuple(sorted(found, key=lambda folder: int(folder.name.partition("-")[0])))
+    numbered = [(parts[0], folder) for folder in live.iterdir() if (parts := _capture_of(folder))]
+    return tuple(folder for _, folder in sorted(numbered))
 
 
 @contextmanager
 def new_live(path: Path, capture_id: str) -> Iterator[Path]:
-    """A folder to write a single step's results into; it takes its place when everything is written.
+    """Make a folder for the results of a single step, which takes its place once everything is written into it.
 
-    Older ones are taken away, but for the last few: one may be being looked at.
+    Results of older steps are removed, except for the newest few. A step that fails leaves nothing behind.
+
+    Parameters
+    ----------
+    path : the session folder.
+    capture_id : the step's capture.
     """
     live = Path(path) / "live"
     live.mkdir(exist_ok=True)
@@ -146,7 +169,7 @@ def new_live(path: Path, capture_id: str) -> Iterator[Path]:
 
 @dataclass
 class NewRun:
-    """A run being written. ``folder`` is where to write now; ``final`` where it lies once it is whole."""
+    """A processing run that is being written. folder : where to write. final : where it lies once it is whole."""
 
     folder: Path
     final: Path | None = None
@@ -154,9 +177,9 @@ class NewRun:
 
 @contextmanager
 def new_run(path: Path) -> Iterator[NewRun]:
-    """A folder to write a run into; it gets its number when everything is written, and never replaces another.
+    """Make a folder for a processing run, which gets its number once everything is written into it.
 
-    A run that fails leaves nothing behind.
+    It never replaces another run; a run that fails leaves nothing behind. path : the session folder.
     """
     results = Path(path) / "results"
     results.mkdir(exist_ok=True)
@@ -191,31 +214,25 @@ def _require_session(path: Path) -> None:
 
 
 def _captures(folder: Path) -> Iterator[Capture]:
+    """The captures in a folder, in no order. SessionError where an image that a record names is not there."""
     if not folder.is_dir():
         return
     for path in folder.iterdir():
-        match = _CAPTURE_NAME.fullmatch(path.name)
-        if not match or not (path / "capture.json").is_file():
+        parts = _capture_of(path)
+        if parts is None or not (path / "capture.json").is_file():
             continue
-        record = _read_json(path / "capture.json")
-        frames = record.get("cameras", {})
-        if not isinstance(frames, dict) or not all(isinstance(frame, dict) for frame in frames.values()):
-            raise InputError(f"{path / 'capture.json'}: 'cameras' must have one record a camera; {_MEND}")
-        images = {camera_id: path / frame["file"] for camera_id, frame in frames.items() if frame.get("file")}
-        for camera_id, image in images.items():
+        record = read_capture_record(path / "capture.json")
+        images = {camera: path / entry.file for camera, entry in record.cameras.items() if entry.file}
+        for camera, image in images.items():
             if not image.is_file():
-                raise InputError(
-                    f"{image}: the record of {path.name} names this image of camera {camera_id}, but it is not there; "
-                    f"{_MEND}"
+                raise SessionError(
+                    f"{image}: the record of {path.name} names this image of camera {camera}, but it is not there; "
+                    f"{REMEDY}"
                 )
-        yield Capture(path.name, int(match[1]), match[2], path, images, record)
+        yield Capture(path.name, *parts, path, images, record)
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error}); {_MEND}") from error
-    if not isinstance(value, dict):
-        raise InputError(f"{path}: not a record of a session; {_MEND}")
-    return value
+def _capture_of(folder: Path) -> tuple[int, str] | None:
+    """Number and kind of the capture that a folder is named by; None where it is named otherwise."""
+    parts = split_capture_id(folder.name)
+    return parts if parts is not None and parts[1] in CAPTURE_KINDS else None

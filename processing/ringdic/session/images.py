@@ -1,4 +1,4 @@
-"""Image files decoded to grey levels, and masks. A damaged file is refused, never half read."""
+"""Image files and masks decoded to grey levels and regions. A damaged file is refused, never half read."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ringdic.arrays import Mask
 from ringdic.errors import InputError
 
-# What OpenCV finds wrong with a file is said in a sentence that names the file; its own lines do not.
+# OpenCV would print lines about a damaged file that do not name it; an InputError does.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 # Grey = 0.298936 R + 0.587043 G + 0.114021 B (ITU-R BT.601), in millionths: exact in whole numbers.
@@ -26,10 +26,18 @@ _PNG_END = b"IEND\xaeB`\x82"
 
 
 def read_gray(path: Path) -> NDArray:
-    """Grey levels (height, width) of a JPEG, PNG, PGM or TIFF file, 8 or 16 bits as stored.
+    """Read the grey levels of a JPEG, PNG, PGM or TIFF file.
 
-    Colour becomes round(0.298936 R + 0.587043 G + 0.114021 B). InputError names a file that is missing,
-    truncated or no image.
+    Colour becomes round(0.298936 R + 0.587043 G + 0.114021 B), the luma of ITU-R BT.601.
+
+    Returns
+    -------
+    image : (height, width) uint8 or uint16, grey levels as stored.
+
+    Raises
+    ------
+    InputError
+        The file is missing, truncated or no image; the sentence names it.
     """
     path = Path(path)
     try:
@@ -52,7 +60,11 @@ def read_gray(path: Path) -> NDArray:
 
 
 def gray(image: NDArray) -> NDArray:
-    """Grey levels (height, width) of a colour image (height, width, 3 or 4) in blue-green-red order."""
+    """Grey levels of a colour image by the luma of ITU-R BT.601.
+
+    image : (height, width, 1, 3 or 4) uint8 or uint16, levels of blue, green, red and opacity, or grey alone.
+    Returns (height, width) grey levels of the same type.
+    """
     if image.shape[2] == 1:
         return image[:, :, 0]
     levels = np.empty(image.shape[:2], image.dtype)
@@ -62,6 +74,7 @@ def gray(image: NDArray) -> NDArray:
 
 
 def _weighed(image: NDArray) -> NDArray:
+    """Weighted sum of the colours, rounded, as whole numbers of twice the size."""
     wide = np.dtype(np.uint32 if image.dtype == np.uint8 else np.uint64)
     total = np.full(image.shape[:2], _MILLION // 2, wide)
     for channel, weight in enumerate((_BLUE, _GREEN, _RED)):
@@ -71,9 +84,21 @@ def _weighed(image: NDArray) -> NDArray:
 
 
 def read_mask(path: Path, shape: tuple[int, int]) -> Mask:
-    """The region of interest (height, width), true where the mask image is not black.
+    """Read a region of interest from a mask image.
 
-    InputError if the size differs from ``shape`` or nothing is marked.
+    Parameters
+    ----------
+    path : an image that is not black inside the region.
+    shape : (height, width) px of the image that the region lies in.
+
+    Returns
+    -------
+    mask : (height, width) bool, true inside.
+
+    Raises
+    ------
+    InputError
+        The mask has another size or marks no pixel.
     """
     mask = read_gray(path) > 0
     if mask.shape != tuple(shape):
@@ -87,7 +112,7 @@ def read_mask(path: Path, shape: tuple[int, int]) -> Mask:
 
 
 def _is_whole(data: bytes) -> bool:
-    """False where the file's own structure shows that its end is missing."""
+    """Whether the file's end is there, as far as the structure of its format shows."""
     if data.startswith(b"\x89PNG"):
         return _PNG_END in data
     if data.startswith(b"\xff\xd8"):
@@ -96,13 +121,13 @@ def _is_whole(data: bytes) -> bool:
 
 
 def _jpeg_has_end(data: bytes) -> bool:
-    """Whether the segments lead to an end-of-image marker. What may follow it (raw sensor data) does not matter."""
+    """Whether the segments of a JPEG file lead to its end-of-image marker; raw sensor data may follow it."""
     at = 2
     while True:
-        found = _JPEG_MARKER.search(data, at)
-        if found is None:
+        match = _JPEG_MARKER.search(data, at)
+        if match is None:
             return False
-        marker, at = found[1][0], found.end()
+        marker, at = match[1][0], match.end()
         if marker == 0xD9:
             return True
         if marker == 0x01:

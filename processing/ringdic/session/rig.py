@@ -1,44 +1,78 @@
-"""The rig as the laboratory describes it: ``rig.toml`` read, checked and frozen. Standard library only."""
+"""The rig as the laboratory describes it: ``rig.toml`` read, checked and frozen."""
 
 from __future__ import annotations
 
 import itertools
 import math
 import tomllib
-from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Field, Strict, StrictFloat, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 
 from ringdic.errors import InputError
+from ringdic.session.names import is_file_name
+from ringdic.settings import TABLE, faults
 
-T = TypeVar("T")
+
+def _usable_id(camera_id: str) -> str:
+    if not is_file_name(camera_id):
+        raise ValueError(f"{camera_id!r} is not usable: images are named by it; use letters and digits")
+    return camera_id
 
 
-@dataclass(frozen=True)
+def _two_numbers(value: Any) -> Any:
+    if value is not None and not (isinstance(value, list | tuple) and len(value) == 2):
+        raise ValueError(f"must be a list of 2 numbers, not {value!r}")
+    return value
+
+
+def _list_of_cameras(value: Any) -> Any:
+    if not isinstance(value, list | tuple):
+        raise ValueError(f"must be one table a camera, each under two pairs of brackets, not {value!r}")
+    return value
+
+
+def _list_of_pairs(value: Any) -> Any:
+    if not isinstance(value, list | tuple):
+        raise ValueError(f"must be a list of pairs of camera ids, not {value!r}")
+    for pair in value:
+        if not isinstance(pair, list | tuple) or len(pair) != 2 or pair[0] == pair[1]:
+            raise ValueError(f"has {pair!r}, which is not a pair of cameras")
+    return value
+
+
+Positive = Annotated[float, Strict(), Field(gt=0)]
+Count = Annotated[int, Strict(), Field(ge=2)]
+Squares = Annotated[int, Strict(), Field(ge=4)]
+Pairs = tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, config=TABLE)
 class Target:
-    """The calibration object: a cylinder with dots on a grid. Lengths mm; column spacing along the arc."""
+    """The calibration object: a cylinder with dots on a grid, the axis along z.
 
-    kind: str
-    radius_mm: float
-    rows: int
-    row_spacing_mm: float
-    first_row_z_mm: float
-    columns: int
-    column_spacing_mm: float
-    dot_size_mm: float
-    dot_shape: str = "square"
+    radius_mm : of the cylinder. rows, columns : of the grid. row_spacing_mm : along z. first_row_z_mm : z of the
+    lowest row. column_spacing_mm : along the arc. dot_size_mm : edge or diameter of a dot.
+    """
+
+    kind: Literal["dot-cylinder"]
+    radius_mm: Positive
+    rows: Count
+    row_spacing_mm: Positive
+    first_row_z_mm: StrictFloat
+    columns: Count
+    column_spacing_mm: Positive
+    dot_size_mm: Positive
+    dot_shape: Literal["square", "circle"] = "square"
 
     def __post_init__(self) -> None:
-        _require(self.kind == "dot-cylinder", f"[target] kind '{self.kind}' is not known; use 'dot-cylinder'")
-        _require(self.dot_shape in ("square", "circle"), "[target] dot_shape must be 'square' or 'circle'")
-        for name in ("radius_mm", "row_spacing_mm", "column_spacing_mm", "dot_size_mm"):
-            _require(getattr(self, name) > 0, f"[target] {name} must be positive")
-        _require(self.rows >= 2 and self.columns >= 2, "[target] needs at least 2 rows and 2 columns")
-        used = (self.columns - 1) * self.column_spacing_mm + self.dot_size_mm
-        _require(
-            used < 2 * math.pi * self.radius_mm,
-            f"[target] {self.columns} columns at {self.column_spacing_mm} mm do not fit round the radius",
-        )
+        if (self.columns - 1) * self.column_spacing_mm + self.dot_size_mm >= 2 * math.pi * self.radius_mm:
+            raise ValueError(
+                f"{self.columns} columns at {self.column_spacing_mm} mm do not fit round the radius of "
+                f"{self.radius_mm} mm"
+            )
 
     @property
     def column_angle(self) -> float:
@@ -46,22 +80,13 @@ class Target:
         return self.column_spacing_mm / self.radius_mm
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=TABLE)
 class Board:
-    """The checkerboard of the intrinsics: squares (across, along), edge in mm."""
+    """The checkerboard that the lenses are measured on. squares : (across, along). square_mm : their edge."""
 
-    kind: str
-    squares: tuple[int, int]
-    square_mm: float
-
-    def __post_init__(self) -> None:
-        _require(self.kind == "checkerboard", f"[board] kind '{self.kind}' is not known; use 'checkerboard'")
-        _require(
-            len(self.squares) == 2 and min(self.squares) >= 4,
-            "[board] squares must be two numbers, 4 or more",
-        )
-        object.__setattr__(self, "squares", (int(self.squares[0]), int(self.squares[1])))
-        _require(self.square_mm > 0, "[board] square_mm must be positive")
+    kind: Literal["checkerboard"]
+    squares: Annotated[tuple[Squares, Squares], BeforeValidator(_two_numbers)]
+    square_mm: Positive
 
     @property
     def inner_corners(self) -> tuple[int, int]:
@@ -69,56 +94,110 @@ class Board:
         return self.squares[0] - 1, self.squares[1] - 1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=TABLE)
 class RigCamera:
-    """One camera of the ring as set up by hand: nominal azimuth good to ± 5°."""
+    """One camera of the ring as it was set up by hand.
 
-    id: str
-    azimuth_deg: float
-    height_mm: float | None = None
-    distance_mm: float | None = None
-    rotation_deg: float = 0.0
+    id : names its images and its node. azimuth_deg : about z, nominal, good to ± 5°. height_mm, distance_mm : of the
+    camera over z = 0 and from the axis. rotation_deg : of the image about the line of sight. intrinsics : file of a
+    lens that was measured before.
+    """
+
+    id: Annotated[str, AfterValidator(_usable_id)]
+    azimuth_deg: StrictFloat
+    height_mm: StrictFloat | None = None
+    distance_mm: StrictFloat | None = None
+    rotation_deg: StrictFloat = 0.0
     intrinsics: str | None = None
 
-    def __post_init__(self) -> None:
-        _require(
-            bool(self.id) and "/" not in self.id and self.id not in (".", ".."),
-            f"camera id '{self.id}' is not usable",
-        )
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=TABLE)
 class CaptureSettings:
-    """What the cameras are told: exposure in µs, gains, frame period and the tolerated skew."""
+    """Settings of the cameras while they capture.
 
-    exposure_us: float | None = None
-    gain: float | None = None
-    colour_gains: tuple[float, float] | None = None
-    period_us: float | None = None
-    tolerance_us: float | None = None
+    exposure_us : µs. gain : analogue. colour_gains : (red, blue). period_us : of the frames, µs. tolerance_us : skew
+    between the cameras that is not flagged, µs. None leaves a setting to the camera or the controller.
+    """
+
+    exposure_us: StrictFloat | None = None
+    gain: StrictFloat | None = None
+    colour_gains: Annotated[tuple[StrictFloat, StrictFloat] | None, BeforeValidator(_two_numbers)] = None
+    period_us: StrictFloat | None = None
+    tolerance_us: StrictFloat | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=TABLE)
 class Rig:
-    """Everything ``rig.toml`` says. ``pairs`` are camera ids, reference camera first."""
+    """A rig as ``rig.toml`` describes it. pairs : ids of two cameras each, the reference camera first."""
 
     name: str
     target: Target
     board: Board
     cameras: tuple[RigCamera, ...]
-    pairs: tuple[tuple[str, str], ...]
+    pairs: Pairs
     capture: CaptureSettings = CaptureSettings()
 
     def camera(self, camera_id: str) -> RigCamera:
-        """The camera of this id; KeyError if the rig has none."""
+        """The camera of an id; KeyError if the rig has none."""
         for camera in self.cameras:
             if camera.id == camera_id:
                 return camera
         raise KeyError(camera_id)
 
 
-def adjacent_pairs(cameras: tuple[RigCamera, ...]) -> tuple[tuple[str, str], ...]:
-    """Every adjacent pair in ring order, closed when the cameras go all the way round (largest gap ≤ 90°)."""
+@dataclass(frozen=True, config=TABLE)
+class _Name:
+    """The table ``[rig]``."""
+
+    name: str
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise ValueError("name is empty")
+
+
+@dataclass(frozen=True, config=TABLE)
+class _ListedPairs:
+    """The table ``[pairs]``."""
+
+    pairs: Annotated[Pairs, BeforeValidator(_list_of_pairs)] = ()
+
+    def __post_init__(self) -> None:
+        if not self.pairs:
+            raise ValueError("pairs is empty; leave the table out to use every adjacent pair")
+
+
+@dataclass(frozen=True, config=TABLE)
+class _RigFile:
+    """The tables of a ``rig.toml``."""
+
+    rig: _Name
+    target: Target
+    board: Board
+    cameras: Annotated[tuple[RigCamera, ...], BeforeValidator(_list_of_cameras)]
+    capture: CaptureSettings = CaptureSettings()
+    pairs: _ListedPairs | None = None
+
+    def __post_init__(self) -> None:
+        ids = [camera.id for camera in self.cameras]
+        if len(ids) < 2:
+            raise ValueError("[[cameras]] needs at least two cameras")
+        for camera_id in ids:
+            if ids.count(camera_id) > 1:
+                raise ValueError(f"camera id '{camera_id}' occurs more than once")
+        for camera_id in itertools.chain.from_iterable(self.pairs.pairs if self.pairs else ()):
+            if camera_id not in ids:
+                raise ValueError(f"[pairs] names camera '{camera_id}', which [[cameras]] does not have")
+
+
+_RIG_FILE = TypeAdapter(_RigFile)
+
+
+def adjacent_pairs(cameras: tuple[RigCamera, ...]) -> Pairs:
+    """Every pair of neighbouring cameras, in the order in which they are listed.
+
+    The last camera and the first are a pair too where they are at most 90° apart: the ring is closed.
+    """
     ids = [camera.id for camera in cameras]
     pairs = list(itertools.pairwise(ids))
     if len(ids) > 2 and abs(_wrapped(cameras[0].azimuth_deg - cameras[-1].azimuth_deg)) <= 90.0:
@@ -127,7 +206,7 @@ def adjacent_pairs(cameras: tuple[RigCamera, ...]) -> tuple[tuple[str, str], ...
 
 
 def read_rig(path: Path) -> Rig:
-    """The rig described by a TOML file; InputError names the file and the key at fault."""
+    """Read the rig that a TOML file describes. InputError names the file and the key at fault."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; it must describe the target, the board and the cameras")
@@ -140,102 +219,26 @@ def read_rig(path: Path) -> Rig:
 
 
 def parse_rig(text: str) -> Rig:
-    """The rig described by the text of a ``rig.toml``."""
+    """The rig that the text of a ``rig.toml`` describes.
+
+    Without ``[pairs]``, every adjacent pair of cameras is one.
+
+    Raises
+    ------
+    InputError
+        A key is missing, unknown or has a value that is not allowed; the sentence names it.
+    tomllib.TOMLDecodeError
+        The text is not TOML.
+    """
     tables = tomllib.loads(text)
-    _refuse_unknown(tables, {"rig", "target", "board", "cameras", "capture", "pairs"}, "")
-    for name in ("rig", "target", "board", "cameras"):
-        _require(name in tables, f"[{name}] is missing")
-    rig = _table(tables["rig"], "[rig]")
-    _refuse_unknown(rig, {"name"}, "[rig] ")
-    _require(bool(rig.get("name")), "[rig] name is missing")
-    entries = tables["cameras"]
-    _require(isinstance(entries, list), "cameras must be one [[cameras]] table a camera, with two pairs of brackets")
-    cameras = tuple(_build(RigCamera, entry, f"[[cameras]] number {i + 1} ") for i, entry in enumerate(entries))
-    _require(len(cameras) >= 2, "[[cameras]] needs at least two cameras")
-    ids = [camera.id for camera in cameras]
-    for camera_id in ids:
-        _require(ids.count(camera_id) == 1, f"camera id '{camera_id}' occurs more than once")
-    return Rig(
-        name=_typed(rig["name"], "str", "[rig] name"),
-        target=_build(Target, tables["target"], "[target] "),
-        board=_build(Board, tables["board"], "[board] "),
-        cameras=cameras,
-        pairs=_pairs(tables.get("pairs"), cameras),
-        capture=_build(CaptureSettings, tables.get("capture", {}), "[capture] "),
-    )
-
-
-def _pairs(table: Any, cameras: tuple[RigCamera, ...]) -> tuple[tuple[str, str], ...]:
-    if table is None:
-        return adjacent_pairs(cameras)
-    table = _table(table, "[pairs]")
-    _refuse_unknown(table, {"pairs"}, "[pairs] ")
-    listed = table.get("pairs", [])
-    _require(isinstance(listed, list), f"[pairs] pairs must be a list of pairs of camera ids, not {listed!r}")
-    ids = [camera.id for camera in cameras]
-    pairs = []
-    for pair in listed:
-        two = isinstance(pair, list) and len(pair) == 2 and pair[0] != pair[1]
-        _require(two, f"[pairs] {pair!r} is not a pair of cameras")
-        for camera_id in pair:
-            _require(camera_id in ids, f"[pairs] names camera '{camera_id}', which [[cameras]] does not have")
-        pairs.append((pair[0], pair[1]))
-    _require(bool(pairs), "[pairs] pairs is empty; leave the table out to use every adjacent pair")
-    return tuple(pairs)
-
-
-def _build(kind: type[T], table: Any, where: str) -> T:
-    """One frozen dataclass from one TOML table, with unknown, missing and mistyped keys named."""
-    known = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
-    table = _table(table, where.strip())
-    _refuse_unknown(table, set(known), where)
-    values: dict[str, Any] = {}
-    for name, field in known.items():
-        if name not in table:
-            _require(field.default is not MISSING, f"{where}{name} is missing")
-            continue
-        values[name] = _typed(table[name], str(field.type), where + name)
-    return kind(**values)
-
-
-_WANTED = {"float": "a number", "int": "a whole number", "str": "text in quotes"}
-
-
-def _typed(value: Any, annotation: str, where: str) -> Any:
-    """A TOML value as the field's annotation wants it: a number, a whole number, text, or two numbers."""
-    wanted = annotation.split(" | ")[0]
-    if wanted.startswith("tuple["):
-        inner = wanted.removeprefix("tuple[").removesuffix("]").split(", ")
-        _require(
-            isinstance(value, list) and len(value) == len(inner),
-            f"{where} must be a list of {len(inner)} numbers, not {value!r}",
-        )
-        return tuple(_typed(each, kind, where) for each, kind in zip(value, inner, strict=True))
-    if wanted == "str":
-        written = f' (write "{value}")' if isinstance(value, int | float) else ""
-        _require(isinstance(value, str), f"{where} must be {_WANTED[wanted]}, not {value!r}{written}")
-        return value
-    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    _require(
-        number and (wanted == "float" or isinstance(value, int)), f"{where} must be {_WANTED[wanted]}, not {value!r}"
-    )
-    return float(value) if wanted == "float" else value
-
-
-def _table(value: Any, header: str) -> dict[str, Any]:
-    _require(isinstance(value, dict), f"{header} must be a table, not {value!r}")
-    return dict(value)
-
-
-def _refuse_unknown(table: dict[str, Any], known: set[str], where: str) -> None:
-    for key in table:
-        _require(key in known, f"{where}unknown key '{key}'; known are {', '.join(sorted(known))}")
-
-
-def _require(condition: bool, sentence: str) -> None:
-    if not condition:
-        raise InputError(sentence)
+    try:
+        file = _RIG_FILE.validate_python(tables)
+    except ValidationError as error:
+        raise InputError(faults(error, _RigFile)) from error
+    pairs = file.pairs.pairs if file.pairs else adjacent_pairs(file.cameras)
+    return Rig(file.rig.name, file.target, file.board, file.cameras, pairs, file.capture)
 
 
 def _wrapped(angle_deg: float) -> float:
+    """An angle in [-180°, 180°)."""
     return (angle_deg + 180.0) % 360.0 - 180.0

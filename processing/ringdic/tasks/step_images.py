@@ -40,7 +40,7 @@ class Digests:
         if path is None:
             return None
         if path not in self.known:
-            self.known[path] = file_digest(path, capture.record.get("cameras", {}).get(id_))
+            self.known[path] = file_digest(path, capture.record.cameras.get(id_))
         return self.known[path]
 
     def mask(self, id_: str) -> str | None:

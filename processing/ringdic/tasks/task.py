@@ -18,6 +18,7 @@ from pydantic import BaseModel
 
 from ringdic.compiled import source_digest
 from ringdic.errors import ComputationError, InputError
+from ringdic.session.records import CameraRecord
 
 Arrays = Mapping[str, NDArray[Any]]
 #: Called when a task has ended, with the task, its report, and how many tasks of how many have ended.
@@ -132,10 +133,10 @@ def code_stamp() -> str:
     return source_digest()
 
 
-def file_digest(path: Path, record: Mapping[str, Any] | None = None) -> str:
+def file_digest(path: Path, record: CameraRecord | None = None) -> str:
     """The SHA-256 of a file. record : of the file in its capture; its digest is used where the size in bytes agrees."""
-    if record and record.get("sha256") and record.get("bytes") == path.stat().st_size:
-        return str(record["sha256"])
+    if record is not None and record.sha256 and record.bytes == path.stat().st_size:
+        return record.sha256
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

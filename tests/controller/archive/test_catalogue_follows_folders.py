@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from ringdic.session.records import CaptureRecord
 from ringdic_controller.archive.catalogue import Catalogue
 
 
@@ -23,8 +24,8 @@ def a_session(root: Path, name: str, kinds: tuple[str, ...], created: str = "202
 def a_capture(folder: Path, number: int, kind: str) -> None:
     name = f"{number:04d}-{kind}"
     (folder / "captures" / name).mkdir()
-    record = {"capture_id": name, "number": number, "kind": kind, "cameras": {}}
-    (folder / "captures" / name / "capture.json").write_text(json.dumps(record))
+    record = CaptureRecord(name, number, kind, folder.name, "closed")
+    (folder / "captures" / name / "capture.json").write_text(json.dumps(record.to_json()))
 
 
 def test_sessions_are_listed_newest_first_with_their_counts(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from ringdic_controller.archive.writer import Archive
+from ringdic.session.writer import Archive
 from ringdic_controller.jobs.children import Order, WarmChild, message_of, serving_command
 from ringdic_controller.jobs.jobs import Job, Jobs
 

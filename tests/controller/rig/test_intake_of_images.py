@@ -6,7 +6,7 @@ import hashlib
 from dataclasses import replace
 
 import pytest
-from ringdic_controller.archive.writer import Archive, verify
+from ringdic.session.writer import Archive, verify
 from ringdic_controller.rig.intake import Intake
 from ringdic_node.wire import CaptureKey, Failure, Manifest
 
@@ -98,7 +98,7 @@ def test_what_a_node_still_holds_is_wanted_only_if_the_closed_capture_lacks_it(r
     recorded.acks.clear()
     assert not recorded.intake.wants(manifest_of())
     assert recorded.acks == [("201", "archived")], "the acknowledgement had been lost"
-    assert recorded.capture.record()["cameras"]["201"]["status"] == "late"
+    assert recorded.capture.record().cameras["201"].status == "late"
 
 
 def test_a_full_inbox_drops_and_a_worked_off_one_takes_again(tmp_path):
@@ -134,7 +134,7 @@ def test_images_archived_side_by_side_are_all_in_the_record(tmp_path):
     recorded.intake.start()
     recorded.intake.stop(timeout=30)
     assert sorted(recorded.acks) == [(camera, "archived") for camera in cameras]
-    assert {entry["status"] for entry in capture.record()["cameras"].values()} == {"ok"}
+    assert {entry.status for entry in capture.record().cameras.values()} == {"ok"}
     assert verify(recorded.session.path) == []
 
 
@@ -164,6 +164,6 @@ def test_a_nodes_own_reason_replaces_a_general_one(recorded):
     key = CaptureKey("s", "0001-board", 50)
     recorded.intake.note_failure(Failure("201", key, "the camera timed out"))
     recorded.intake.note_failure(Failure("202", replace(key, fire_at_ns=51), "of another session"))
-    cameras = recorded.capture.record()["cameras"]
-    assert cameras["201"]["reason"] == "the camera timed out"
-    assert cameras["202"]["reason"] == "no image arrived"
+    cameras = recorded.capture.record().cameras
+    assert cameras["201"].reason == "the camera timed out"
+    assert cameras["202"].reason == "no image arrived"

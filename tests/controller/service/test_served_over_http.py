@@ -17,7 +17,7 @@ import httpx
 import pytest
 import uvicorn
 from ringdic.errors import InputError
-from ringdic_controller.archive.writer import Archive
+from ringdic.session.writer import Archive
 from ringdic_controller.service.app import create_app
 from ringdic_controller.service.config import ControllerConfig
 from ringdic_controller.service.desk import Desk

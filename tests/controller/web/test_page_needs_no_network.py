@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import ringdic_controller
+from ringdic.session.names import CAPTURE_KINDS
 
 WEB = Path(ringdic_controller.__file__).parent / "web"
 
@@ -22,3 +23,11 @@ def test_the_lock_file_pins_every_package_by_checksum_and_names_no_host() -> Non
 def test_the_sources_of_the_page_name_no_other_host(file: Path) -> None:
     addresses = re.findall(r"https?://[\w./]+", file.read_text(encoding="utf-8"))
     assert set(addresses) <= {"http://www.w3.org/2000/svg"}
+
+
+def test_the_page_has_a_button_for_each_kind_of_capture() -> None:
+    listed = re.search(r"const KINDS = (\[.*?\]);", (WEB / "src" / "captures.js").read_text(encoding="utf-8"))
+    assert listed is not None
+    assert tuple(json.loads(listed[1])) == CAPTURE_KINDS
+    buttons = re.findall(r'id="capture-\w+" data-kind="(\w+)"', (WEB / "index.html").read_text(encoding="utf-8"))
+    assert tuple(buttons) == CAPTURE_KINDS

@@ -19,6 +19,7 @@ from ringdic.errors import InputError
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.geometry.triangulation import reprojection_residuals, triangulate
 from ringdic.session.folder import Capture, Session
+from ringdic.session.records import CaptureRecord
 from ringdic.session.rig import Rig, RigCamera, read_rig
 from ringdic.settings import CalibrationGroup
 from scipy.optimize import least_squares
@@ -228,19 +229,17 @@ def session(folder, rig, tmp_path) -> Session:
     """Three neighbours of the rendered ring."""
     names = ("cam_12", "cam_01", "cam_02")
     some = replace(rig, cameras=tuple(rig.camera(name) for name in names), pairs=(names[:2], names[1:]))
-    boards = tuple(
-        Capture(
-            f"{number + 1:04d}-board",
-            number + 1,
-            "board",
-            tmp_path,
-            {name: folder / "limb" / "board" / name / f"{number:03d}.jpg" for name in names},
-            {},
-        )
-        for number in range(5)
-    )
-    images = {name: folder / "limb" / "target" / f"{name}.jpg" for name in names}
-    return Session(tmp_path, "three", some, (*boards, Capture("0006-target", 6, "target", tmp_path, images, {})))
+
+    def capture(number: int, kind: str, images: dict[str, Path]) -> Capture:
+        record = CaptureRecord(f"{number:04d}-{kind}", number, kind, "three", "closed")
+        return Capture(record.capture_id, number, kind, tmp_path, images, record)
+
+    boards = [
+        capture(k + 1, "board", {name: folder / "limb" / "board" / name / f"{k:03d}.jpg" for name in names})
+        for k in range(5)
+    ]
+    target = capture(6, "target", {name: folder / "limb" / "target" / f"{name}.jpg" for name in names})
+    return Session(tmp_path, "three", some, (*boards, target))
 
 
 def test_a_session_is_calibrated_as_its_settings_say_and_once(session, rig, ways) -> None:

@@ -8,8 +8,8 @@ import os
 
 import pytest
 from ringdic.errors import InputError
-from ringdic_controller.archive.writer import Archive, SessionError, verify
-from ringdic_node.wire import CaptureKey, Manifest
+from ringdic.session.records import ImageDescription, SessionError
+from ringdic.session.writer import Archive, verify
 
 SECOND = 1_000_000_000
 RIG = '[rig]\nname = "ring"\n[[cameras]]\nid = "201"\nazimuth_deg = 0\n[[cameras]]\nid = "202"\nazimuth_deg = 30\n'
@@ -26,10 +26,8 @@ def capture(archive):
     return session.begin_capture("board", ["201", "202"], fire_at_ns=50, tolerance_ns=1000)
 
 
-def manifest_of(image: bytes, camera: str = "201", time_ns: int = 60) -> Manifest:
-    key = CaptureKey("first", "0001-board", 50)
-    sha256 = hashlib.sha256(image).hexdigest()
-    return Manifest(camera, key, "board", sha256, len(image), 4, 3, time_ns, 5000.0, metadata={"Lux": 7})
+def described(image: bytes, time_ns: int = 60) -> ImageDescription:
+    return ImageDescription(hashlib.sha256(image).hexdigest(), 4, 3, time_ns, 5000.0, {"Lux": 7})
 
 
 def test_a_session_begins_with_its_rig_and_its_header(archive):
@@ -71,15 +69,15 @@ def test_captures_are_numbered_through_the_session(archive):
     made = [session.begin_capture(kind, ["201"]).capture_id for kind in ("board", "board", "target", "specimen")]
     assert made == ["0001-board", "0002-board", "0003-target", "0004-specimen"]
     assert session.count("board") == 2
-    assert [record["capture_id"] for record in session.captures()] == made
+    assert [record.capture_id for record in session.captures()] == made
     with pytest.raises(InputError, match="film"):
         session.begin_capture("film", ["201"])
 
 
 def test_an_image_is_stored_as_it_came_and_the_record_says_so(capture):
-    assert capture.store("201", manifest_of(b"pixels"), b"pixels").verdict == "archived"
+    assert capture.store("201", described(b"pixels"), b"pixels").verdict == "archived"
     assert (capture.path / "201.pgm").read_bytes() == b"pixels"
-    entry = capture.record()["cameras"]["201"]
+    entry = json.loads((capture.path / "capture.json").read_text())["cameras"]["201"]
     assert entry == {
         "status": "ok",
         "reason": None,
@@ -93,29 +91,29 @@ def test_an_image_is_stored_as_it_came_and_the_record_says_so(capture):
         "metadata": {"Lux": 7},
         "original": None,
     }
-    assert capture.record()["cameras"]["202"]["status"] == "pending"
+    assert capture.record().cameras["202"].status == "pending"
 
 
 def test_a_repeat_changes_nothing(capture):
-    capture.store("201", manifest_of(b"pixels"), b"pixels")
+    capture.store("201", described(b"pixels"), b"pixels")
     before = (capture.path / "capture.json").read_bytes()
-    assert capture.store("201", manifest_of(b"pixels"), b"pixels").verdict == "repeat"
+    assert capture.store("201", described(b"pixels"), b"pixels").verdict == "repeat"
     assert (capture.path / "capture.json").read_bytes() == before
     assert sorted(p.name for p in capture.path.iterdir()) == ["201.pgm", "capture.json"]
 
 
 def test_another_image_is_kept_aside_and_the_first_stays(capture):
-    capture.store("201", manifest_of(b"pixels"), b"pixels")
+    capture.store("201", described(b"pixels"), b"pixels")
     for _ in range(2):
-        assert capture.store("201", manifest_of(b"other"), b"other").file == "201.conflict-1.pgm"
-    assert capture.store("201", manifest_of(b"third"), b"third").file == "201.conflict-2.pgm"
+        assert capture.store("201", described(b"other"), b"other").file == "201.conflict-1.pgm"
+    assert capture.store("201", described(b"third"), b"third").file == "201.conflict-2.pgm"
     assert (capture.path / "201.pgm").read_bytes() == b"pixels"
-    assert capture.record()["cameras"]["201"]["sha256"] == hashlib.sha256(b"pixels").hexdigest()
+    assert capture.record().cameras["201"].sha256 == hashlib.sha256(b"pixels").hexdigest()
 
 
 def test_a_wrong_checksum_is_never_stored(capture):
     with pytest.raises(ValueError, match="checksum"):
-        capture.store("201", manifest_of(b"pixels"), b"pixelz")
+        capture.store("201", described(b"pixels"), b"pixelz")
     assert not (capture.path / "201.pgm").exists()
 
 
@@ -123,55 +121,55 @@ def test_a_crash_between_image_and_record_is_healed_by_the_repeat(capture, monke
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
-            capture.store("201", manifest_of(b"pixels"), b"pixels")
-    assert capture.record()["cameras"]["201"]["file"] is None
-    capture.store("201", manifest_of(b"pixels"), b"pixels")
-    assert capture.record()["cameras"]["201"]["status"] == "ok"
+            capture.store("201", described(b"pixels"), b"pixels")
+    assert capture.record().cameras["201"].file is None
+    capture.store("201", described(b"pixels"), b"pixels")
+    assert capture.record().cameras["201"].status == "ok"
 
 
 def test_the_close_names_every_missing_camera_and_measures_the_skew(capture):
-    capture.store("201", manifest_of(b"pixels"), b"pixels")
+    capture.store("201", described(b"pixels"), b"pixels")
     record = capture.close({"202": "the node disappeared"})
-    assert record["state"] == "closed"
-    assert record["cameras"]["202"]["status"] == "failed"
-    assert record["cameras"]["202"]["reason"] == "the node disappeared"
-    assert record["skew_ns"] is None, "one frame has no spread"
+    assert record.state == "closed"
+    assert record.cameras["202"].status == "failed"
+    assert record.cameras["202"].reason == "the node disappeared"
+    assert record.skew_ns is None, "one frame has no spread"
 
     # The late image counts in the skew: 1060 - 60 = 1000 is not beyond the tolerance of 1000.
-    capture.store("202", manifest_of(b"late", "202", 1060), b"late")
+    capture.store("202", described(b"late", 1060), b"late")
     record = capture.record()
-    assert record["cameras"]["202"]["status"] == "late"
-    assert (record["skew_ns"], record["skew_exceeded"]) == (1000, False)
+    assert record.cameras["202"].status == "late"
+    assert (record.skew_ns, record.skew_exceeded) == (1000, False)
 
 
 def test_a_skew_beyond_the_tolerance_is_flagged(capture):
-    capture.store("201", manifest_of(b"a", "201", 0), b"a")
-    capture.store("202", manifest_of(b"b", "202", 1001), b"b")
-    assert capture.close()["skew_exceeded"] is True
+    capture.store("201", described(b"a", 0), b"a")
+    capture.store("202", described(b"b", 1001), b"b")
+    assert capture.close().skew_exceeded is True
 
 
 def test_an_archived_image_is_not_overruled_by_a_failure(capture):
-    capture.store("201", manifest_of(b"pixels"), b"pixels")
+    capture.store("201", described(b"pixels"), b"pixels")
     capture.fail("201", "too slow")
-    assert capture.record()["cameras"]["201"]["status"] == "ok"
+    assert capture.record().cameras["201"].status == "ok"
 
 
 def test_captures_left_open_are_closed_with_the_reason(archive, capture):
-    capture.store("201", manifest_of(b"pixels"), b"pixels")
+    capture.store("201", described(b"pixels"), b"pixels")
     (capture.path / ".partial-202.pgm-1-2").write_bytes(b"half")
     again = Archive(archive.root)
     assert again.close_unfinished("the controller was restarted") == ["first/0001-board"]
     record = capture.record()
-    assert record["state"] == "closed"
-    assert record["cameras"]["201"]["status"] == "ok"
-    assert record["cameras"]["202"]["reason"] == "the controller was restarted"
+    assert record.state == "closed"
+    assert record.cameras["201"].status == "ok"
+    assert record.cameras["202"].reason == "the controller was restarted"
     assert not list(capture.path.glob(".partial*"))
     assert again.close_unfinished("once more") == []
 
 
 def test_verify_finds_what_was_changed_removed_or_slipped_in(archive, capture):
     for camera in ("201", "202"):
-        capture.store(camera, manifest_of(camera.encode(), camera), camera.encode())
+        capture.store(camera, described(camera.encode()), camera.encode())
     session = archive.open("first").path
     assert verify(session) == []
     (capture.path / "201.pgm").write_bytes(b"forged")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from ringdic.errors import InputError
 from ringdic.session.folder import open_session
-from ringdic_controller.archive.importing import import_folder, natural_order
-from ringdic_controller.archive.writer import verify
+from ringdic.session.importing import import_folder, natural_order
+from ringdic.session.writer import verify
 
 SIZE = (24, 32)
 
@@ -51,11 +51,11 @@ def test_every_image_becomes_a_byte_copy_in_its_capture(src, tmp_path):
     last = session.of_kind("specimen")[-1]
     original = src / "specimen" / "202" / "step10.jpg"
     assert last.images["202"].read_bytes() == original.read_bytes()
-    entry = last.record["cameras"]["202"]
-    assert entry["sha256"] == hashlib.sha256(original.read_bytes()).hexdigest()
-    assert (entry["width"], entry["height"]) == (SIZE[1], SIZE[0])
-    assert entry["original"].endswith("step10.jpg")
-    assert all(capture.record["state"] == "closed" for capture in session.captures)
+    entry = last.record.cameras["202"]
+    assert entry.sha256 == hashlib.sha256(original.read_bytes()).hexdigest()
+    assert (entry.width, entry.height) == (SIZE[1], SIZE[0])
+    assert entry.original.endswith("step10.jpg")
+    assert all(capture.record.state == "closed" for capture in session.captures)
     assert session.mask("201").read_bytes() == (src / "mask" / "201.png").read_bytes()
     assert session.mask("202") is None
     assert verify(path) == []

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from ringdic.correlation.correlate import load_kernels
 from ringdic.errors import ComputationError, InputError
+from ringdic.session.records import CameraRecord
 from ringdic.settings import CorrelationGroup
 from ringdic.tasks import (
     Arrays,
@@ -151,9 +152,9 @@ def test_a_key_tells_values_apart_and_is_the_same_for_the_same() -> None:
 def test_a_record_of_a_file_is_believed_while_the_size_agrees(tmp_path: Path) -> None:
     path = tmp_path / "image.pgm"
     path.write_bytes(b"1234")
-    assert file_digest(path, {"sha256": "told", "bytes": 4}) == "told"
+    assert file_digest(path, CameraRecord(sha256="told", bytes=4)) == "told"
     read = file_digest(path)
-    assert file_digest(path, {"sha256": "told", "bytes": 5}) == read != "told"
+    assert file_digest(path, CameraRecord(sha256="told", bytes=5)) == read != "told"
     path.write_bytes(b"1235")
     assert file_digest(path) != read
 

@@ -1,12 +1,12 @@
 """Captures: begin one, follow it, read its record and images."""
 
 from dataclasses import asdict
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response, status
 from fastapi.responses import FileResponse
 from pydantic import BaseModel
-from ringdic_node.wire import CAPTURE_KINDS
+from ringdic.session.names import CaptureKind
 
 from ringdic_controller.service.desk import Desk
 from ringdic_controller.service.preview import preview_jpeg
@@ -21,7 +21,7 @@ router = APIRouter(tags=["captures"])
 class NewCapture(BaseModel):
     """Kind of a capture to begin; with ``override`` cameras that are missing or not armed are left out as failed."""
 
-    kind: Literal[CAPTURE_KINDS]  # type: ignore[valid-type]
+    kind: CaptureKind
     override: bool = False
 
 

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from ringdic.errors import ComputationError, InputError
 from ringdic.session.rig import parse_rig
+from ringdic.settings import Settings
 from ringdic_node.virtual_rig.rig import paper_rig
 
 from ringdic_controller.studies.demo.client import Client
@@ -81,7 +82,7 @@ def _measure(folder: Path, count: int, rounds: int, size: tuple[int, int]) -> di
     expected = {id_: _prepare(images / f"{id_}.pgm", seed, size) for seed, id_ in enumerate(ids)}
     tables = {id_: f'camera = "playback"\n[playback]\nimage = "{(images / id_).as_posix()}.pgm"\n' for id_ in ids}
     with (
-        running_controller(folder, rig.rig_toml(), "") as running,
+        running_controller(folder, rig.rig_toml(), Settings()) as running,
         running_nodes(folder, parse_rig(rig.rig_toml()).name, tables, running.endpoint) as processes,
     ):
         client = Client(running.address)

@@ -56,7 +56,7 @@ def bench_command(
 
         from ringdic_controller.studies.bench.live import bench_live
 
-        chosen = load_settings(None, set_ or []).to_toml()
+        chosen = load_settings(None, set_ or [])
         result["live"] = bench_live(out / "live", cameras=cameras, scale=scale, settings=chosen, say=say)
     if before is not None:
         result["ratios"] = compared(result, before)

@@ -19,6 +19,7 @@ import numpy as np
 from ringdic.errors import ComputationError, InputError
 from ringdic.session.images import read_gray
 from ringdic.session.rig import parse_rig
+from ringdic.settings import Settings
 
 from ringdic_controller.studies.bench.capture import processor_seconds
 from ringdic_controller.studies.demo.client import Client
@@ -42,13 +43,13 @@ def bench_live(
     steps: int = 5,
     interval: float = 5.0,
     boards: int = 12,
-    settings: str = "",
+    settings: Settings | None = None,
     say: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """The figures of `steps` steps, one every `interval` seconds, after the reference. JSON values, times in seconds.
 
     folder : where images and calibration are kept for the next time. boards : views of the checkerboard.
-    settings : TOML for the processing.
+    settings : of the processing; None takes those of the demo at this size of the images.
     Raises ComputationError if a step could not be processed.
     """
     scenery = Scenery(scale, cameras, boards, limb=steps)

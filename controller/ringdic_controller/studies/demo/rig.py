@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ringdic.errors import ComputationError
+from ringdic.settings import Settings
 
 from ringdic_controller.service.config import ControllerConfig
 from ringdic_controller.service.service import free_endpoint
@@ -50,10 +51,10 @@ class Running:
 
 
 @contextmanager
-def running_controller(folder: Path, rig_toml: str, settings_toml: str) -> Iterator[Running]:
+def running_controller(folder: Path, rig_toml: str, settings: Settings) -> Iterator[Running]:
     """The controller as a process of its own; its archive is ``folder/archive``."""
     (folder / "rig.toml").write_text(rig_toml, encoding="utf-8")
-    (folder / "settings.toml").write_text(settings_toml, encoding="utf-8")
+    (folder / "settings.toml").write_text(settings.to_toml(), encoding="utf-8")
     endpoint = free_endpoint(ControllerConfig()).endpoint
     config = folder / "controller.toml"
     config.write_text(

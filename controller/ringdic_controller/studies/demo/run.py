@@ -14,6 +14,7 @@ from ringdic.cli.console import say, show_table
 from ringdic.progress import Progress, Report, progress_bar
 from ringdic.session.folder import newest_results
 from ringdic.session.rig import parse_rig
+from ringdic.settings import PAPER, Settings
 from ringdic_node.virtual_rig.render import load_renderer
 from ringdic_node.virtual_rig.rig import VirtualRig, paper_rig, write_truth
 from ringdic_node.virtual_rig.scenes import Limb
@@ -104,10 +105,9 @@ def _compare(setting: Setting, session: str, rig: VirtualRig, began: float) -> d
     return comparison
 
 
-def settings_for(scale: float) -> str:
-    """Settings for a scale of the images: radius 20 and step 10 px at full scale, never smaller than a subset needs."""
-    radius, step = max(10, round(20 * scale)), max(5, round(10 * scale))
-    return f"[correlation]\nradius_px = {radius}\nstep_px = {step}\n"
+def settings_for(scale: float) -> Settings:
+    """The paper's settings at a scale of the images, with no fewer pixels in a subset than it needs."""
+    return PAPER.model_copy(update={"correlation": PAPER.correlation.at_scale(scale)})
 
 
 def _new_folder(folder: Path) -> Path:

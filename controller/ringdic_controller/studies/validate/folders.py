@@ -7,7 +7,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from ringdic_controller.archive.writer import SessionWriter
+from ringdic.session.writer import SessionWriter
+
 from ringdic_controller.studies.validate.darkroom import Darkroom, RenderedShot
 
 

@@ -71,6 +71,4 @@ def run_validation(
 
 def scaled(settings: Settings, scale: float) -> Settings:
     """The settings of full scale at a smaller one, with no fewer pixels than a subset needs."""
-    group = settings.correlation
-    radius, step = max(10, round(group.radius_px * scale)), max(5, round(group.step_px * scale))
-    return settings.model_copy(update={"correlation": group.model_copy(update={"radius_px": radius, "step_px": step})})
+    return settings.model_copy(update={"correlation": settings.correlation.at_scale(scale)})

@@ -1,0 +1,282 @@
+"""The JSON records of a session folder: ``session.json`` and each capture's ``capture.json``, typed and checked.
+
+A record of another schema is refused. Fields that this version does not know are ignored when a record is read and
+kept when it is written again. Times are integers, ns since the Unix epoch, or ISO 8601 text in UTC.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ringdic.errors import InputError
+from ringdic.session.names import capture_id, is_file_name
+
+SCHEMA = 1
+
+_STATUSES = ("pending", "ok", "late", "failed")
+#: What to do about a damaged session.
+REMEDY = "copy it back, or import the session again"
+_UNKNOWN = "unknown"
+
+R = TypeVar("R", bound="_Record")
+
+
+class SessionError(InputError):
+    """A session or a record of it that does not exist, exists already or cannot be used; the text tells which."""
+
+
+@dataclass(frozen=True)
+class _Record:
+    """A JSON object whose fields are those of the class, in order; `unknown` are all others of the object."""
+
+    unknown: Mapping[str, Any] = field(default_factory=dict, kw_only=True)
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value, (wanted, types) = getattr(self, each.name), _TYPES[str(each.type)]
+            if not isinstance(value, types) or (isinstance(value, bool) and bool not in types):
+                raise SessionError(f"'{each.name}' must be {wanted}, not {value!r}")
+
+    @classmethod
+    def _of(cls: type[R], document: Mapping[str, Any]) -> R:
+        """The record that a JSON object holds. SessionError names a field that is missing or has the wrong type."""
+        if not isinstance(document, Mapping):
+            raise SessionError(f"a table of fields is wanted, not {document!r}")
+        names = [each.name for each in fields(cls) if each.name != _UNKNOWN]
+        values = {name: document[name] for name in names if name in document}
+        required = [each.name for each in fields(cls) if each.default is each.default_factory is MISSING]
+        for name in required:
+            if name not in values:
+                raise SessionError(f"the field '{name}' is missing")
+        unknown = {name: value for name, value in document.items() if name not in names}
+        return cls(**values, unknown=unknown)
+
+    def _fields(self) -> dict[str, Any]:
+        names = [each.name for each in fields(self) if each.name != _UNKNOWN]
+        return {**{name: getattr(self, name) for name in names}, **self.unknown}
+
+
+_TYPES: dict[str, tuple[str, tuple[type, ...]]] = {
+    "str": ("text", (str,)),
+    "str | None": ("text or null", (str, type(None))),
+    "int": ("a whole number", (int,)),
+    "int | None": ("a whole number or null", (int, type(None))),
+    "float | None": ("a number or null", (int, float, type(None))),
+    "bool": ("true or false", (bool,)),
+    "bool | None": ("true, false or null", (bool, type(None))),
+    "Mapping[str, Any]": ("a table", (Mapping,)),
+    "Mapping[str, CameraRecord]": ("a table with an entry for each camera", (Mapping,)),
+}
+
+
+@dataclass(frozen=True)
+class SessionRecord(_Record):
+    """Record of a session, kept in ``session.json``: what it is called, of which rig, and whence its images come.
+
+    session : name of the session. rig : name of the rig. created : ISO 8601. source : "capture" or "import".
+    """
+
+    session: str
+    rig: str
+    created: str
+    source: str
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.source not in ("capture", "import"):
+            raise SessionError(f"a session's 'source' is 'capture' or 'import', not {self.source!r}")
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> SessionRecord:
+        """The record that the JSON object of a ``session.json`` holds. Raises SessionError."""
+        return cls._of(_without_schema(document))
+
+    def to_json(self) -> dict[str, Any]:
+        """The record as the JSON object of a ``session.json``."""
+        return {"schema": SCHEMA, **self._fields()}
+
+
+@dataclass(frozen=True)
+class ImageDescription:
+    """Description of an image that comes from a camera: checksum, size, time of exposure, metadata.
+
+    sha256 : hexadecimal digits. width, height : px. time_ns : measured time of the exposure. exposure_us : µs.
+    metadata : JSON values that the camera told. format : extension of the file, without the dot.
+    """
+
+    sha256: str
+    width: int
+    height: int
+    time_ns: int | None = None
+    exposure_us: float | None = None
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    format: str = "pgm"
+
+
+@dataclass(frozen=True)
+class CameraRecord(_Record):
+    """One camera's entry in the record of a capture.
+
+    status : "pending" while the image is awaited, "ok", "late" where it came after the close, "failed".
+    reason : why it is late or failed. file : name of the image in the capture's folder. sha256, bytes : of that file.
+    width, height : px. time_ns : measured time of the exposure. exposure_us : µs. metadata : JSON values that the
+    camera told. original : the file that was imported.
+    """
+
+    status: str = "pending"
+    reason: str | None = None
+    file: str | None = None
+    sha256: str | None = None
+    bytes: int | None = None
+    width: int | None = None
+    height: int | None = None
+    time_ns: int | None = None
+    exposure_us: float | None = None
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    original: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.status not in _STATUSES:
+            raise SessionError(f"'status' is one of {', '.join(_STATUSES)}, not {self.status!r}")
+        if self.file is not None and not is_file_name(self.file):
+            raise SessionError(f"'file' must be a name in the capture's folder, not {self.file!r}")
+
+    @property
+    def lacks_image(self) -> bool:
+        """Whether no image of this camera has been archived."""
+        return self.status in ("pending", "failed")
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> CameraRecord:
+        """The entry that a JSON object holds. Raises SessionError."""
+        return cls._of(document)
+
+    def to_json(self) -> dict[str, Any]:
+        """The entry as a JSON object."""
+        return self._fields()
+
+
+@dataclass(frozen=True)
+class CaptureRecord(_Record):
+    """Record of one capture, kept in its ``capture.json``: when it was taken, and what became of each camera's image.
+
+    capture_id : ``NNNN-kind``, of `number` and `kind`. session : name of the session. state : "open" or "closed".
+    opened_at, closed_at : ISO 8601. fire_at_ns : planned moment of the exposure. skew_ns : spread of the cameras'
+    measured times, None where fewer than two measured one. tolerance_ns : skew that is not flagged. skew_exceeded :
+    whether it is larger. override : captured although cameras were missing. cameras : an entry for each camera that
+    an image is expected of.
+    """
+
+    capture_id: str
+    number: int
+    kind: str
+    session: str
+    state: str
+    opened_at: str | None = None
+    closed_at: str | None = None
+    fire_at_ns: int | None = None
+    skew_ns: int | None = None
+    tolerance_ns: int | None = None
+    skew_exceeded: bool | None = None
+    override: bool = False
+    cameras: Mapping[str, CameraRecord] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.capture_id != capture_id(self.number, self.kind):
+            raise SessionError(f"'capture_id' {self.capture_id!r} is not that of number {self.number}, {self.kind!r}")
+        if self.state not in ("open", "closed"):
+            raise SessionError(f"'state' is 'open' or 'closed', not {self.state!r}")
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> CaptureRecord:
+        """The record that the JSON object of a ``capture.json`` holds. Raises SessionError."""
+        document = _without_schema(document)
+        entries = document.get("cameras", {})
+        if not isinstance(entries, Mapping):
+            raise SessionError(f"'cameras' must have one record a camera, not {entries!r}")
+        cameras = {}
+        for camera, entry in entries.items():
+            try:
+                cameras[camera] = CameraRecord.from_json(entry)
+            except SessionError as error:
+                raise SessionError(f"camera '{camera}': {error}") from error
+        return cls._of({**document, "cameras": cameras})
+
+    def to_json(self) -> dict[str, Any]:
+        """The record as the JSON object of a ``capture.json``."""
+        entries = {camera: entry.to_json() for camera, entry in self.cameras.items()}
+        return {"schema": SCHEMA, **self._fields(), "cameras": entries}
+
+    def with_entry(self, camera: str, entry: CameraRecord) -> CaptureRecord:
+        """The record with another entry for a camera; the skew of a closed capture is measured anew."""
+        changed = replace(self, cameras={**self.cameras, camera: entry})
+        return changed._with_skew() if self.state == "closed" else changed
+
+    def with_failure(self, camera: str, reason: str) -> CaptureRecord:
+        """The record with the reason why a camera has no image; unchanged where its image is archived."""
+        entry = self.cameras[camera]
+        if not entry.lacks_image or (entry.status == "failed" and entry.reason == reason):
+            return self
+        entry = replace(entry, status="failed", reason=reason)
+        return replace(self, cameras={**self.cameras, camera: entry})
+
+    def closed(self, at: str, failures: Mapping[str, str]) -> CaptureRecord:
+        """The record at the end of the capture: every camera without an image has failed, and the skew is measured.
+
+        at : the time of the close, ISO 8601. failures : reasons, by camera.
+        """
+        cameras = dict(self.cameras)
+        for camera, entry in cameras.items():
+            if entry.lacks_image:
+                reason = failures.get(camera) or entry.reason or "no image arrived before the close"
+                cameras[camera] = replace(entry, status="failed", reason=reason)
+        closed = replace(self, cameras=cameras)
+        if self.state == "open":
+            closed = replace(closed, state="closed", closed_at=at)
+        return closed._with_skew()
+
+    def _with_skew(self) -> CaptureRecord:
+        times = [entry.time_ns for entry in self.cameras.values() if entry.time_ns is not None]
+        if len(times) < 2:
+            return replace(self, skew_ns=None, skew_exceeded=None)
+        skew = max(times) - min(times)
+        exceeded = None if self.tolerance_ns is None else skew > self.tolerance_ns
+        return replace(self, skew_ns=skew, skew_exceeded=exceeded)
+
+
+def read_session_record(path: Path) -> SessionRecord:
+    """Read and check a ``session.json``. SessionError names the file and the field at fault."""
+    return _read(path, SessionRecord.from_json)
+
+
+def read_capture_record(path: Path) -> CaptureRecord:
+    """Read and check a ``capture.json``. SessionError names the file and the field at fault."""
+    return _read(path, CaptureRecord.from_json)
+
+
+def _read(path: Path, from_json: Callable[[Mapping[str, Any]], R]) -> R:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SessionError(f"{path}: cannot be read ({error.strerror}); {REMEDY}") from error
+    except ValueError as error:
+        raise SessionError(f"{path}: not readable as JSON ({error}); {REMEDY}") from error
+    try:
+        return from_json(document)
+    except SessionError as error:
+        raise SessionError(f"{path}: {error}; {REMEDY}") from error
+
+
+def _without_schema(document: Any) -> dict[str, Any]:
+    """The other fields of a record. SessionError where it is no JSON object or has another schema."""
+    if not isinstance(document, Mapping):
+        raise SessionError("not a record of a session")
+    if document.get("schema") != SCHEMA:
+        raise SessionError(f"a record of schema {document.get('schema')!r}, but this version reads schema {SCHEMA}")
+    return {name: value for name, value in document.items() if name != "schema"}
