@@ -123,10 +123,13 @@ def _annotated(node: ast.Module | Named) -> bool:
 
 
 def duplicates(all_places: list[Place]) -> dict[str, list[Place]]:
-    """Public classes and functions of modules that share their name with another, by name."""
+    """Public classes and functions of modules that share their name with another, by name.
+
+    ``main``, the entry of a command, may stand in several modules.
+    """
     by_name: dict[str, list[Place]] = defaultdict(list)
     for place in all_places:
-        if place.name and "." not in place.name and place.public:
+        if place.name not in ("", "main") and "." not in place.name and place.public:
             by_name[place.name].append(place)
     return {name: found for name, found in by_name.items() if len(found) > 1}
 

@@ -26,7 +26,7 @@ from typing import Any
 
 from ringdic_node.cameras.camera import NodeCamera
 from ringdic_node.clock import Clock
-from ringdic_node.wire import WireError, checked_name
+from ringdic_node.wire import WireError, valid_name
 
 
 class ConfigError(ValueError):
@@ -70,8 +70,8 @@ class NodeConfig:
 
     def __post_init__(self) -> None:
         try:
-            checked_name("rig", self.rig)
-            checked_name("id", self.id)
+            valid_name("rig", self.rig)
+            valid_name("id", self.id)
         except WireError as error:
             raise ConfigError(str(error)) from error
         if self.camera not in _CAMERA_KEYS:

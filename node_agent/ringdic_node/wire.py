@@ -57,7 +57,7 @@ class WireError(ValueError):
     """A message that breaks the contract: the text says which field and why."""
 
 
-def checked_name(what: str, name: object) -> str:
+def valid_name(what: str, name: object) -> str:
     """Return `name` if it may stand in a key and in a file name, else raise WireError."""
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise WireError(
@@ -74,7 +74,7 @@ class Keys:
     rig: str
 
     def __post_init__(self) -> None:
-        checked_name("rig", self.rig)
+        valid_name("rig", self.rig)
 
     def node(self, node: str, verb: str) -> str:
         """Key of one verb of a node: arm, trigger, inventory, fetch, preview, ack or status."""
@@ -98,8 +98,8 @@ class CaptureKey:
     fire_at_ns: int
 
     def __post_init__(self) -> None:
-        checked_name("session", self.session)
-        checked_name("capture_id", self.capture_id)
+        valid_name("session", self.session)
+        valid_name("capture_id", self.capture_id)
         _require_int("fire_at_ns", self.fire_at_ns, at_least=0)
 
     def __str__(self) -> str:
@@ -153,12 +153,12 @@ class Arm(_Message):
     expected: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        checked_name("session", self.session)
+        valid_name("session", self.session)
         _require_in("kind", self.kind, CAPTURE_KINDS)
         _require_table("settings", self.settings)
         _require_hash("settings_hash", self.settings_hash)
         for node in self.expected:
-            checked_name("node", node)
+            valid_name("node", node)
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ class ArmReply(_Message):
     versions: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        checked_name("node", self.node)
+        valid_name("node", self.node)
         _require_hash("settings_hash", self.settings_hash)
         _require_table("locked", self.locked)
         _require_table("versions", self.versions)
@@ -213,7 +213,7 @@ class TriggerReply(_Message):
     reason: str = ""
 
     def __post_init__(self) -> None:
-        checked_name("node", self.node)
+        valid_name("node", self.node)
         _require_in("verdict", self.verdict, TRIGGER_VERDICTS)
 
 
@@ -235,7 +235,7 @@ class Manifest(_Message):
     metadata: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        checked_name("node", self.node)
+        valid_name("node", self.node)
         _require_in("kind", self.kind, CAPTURE_KINDS)
         _require_hash("sha256", self.sha256)
         _require_int("bytes", self.bytes, at_least=1)
@@ -258,7 +258,7 @@ class Failure(_Message):
     reason: str
 
     def __post_init__(self) -> None:
-        checked_name("node", self.node)
+        valid_name("node", self.node)
         if not self.reason:
             raise WireError("a Failure must tell the reason")
 
@@ -274,7 +274,7 @@ class Inventory(_Message):
     capturing: CaptureKey | None = None
 
     def __post_init__(self) -> None:
-        checked_name("node", self.node)
+        valid_name("node", self.node)
 
 
 @dataclass(frozen=True)
@@ -296,7 +296,7 @@ class Ack(_Message):
     verdict: str = "archived"
 
     def __post_init__(self) -> None:
-        checked_name("node", self.node)
+        valid_name("node", self.node)
         _require_hash("sha256", self.sha256)
         _require_in("verdict", self.verdict, ACK_VERDICTS)
 
@@ -317,7 +317,7 @@ class NodeStatus(_Message):
     detail: str = ""
 
     def __post_init__(self) -> None:
-        checked_name("node", self.node)
+        valid_name("node", self.node)
         _require_in("state", self.state, NODE_STATES)
         _require_int("time_ns", self.time_ns, at_least=0)
         _require_int("spool_free", self.spool_free, at_least=0)

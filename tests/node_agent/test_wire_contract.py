@@ -26,10 +26,10 @@ from ringdic_node.wire import (
     Trigger,
     TriggerReply,
     WireError,
-    checked_name,
     decode,
     decode_as,
     encode,
+    valid_name,
 )
 
 names = st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,20}\Z")
@@ -162,4 +162,4 @@ def test_a_name_is_one_in_messages_where_it_is_one_in_a_session(name):
         except refusal as error:
             return str(error)
 
-    assert verdict(checked_name, WireError) == verdict(session_names.checked_name, InputError)
+    assert verdict(valid_name, WireError) == verdict(session_names.valid_name, InputError)

@@ -23,7 +23,7 @@ ALL, PAIRS = "all views", "pairs"
 
 
 @dataclass(frozen=True)
-class Run:
+class CylinderRun:
     """A run of one way of processing over the images of the cylinder. cameras : as this way calibrated them, by id."""
 
     results: Results
@@ -31,7 +31,7 @@ class Run:
     tracks: Tracks
 
     @classmethod
-    def of(cls, results: Results) -> Run:
+    def of(cls, results: Results) -> CylinderRun:
         """The run whose results these are."""
         return cls(results, {camera.id: camera for camera in results.cameras}, Tracks.of(results))
 
@@ -43,7 +43,7 @@ class Run:
         return np.stack([self.tracks.of_pair(self.cameras, pair, step) for pair in pairs])
 
 
-def diameter(runs: Mapping[str, Run], pairs: tuple[tuple[str, str], ...]) -> Findings:
+def diameter(runs: Mapping[str, CylinderRun], pairs: tuple[tuple[str, str], ...]) -> Findings:
     """Figures of the fitted cylinder: its diameter, and the standard deviation of twice the points' radii."""
     fits = {way: fitted_cylinder(run.results.vertices_ref) for way, run in runs.items()}
     single = {way: fitted_cylinder(np.concatenate(run.cloud(pairs))) for way, run in runs.items()}
@@ -57,7 +57,7 @@ def diameter(runs: Mapping[str, Run], pairs: tuple[tuple[str, str], ...]) -> Fin
     return Findings(figures, {way: {"radii": 0.5 * fit.diameter + fit.radial} for way, fit in fits.items()})
 
 
-def figure_7a(runs: Mapping[str, Run], pairs: tuple[tuple[str, str], ...]) -> Findings:
+def figure_7a(runs: Mapping[str, CylinderRun], pairs: tuple[tuple[str, str], ...]) -> Findings:
     """Merging mismatch: the distance between points measured by two pairs that share a camera (Fig. 7a)."""
     found = {way: mismatch(run.tracks, run.cameras, pairs) for way, run in runs.items()}
     mean = {way: float(each.mean()) for way, each in found.items() if len(each)}
@@ -78,7 +78,7 @@ class _Steps:
     strain: Floats
 
 
-def figure_7b(runs: Mapping[str, Run], surface: Cylinder, pairs: tuple[tuple[str, str], ...]) -> Findings:
+def figure_7b(runs: Mapping[str, CylinderRun], surface: Cylinder, pairs: tuple[tuple[str, str], ...]) -> Findings:
     """Displacement and strain of each rigid step of 0.1 mm against the reference; true strain is zero (Fig. 7b)."""
     every = {way: _all_views(run, surface) for way, run in runs.items()}
     single = {way: _from_pairs(run, surface, pairs) for way, run in runs.items()}
@@ -105,7 +105,7 @@ def figure_7b(runs: Mapping[str, Run], surface: Cylinder, pairs: tuple[tuple[str
 
 
 def apart(
-    runs: Mapping[str, Run], rays: ExactRays, true: Mapping[str, Camera], uncorrected: Mapping[str, Camera]
+    runs: Mapping[str, CylinderRun], rays: ExactRays, true: Mapping[str, Camera], uncorrected: Mapping[str, Camera]
 ) -> Findings:
     """The two systematic errors separated: the calibration on exact pixels, the matching with the true cameras.
 
@@ -136,13 +136,13 @@ def apart(
     return Findings(tuple(figures))
 
 
-def print_errors(runs: Mapping[str, Run]) -> Findings:
+def print_errors(runs: Mapping[str, CylinderRun]) -> Findings:
     """Diameter after a calibration on a target whose dots are printed off their places."""
     bias = {way: fitted_cylinder(run.results.vertices_ref).diameter - TRUE for way, run in runs.items()}
     return Findings((Figure("print errors 0.03 mm", "diameter bias", "mm", bias, "", 0.005),))
 
 
-def _all_views(run: Run, surface: Cylinder) -> _Steps:
+def _all_views(run: CylinderRun, surface: Cylinder) -> _Steps:
     found = errors(run.results, surface)
     steps = range(1, len(run.results.steps))
     strain = []
@@ -156,7 +156,7 @@ def _all_views(run: Run, surface: Cylinder) -> _Steps:
     )
 
 
-def _from_pairs(run: Run, surface: Cylinder, pairs: tuple[tuple[str, str], ...]) -> _Steps:
+def _from_pairs(run: CylinderRun, surface: Cylinder, pairs: tuple[tuple[str, str], ...]) -> _Steps:
     """Errors of each step when every camera pair triangulates on its own."""
     mean, std = [], []
     before = run.cloud(pairs, 0)

@@ -19,7 +19,14 @@ from ringdic.settings import CalibrationGroup, Settings
 from ringdic_node.virtual_rig.scenes import Cylinder, Specimen
 
 from ringdic_controller.studies.validate.calibration import ExactRays, figure_6, table_1, table_2, true_camera
-from ringdic_controller.studies.validate.cylinder import Run, apart, diameter, figure_7a, figure_7b, print_errors
+from ringdic_controller.studies.validate.cylinder import (
+    CylinderRun,
+    apart,
+    diameter,
+    figure_7a,
+    figure_7b,
+    print_errors,
+)
 from ringdic_controller.studies.validate.darkroom import Darkroom, RenderedShot
 from ringdic_controller.studies.validate.figures import PAPER, Figure, Findings
 from ringdic_controller.studies.validate.folders import make_session
@@ -74,7 +81,7 @@ class Validation:
         if "cylinder" in experiments:
             found |= self._cylinder(rings)
         if "printed" in experiments:
-            runs = {way: Run.of(results) for way, results in self._process("printed", 1).items()}
+            runs = {way: CylinderRun.of(results) for way, results in self._process("printed", 1).items()}
             found["printed"] = print_errors(runs)
         if "limb" in experiments or "spoilt" in experiments:
             found |= self._limb("spoilt" in experiments)
@@ -97,7 +104,7 @@ class Validation:
 
     def _cylinder(self, rings: Mapping[str, CalibratedRig]) -> dict[str, Findings]:
         results = self._process("cylinder")
-        runs = {way: Run.of(each) for way, each in results.items()}
+        runs = {way: CylinderRun.of(each) for way, each in results.items()}
         uncorrected = {id_: each.camera for id_, each in self._uncorrected().cameras.items()}
         rays = ExactRays.of(self.true, self.pairs)
         return {
