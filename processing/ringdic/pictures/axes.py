@@ -108,9 +108,10 @@ def surface_in_viewer(results: EvaluatedResults, scale: Scale, step: int) -> Plo
     body = pyvista.PolyData.from_regular_faces(mesh.vertices, mesh.faces)
     body.cell_data[scale.title] = _on_faces(results, scale, step)[measured]
     plotter = pyvista.Plotter()
-    bar: dict[str, Any] = {"title": scale.title}
-    limits = (scale.low, scale.high)
-    plotter.add_mesh(body, scalars=scale.title, cmap=scale.mappable().cmap, clim=limits, scalar_bar_args=bar)
+    plotter.add_mesh(
+        body, scalars=scale.title, cmap=scale.mappable().cmap, clim=(scale.low, scale.high),
+        scalar_bar_args={"title": scale.title}, lighting=False,  # the colours are those of the bar
+    )  # fmt: skip
     plotter.add_text(results.steps[step], font_size=10)
     return plotter
 
