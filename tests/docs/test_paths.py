@@ -40,3 +40,17 @@ def test_every_room_stands_on_a_storey(pages: Path, heading: str) -> None:
     rooms = {path.parent.name for path in library.glob("*/__init__.py")}
     modules = {path.stem for path in library.glob("*.py")} - {"__init__", "__main__"}
     assert rooms | modules <= described
+
+
+def test_functions_that_pages_name_are_in_their_files(pages: Path) -> None:
+    library = ROOT / "processing" / "ringdic"
+    named = [
+        (name, path)
+        for page in pages.rglob("*.md")
+        for name, path in re.findall(r"`(\w+)` in\s+`([\w/]+\.py)`", page.read_text(encoding="utf-8"))
+    ]
+    assert named
+    for name, path in named:
+        source = next((root / path for root in (ROOT, library) if (root / path).is_file()), None)
+        assert source is not None, path
+        assert re.search(rf"^(?:def |class )?{name}\b", source.read_text(encoding="utf-8"), re.MULTILINE), (name, path)
