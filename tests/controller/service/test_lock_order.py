@@ -117,7 +117,6 @@ def test_a_session_takes_locks_in_one_order_only(
         client.post(f"{API}/sessions", json={"name": "limb"})
         for kind in ("board", "target", "specimen", "specimen", "specimen"):
             begun = client.post(f"{API}/captures", json={"kind": kind}).json()["id"]
-            client.post(f"{API}/captures", json={"kind": kind})
             until(lambda: desk.rounds.get(begun).ended)  # noqa: B023
         until(lambda: desk.catalogue.runs("limb"))
         client.post(f"{API}/jobs/{client.post(f'{API}/jobs', json={'session': 'limb'}).json()['id']}/cancel")
