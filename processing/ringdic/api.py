@@ -282,9 +282,9 @@ def import_folder(source: str | Path, session: str | Path) -> Session:
     Raises InputError for a missing or damaged image, an unknown key in ``rig.toml``, or a session that exists.
     """
     from ringdic.session.folder import open_session
-    from ringdic.session.importing import import_folder as make_session
+    from ringdic.session.importing import import_images
 
-    make_session(Path(source), Path(session))
+    import_images(Path(source), Path(session))
     return open_session(Path(session))
 
 

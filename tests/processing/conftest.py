@@ -15,7 +15,7 @@ from ringdic.multiview.shape import ReferenceShape
 from ringdic.multiview.surface import reference_pixels
 from ringdic.multiview.tracking import CameraTrack, Tracking, at_reference, track_block
 from ringdic.session.folder import open_session
-from ringdic.session.importing import import_folder
+from ringdic.session.importing import import_images
 from ringdic.settings import CalibrationGroup
 from ringdic.tasks import process_memory
 from ringdic_node.virtual_rig.render import render
@@ -39,7 +39,7 @@ def two_cameras(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for name, (kind, number) in {**shots, f"target/{camera.id}.png": ("target", 0)}.items():
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             assert cv2.imwrite(str(source / name), render(camera, scene(kind, number), number))
-    import_folder(source, folder / "session")
+    import_images(source, folder / "session")
     calibrate_rig(open_session(folder / "session"), CalibrationGroup())
     return folder / "session"
 

@@ -74,15 +74,8 @@ def export(
     run : int, optional
         Number of the processing run; the newest unless given.
 
-    Returns
-    -------
-    Path
-        The file or folder written.
-
-    Raises
-    ------
-    InputError
-        Unknown format or field, no results, or no folder to write into.
+    Returns the file or folder written. Raises InputError for an unknown format or field, for a session without results,
+    and where there is no folder to write into.
     """
     if format not in _WRITERS:
         raise InputError(f"no export format '{format}'; there are {', '.join(FORMATS)}")

@@ -51,7 +51,7 @@ class _View:
     path: Path
 
 
-def import_folder(
+def import_images(
     src: Path,
     session: Path,
     *,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from ringdic.errors import InputError
 from ringdic.session.folder import open_session
-from ringdic.session.importing import import_folder, natural_order
+from ringdic.session.importing import import_images, natural_order
 from ringdic.session.writer import verify
 
 SIZE = (24, 32)
@@ -43,7 +43,7 @@ def src(tmp_path, rig_toml):
 
 def test_every_image_becomes_a_byte_copy_in_its_capture(src, tmp_path):
     seen = []
-    path = import_folder(src, tmp_path / "made", progress=lambda done, total, name: seen.append((done, total)))
+    path = import_images(src, tmp_path / "made", progress=lambda done, total, name: seen.append((done, total)))
     session = open_session(path)
     assert [c.kind for c in session.captures] == ["board"] * 3 + ["target"] + ["specimen"] * 11
     assert set(session.captures[2].images) == {"201"}, "camera 202 has only two views of the board"
@@ -80,7 +80,7 @@ def spoil_camera_at_rest(src):
 
 def test_captures_at_rest_are_taken_along(src, tmp_path):
     at_rest(src)
-    session = open_session(import_folder(src, tmp_path / "made"))
+    session = open_session(import_images(src, tmp_path / "made"))
     assert [c.kind for c in session.captures[-3:]] == ["specimen", "static", "static"]
     rest = session.of_kind("static")[1].images
     assert rest["202"].read_bytes() == (src / "static" / "202" / "rest1.png").read_bytes()
@@ -152,15 +152,15 @@ def remove(*parts):
 def test_a_bad_folder_is_refused_and_leaves_nothing(src, tmp_path, spoil, told):
     spoil(src)
     with pytest.raises(InputError, match=told) as caught:
-        import_folder(src, tmp_path / "made")
+        import_images(src, tmp_path / "made")
     assert caught.value.exit_code == 2
     assert sorted(path.name for path in tmp_path.iterdir()) == ["src"]
 
 
 def test_a_session_is_never_replaced(src, tmp_path):
-    import_folder(src, tmp_path / "made")
+    import_images(src, tmp_path / "made")
     with pytest.raises(InputError, match="exists already"):
-        import_folder(src, tmp_path / "made")
+        import_images(src, tmp_path / "made")
 
 
 def test_natural_order_counts_like_a_person(tmp_path):
