@@ -44,7 +44,7 @@ from ringdic.compiled import choose_cache_folder
 from ringdic.errors import ComputationError, InputError, RingdicError, missing_extra
 
 if TYPE_CHECKING:
-    from ringdic.api import ImageCorrelation, correlate, import_folder, process, read_run
+    from ringdic.api import Correlation, correlate, import_folder, process, read_run
     from ringdic.jobs.run import Run
     from ringdic.session.folder import Session, open_session
     from ringdic.settings import Settings, load_settings
@@ -53,7 +53,7 @@ __version__ = "0.2.0"
 
 __all__ = [
     "ComputationError",
-    "ImageCorrelation",
+    "Correlation",
     "InputError",
     "RingdicError",
     "Run",
@@ -69,7 +69,7 @@ __all__ = [
 ]
 
 _MODULES = {
-    "ImageCorrelation": "ringdic.api",
+    "Correlation": "ringdic.api",
     "Run": "ringdic.jobs.run",
     "Session": "ringdic.session.folder",
     "Settings": "ringdic.settings",

@@ -1,19 +1,23 @@
 """The public functions of RingDIC; all of them are names of :mod:`ringdic`.
 
-Two images, without calibration, in five lines:
+Two images, without calibration, in five lines::
 
-    >>> matches = ringdic.correlate("reference.png", "deformed.png")        # doctest: +SKIP
-    >>> matches.displacement                                                # doctest: +SKIP
-    >>> matches.strain(window=50).field("Exx")                              # doctest: +SKIP
-    >>> matches.plot("Exx", window=50)                                      # doctest: +SKIP
+    import ringdic
 
-A session of a calibrated rig, in six:
+    matches = ringdic.correlate("reference.png", "deformed.png")
+    matches.displacement
+    matches.strain(window=50).field("Exx")
+    matches.plot("Exx", window=50)
 
-    >>> session = ringdic.import_folder("images", "session")                # doctest: +SKIP
-    >>> run = ringdic.process(session, set={"surface.method": "global"})    # doctest: +SKIP
-    >>> run.field("lambda2", step=-1)                                       # doctest: +SKIP
-    >>> run.plot("lambda2")                                                 # doctest: +SKIP
-    >>> run.export("results.vtkhdf")                                        # doctest: +SKIP
+A session of a calibrated rig, in six::
+
+    import ringdic
+
+    session = ringdic.import_folder("images", "session")
+    run = ringdic.process(session, set={"correlation.radius_px": 20})
+    run.field("lambda2", step=-1)
+    run.plot("lambda2")
+    run.export("results.vtkhdf")
 
 A mistake that can be mended is an :class:`InputError`, sound input that does not determine an answer a
 :class:`ComputationError`; both say in one sentence what is wrong and what to do.
@@ -37,7 +41,7 @@ from ringdic.progress import Progress, Report, progress_bar, silent
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from ringdic.correlation import Correlation
+    from ringdic.correlation import PointMatches
     from ringdic.jobs.run import Run
     from ringdic.session.folder import Session
     from ringdic.settings import Settings
@@ -51,7 +55,7 @@ ProgressChoice = Callable[[Progress], None] | Literal[False] | None
 
 
 @dataclass(frozen=True, repr=False)
-class ImageCorrelation:
+class Correlation:
     """Matches of the points of a reference image in a current image: displacement, its gradient, their quality.
 
     Attributes
@@ -66,15 +70,15 @@ class ImageCorrelation:
     faces : (m, 3) int32, indices of the points of each triangle of the grid.
     seconds : time spent by stage: prepare, start, refine.
     image : (height, width), grey levels of the reference image, over which fields are drawn.
-    matches : all that the correlation tells of the points, see :class:`ringdic.correlation.Correlation`.
+    matches : all that the correlation tells of the points, see :class:`ringdic.correlation.PointMatches`.
     """
 
-    matches: Correlation
+    matches: PointMatches
     faces: NDArray[np.int32]
     image: NDArray = field(repr=False)
 
     def __repr__(self) -> str:
-        return f"<ImageCorrelation: {int(self.good.sum())} of {len(self.xy)} points matched>"
+        return f"<Correlation: {int(self.good.sum())} of {len(self.xy)} points matched>"
 
     @property
     def xy(self) -> Pixels:
@@ -219,7 +223,7 @@ def correlate(
     interpolation: Literal["quintic", "cubic"] = "quintic",
     threads: int | None = None,
     progress: ProgressChoice = None,
-) -> ImageCorrelation:
+) -> Correlation:
     """Digital image correlation of two images: where each point of the reference lies in the current image.
 
     Parameters
@@ -270,7 +274,7 @@ def correlate(
                 *images, region, settings, threads=threads, names=names,
                 progress=lambda done, total: report(Progress("correlate", done / total, f"{done} of {total} points")),
             )  # fmt: skip
-    return ImageCorrelation(matches, faces, images[0])
+    return Correlation(matches, faces, images[0])
 
 
 def import_folder(source: str | Path, session: str | Path) -> Session:

@@ -28,7 +28,7 @@ def speckle() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def matches(speckle: np.ndarray) -> ringdic.ImageCorrelation:
+def matches(speckle: np.ndarray) -> ringdic.Correlation:
     return ringdic.correlate(speckle, shift(speckle, SHIFT[::-1]), radius=12, step=8, progress=False)
 
 
@@ -69,7 +69,7 @@ def test_examples_are_true(run: ringdic.Run, tmp_path: Path) -> None:
                 assert doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example).failed == 0, example.name
 
 
-def test_a_shift_is_measured(matches: ringdic.ImageCorrelation) -> None:
+def test_a_shift_is_measured(matches: ringdic.Correlation) -> None:
     error = matches.displacement[matches.good] - SHIFT
     assert matches.good.mean() > 0.9
     assert abs(error).max() < 0.05
@@ -78,7 +78,7 @@ def test_a_shift_is_measured(matches: ringdic.ImageCorrelation) -> None:
     assert matches.faces.max() < len(matches.xy)
 
 
-def test_a_field_of_an_image_pair_is_drawn_over_the_image(matches: ringdic.ImageCorrelation) -> None:
+def test_a_field_of_an_image_pair_is_drawn_over_the_image(matches: ringdic.Correlation) -> None:
     axes = matches.plot("u")
     drawn = axes.collections[0].get_array()
     assert np.nanmedian(drawn) == pytest.approx(SHIFT[0], abs=0.01)
@@ -88,7 +88,7 @@ def test_a_field_of_an_image_pair_is_drawn_over_the_image(matches: ringdic.Image
         matches.plot("w")
 
 
-def test_saved_points_are_those_of_the_command(matches: ringdic.ImageCorrelation, tmp_path: Path) -> None:
+def test_saved_points_are_those_of_the_command(matches: ringdic.Correlation, tmp_path: Path) -> None:
     with np.load(matches.save(tmp_path / "points.npz")) as file:
         assert set(file) == {"xy", "uv", "gradient", "zncc", "iterations", "status", "sigma", "faces"}
         np.testing.assert_array_equal(file["uv"], matches.displacement)

@@ -18,7 +18,7 @@ matches them. The room knows images, masks and points only: no camera, no calibr
 ``command``        the correlation of two image files
 """
 
-from ringdic.correlation.correlate import Correlation, as_start_values, correlate_independently, correlate_points
+from ringdic.correlation.correlate import PointMatches, as_start_values, correlate_independently, correlate_points
 from ringdic.correlation.grid import grid
 from ringdic.correlation.hypotheses import WarpHypotheses, search_hypotheses, search_warps
 from ringdic.correlation.prepared import Current, Reference, prepare_current, prepare_reference
@@ -27,9 +27,9 @@ from ringdic.correlation.settings import CorrelationSettings
 from ringdic.correlation.status import Status
 
 __all__ = [
-    "Correlation",
     "CorrelationSettings",
     "Current",
+    "PointMatches",
     "Reference",
     "Status",
     "WarpHypotheses",

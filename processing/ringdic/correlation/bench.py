@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Image, Mask, Pixels
-from ringdic.correlation.correlate import Correlation, correlate_points, load_kernels, on_threads
+from ringdic.correlation.correlate import PointMatches, correlate_points, load_kernels, on_threads
 from ringdic.correlation.grid import grid
 from ringdic.correlation.machine import Machine, kernel_cost, measure_machine
 from ringdic.correlation.prepared import Current, Reference, prepare_current, prepare_reference
@@ -313,7 +313,7 @@ def _difference(pair: _Pair, interpolation: str) -> float:
     return float(np.nanmax(np.abs(displacements[1] - displacements[0])))
 
 
-def _offset_start(result: Correlation) -> Floats:
+def _offset_start(result: PointMatches) -> Floats:
     """Start values (n, 12) of the matched displacements, each 0.3 px off in a random direction, and their gradients."""
     start = np.zeros((len(result.xy), 12))
     angle = np.random.default_rng(1).uniform(0.0, 2.0 * np.pi, len(start))

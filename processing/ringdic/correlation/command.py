@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Mask
-from ringdic.correlation.correlate import Correlation, correlate_points, load_kernels, usable_threads
+from ringdic.correlation.correlate import PointMatches, correlate_points, load_kernels, usable_threads
 from ringdic.correlation.grid import grid
 from ringdic.correlation.prepared import prepare_current, prepare_reference
 from ringdic.correlation.propagation import Progress
@@ -84,7 +84,7 @@ def correlate_images(
     threads: int | None = None,
     progress: Progress | None = None,
     names: tuple[str, str, str] = ("the reference image", "the current image", "the mask"),
-) -> tuple[Correlation, NDArray[np.int32]]:
+) -> tuple[PointMatches, NDArray[np.int32]]:
     """Match a grid of points of one image in another.
 
     Parameters
@@ -133,7 +133,7 @@ def correlate_images(
     return matches, faces
 
 
-def write_points(path: Path, matches: Correlation, faces: NDArray[np.int32]) -> None:
+def write_points(path: Path, matches: PointMatches, faces: NDArray[np.int32]) -> None:
     """Write the matches of an image pair as ``points.npz``; the file appears under its name when it is whole.
 
     path : the file. matches : of n points. faces : (m, 3) int32, indices of the points of each triangle.

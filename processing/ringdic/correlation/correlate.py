@@ -43,7 +43,7 @@ _COLUMNS = [0, 6, 1, 2, 7, 8, 3, 4, 5, 9, 10, 11]
 
 
 @dataclass(frozen=True)
-class Correlation:
+class PointMatches:
     """Matches of n points of a reference image in a current image; NaN where the status is not GOOD.
 
     xy : (n, 2) float64, px, positions in the reference image.
@@ -84,7 +84,7 @@ def correlate_points(
     prefer_neighbour: bool = False,
     threads: int | None = None,
     progress: Progress | None = None,
-) -> Correlation:
+) -> PointMatches:
     """Match points of a reference image in a current image.
 
     Points with a start value are refined from it, the others are reached by reliability-guided propagation from their
@@ -127,7 +127,7 @@ def correlate_points(
 
 def correlate_independently(
     reference: Reference, current: Current, xy: Pixels, settings: CorrelationSettings, start: Floats
-) -> Correlation:
+) -> PointMatches:
     """Match points of a reference image each from its own start value, without propagation and test of outliers.
 
     Parameters
@@ -291,11 +291,11 @@ def as_start_values(parameters: Floats) -> Floats:
     return np.asarray(parameters[:, _COLUMNS])
 
 
-def _result(points: Propagation, seconds: dict[str, float]) -> Correlation:
+def _result(points: Propagation, seconds: dict[str, float]) -> PointMatches:
     """The matches of a propagation, NaN where a point is not good."""
     p = points.parameters.copy()
     p[~points.good] = np.nan
-    return Correlation(
+    return PointMatches(
         xy=points.xy,
         uv=p[:, [0, 6]],
         gradient=p[:, [1, 2, 7, 8]].reshape(-1, 2, 2),

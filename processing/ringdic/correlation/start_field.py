@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ringdic.arrays import Floats, Mask, Pixels
-from ringdic.correlation import Correlation, CorrelationSettings, Current, Reference, correlate_points
+from ringdic.correlation import CorrelationSettings, Current, PointMatches, Reference, correlate_points
 from ringdic.correlation.lattice_field import COMPLETE, interpolate_lattice
 
 _FEWEST = 8  # start values from which an affine fit extrapolates where all points lie
@@ -33,7 +33,7 @@ def match_from_lattice(
     settings: CorrelationSettings,
     start: Floats,
     spacing: int,
-) -> Correlation:
+) -> PointMatches:
     """Match all points of a grid, starting from the matches of a coarse lattice of them.
 
     Parameters
@@ -64,7 +64,7 @@ def match_from_lattice(
     return matches
 
 
-def interpolate_start_values(coarse: Correlation, xy: Pixels, spacing: int, order: int) -> Floats:
+def interpolate_start_values(coarse: PointMatches, xy: Pixels, spacing: int, order: int) -> Floats:
     """Start values of points between matches on a lattice.
 
     Parameters

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Image, Indices, Mask, Pixels
 from ringdic.correlation import (
-    Correlation,
     CorrelationSettings,
     Current,
+    PointMatches,
     Reference,
     Status,
     correlate_independently,
@@ -199,7 +199,7 @@ class _Parts:
     systematic: Floats
     matches: Floats
 
-    def add(self, images: ReferenceImages, cameras: tuple[int, int], matches: Correlation, nodes: Indices) -> None:
+    def add(self, images: ReferenceImages, cameras: tuple[int, int], matches: PointMatches, nodes: Indices) -> None:
         """Add the variances of the matches of some nodes (k,) from the first of two cameras to the second.
 
         The variance in the first camera is the mean over the matches from it. Half of what is not noise is ascribed

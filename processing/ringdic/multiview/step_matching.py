@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels
 from ringdic.correlation import (
-    Correlation,
     CorrelationSettings,
     Current,
+    PointMatches,
     Reference,
     Status,
     as_start_values,
@@ -147,7 +147,7 @@ def _at_knots(
     start: Floats | None,
     settings: CorrelationSettings,
     search: bool,
-) -> Correlation:
+) -> PointMatches:
     """Match the knots from start values, from optical flow, or by a search over the images.
 
     current : the part of the current image about the start values, and the whole. start : (n, 12), of all points.
@@ -171,7 +171,7 @@ def _at_knots(
     return with_matches(matches, lost, correlate_independently(reference, part, xy[lost], settings, smooth_start))
 
 
-def with_matches(matches: Correlation, index: Indices, other: Correlation) -> Correlation:
+def with_matches(matches: PointMatches, index: Indices, other: PointMatches) -> PointMatches:
     """Matches in which the points ``index`` (k,) are replaced by those of other matches where these are good."""
     good = other.good
     arrays = {}
@@ -181,7 +181,7 @@ def with_matches(matches: Correlation, index: Indices, other: Correlation) -> Co
             values = values.copy()
             values[index[good]] = getattr(other, each.name)[good]
         arrays[each.name] = values
-    return Correlation(**arrays)
+    return PointMatches(**arrays)
 
 
 def _about(positions: Pixels, radius: int, part: Current, whole: Current) -> Current:
@@ -206,7 +206,7 @@ def _match_pixels(
     start: Floats | None,
     settings: CorrelationSettings,
     search: bool,
-) -> Correlation:
+) -> PointMatches:
     """Match pixels (n, 2) px in one pass, from start values (n, 12) or, where too few of these hold, by a search."""
     known: Mask = np.zeros(len(pixels), bool)
     if start is not None:
@@ -220,13 +220,13 @@ def _match_pixels(
     return searched if searched.good.sum() > matches.good.sum() else matches
 
 
-def _warp(matches: Correlation) -> Floats:
+def _warp(matches: PointMatches) -> Floats:
     """Warps (n, 12) of matches."""
     n = len(matches.xy)
     return np.concatenate([matches.uv, matches.gradient.reshape(n, 4), matches.curvature.reshape(n, 6)], axis=1)
 
 
-def _smooth(first: Correlation, points: TrackedPoints) -> Floats:
+def _smooth(first: PointMatches, points: TrackedPoints) -> Floats:
     """Warps (m, 12) of the knots by the quadratics of their neighbours' displacement; NaN where these are too few."""
     return _warp_of(robust_quadratics(points.neighbourhoods, first.uv, np.hypot(*first.sigma.T)))
 
@@ -236,7 +236,7 @@ def _warp_of(fit: QuadraticFit) -> Floats:
     return np.concatenate([fit.value, fit.gradient.reshape(-1, 4), fit.curvature.reshape(-1, 6)], axis=1)
 
 
-def _predicted_warps(first: Correlation, points: TrackedPoints, radius: int) -> Floats:
+def _predicted_warps(first: PointMatches, points: TrackedPoints, radius: int) -> Floats:
     """Predict the warps (n, 12) of all points from the knots' matches, with the second derivatives to be held fixed."""
     fit = robust_quadratics(points.neighbourhoods, first.uv, np.hypot(*first.sigma.T))
     warp = _warp_of(fit)
@@ -248,7 +248,7 @@ def _predicted_warps(first: Correlation, points: TrackedPoints, radius: int) -> 
     return out
 
 
-def _fixed_curvature(fit: QuadraticFit, first: Correlation, points: TrackedPoints, radius: int) -> Floats:
+def _fixed_curvature(fit: QuadraticFit, first: PointMatches, points: TrackedPoints, radius: int) -> Floats:
     """Second derivatives (n, 6) that the second pass holds fixed, from the quadratics of the first pass.
 
     Where a knot's own are too uncertain, as at the rim, those of the nearest knot are taken. A wrong second
@@ -266,7 +266,7 @@ def _fixed_curvature(fit: QuadraticFit, first: Correlation, points: TrackedPoint
     return np.asarray(curvature[points.nearest(known)])
 
 
-def _subtract_bias(first: Correlation, second: Correlation, points: TrackedPoints) -> Correlation:
+def _subtract_bias(first: PointMatches, second: PointMatches, points: TrackedPoints) -> PointMatches:
     """Subtract from the second pass the smooth part of its difference from the first that exceeds noise.
 
     This is the bias of first-order subsets where the field is not quadratic; its uncertainty is added to that of the
@@ -300,7 +300,7 @@ def _shrinkage(values: Floats, sigma: Floats, limit: float) -> Floats:
         return np.nan_to_num(np.maximum(0.0, 1.0 - limit / squares))
 
 
-def _mean_square(matches: Correlation, points: TrackedPoints) -> Floats:
+def _mean_square(matches: PointMatches, points: TrackedPoints) -> Floats:
     """Mean square difference (n,) of the subsets, grey levels², at least that of rounding to whole grey levels.
 
     It is C_LS times the variance of the reference's subset.
@@ -315,7 +315,7 @@ def _lost(points: TrackedPoints, status: Indices) -> ImageMatches:
     return ImageMatches(np.full((n, 12), np.nan), np.full((n, 2), np.nan), lost, lost.copy(), status)
 
 
-def _reject_outliers(matches: Correlation, points: TrackedPoints) -> ImageMatches:
+def _reject_outliers(matches: PointMatches, points: TrackedPoints) -> ImageMatches:
     """Matches at the points themselves; those unlike the reference or contradicting their neighbours are lost."""
     status = matches.status.copy()
     mean_square = _mean_square(matches, points)

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Image, Mask, Pixels
 from ringdic.correlation import (
-    Correlation,
     CorrelationSettings,
     Current,
+    PointMatches,
     Reference,
     Status,
     correlate_points,
@@ -145,7 +145,7 @@ def interpolate_matches(matches: CameraMatches, xy: Pixels) -> CameraPixels:
     return CameraPixels(xy + interpolated[:, :2], interpolated[:, 6:8], interpolated[:, 8], status)
 
 
-def track_points(reference: Reference, current: Current, xy: Pixels, settings: CorrelationSettings) -> Correlation:
+def track_points(reference: Reference, current: Current, xy: Pixels, settings: CorrelationSettings) -> PointMatches:
     """Match points of a camera's reference image in a later image, with start values from optical flow.
 
     Where these lead to few matches, the correlation seeks start values in its own ways. xy : (n, 2) float64, px.

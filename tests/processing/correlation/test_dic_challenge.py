@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import pytest
 from ringdic.correlation import (
-    Correlation,
     CorrelationSettings,
+    PointMatches,
     Status,
     correlate_points,
     grid,
@@ -66,7 +66,7 @@ def correlation_of_grid(reference, current, settings, mask=None):
     )
 
 
-def error_row(name: str, settings: CorrelationSettings, result: Correlation, truth, shape, where=None) -> ErrorRow:
+def error_row(name: str, settings: CorrelationSettings, result: PointMatches, truth, shape, where=None) -> ErrorRow:
     """The row of one image; a point without a match counts as lost if its true subset lies inside the current image."""
     known = np.isfinite(truth).all(axis=1)
     if where is not None:

@@ -1,7 +1,7 @@
 """Start values interpolated between the matches of a lattice."""
 
 import numpy as np
-from ringdic.correlation import Correlation, CorrelationSettings
+from ringdic.correlation import CorrelationSettings, PointMatches
 from ringdic.correlation.start_field import interpolate_start_values, lattice_spacing, on_lattice
 
 SPACING = 40
@@ -17,11 +17,11 @@ def quadratic_field(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return uv, slope, bend
 
 
-def correlation_of(xy: np.ndarray, lost: np.ndarray) -> Correlation:
+def correlation_of(xy: np.ndarray, lost: np.ndarray) -> PointMatches:
     """Correlation of points (n, 2) that moved by the quadratic field; lost : (n,), 1 for points without a match."""
     uv, slope, bend = quadratic_field(xy)
     n = len(xy)
-    return Correlation(xy, uv, slope, bend, np.ones(n), np.zeros(n), np.ones(n, int), 2 * lost, np.zeros((n, 2)), {})
+    return PointMatches(xy, uv, slope, bend, np.ones(n), np.zeros(n), np.ones(n, int), 2 * lost, np.zeros((n, 2)), {})
 
 
 def grid(step: int) -> np.ndarray:
