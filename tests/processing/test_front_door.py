@@ -80,8 +80,8 @@ def test_a_shift_is_measured(matches: ringdic.Correlation) -> None:
 
 def test_a_field_of_an_image_pair_is_drawn_over_the_image(matches: ringdic.Correlation) -> None:
     axes = matches.plot("u")
-    drawn = axes.collections[0].get_array()
-    assert np.nanmedian(drawn) == pytest.approx(SHIFT[0], abs=0.01)
+    drawn = axes.collections[0].get_array().compressed()
+    assert np.median(drawn) == pytest.approx(SHIFT[0], abs=0.01)
     assert axes.figure.axes[-1].get_ylabel() == "Displacement u, to the right, px"
     assert matches.plot("E1", window=40.0, axes=axes) is axes
     with pytest.raises(ringdic.InputError, match="no field 'w'; there are u, v"):
