@@ -45,7 +45,7 @@ test-narrow: $(VENV)/.installed-test   ## the kernels compiled for an x86-64 pro
 	NUMBA_CPU_NAME=haswell NUMBA_CPU_FEATURES="$(NARROW)" NUMBA_CACHE_DIR=build/narrow \
 	  $(BIN)/python -m pytest tests/processing/correlation/test_single_precision_kernel.py
 
-test-numba:                            ## the kernels as compiled by the oldest numba, or another: OLDEST=0.66
+test-numba:                            ## the kernels as compiled by the oldest numba that is allowed
 	test -d build/numba || $(PYTHON) -m venv build/numba
 	RINGDIC_SKIP_PAGE=1 build/numba/bin/python -m pip install --quiet ".[processing]" "numba==$(OLDEST).*" pytest
 	cd build && numba/bin/python -P -m pytest --noconftest ../tests/processing/correlation/test_single_precision_kernel.py
