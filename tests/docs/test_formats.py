@@ -60,7 +60,8 @@ def test_a_session_of_a_newer_schema_is_refused(session: Path, name: str) -> Non
     with pytest.raises(InputError) as refusal:
         open_session(session)
     assert str(session / name) in str(refusal.value)
-    assert "schema" in str(refusal.value)
+    assert "schema 99" in str(refusal.value)
+    assert "update RingDIC" in str(refusal.value)
     assert "99" in str(refusal.value)
 
 

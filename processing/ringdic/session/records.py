@@ -29,6 +29,10 @@ class SessionError(InputError):
     """A session or a record of it that does not exist, exists already or cannot be used; the text tells which."""
 
 
+class _NewerSchemaError(SessionError):
+    """A record that a newer version has written: it is not damaged."""
+
+
 @dataclass(frozen=True)
 class _Record:
     """A JSON object whose fields are those of the class, in order; `unknown` are all others of the object."""
@@ -269,6 +273,8 @@ def _read(path: Path, from_json: Callable[[Mapping[str, Any]], R]) -> R:
         raise SessionError(f"{path}: not readable as JSON ({error}); {REMEDY}") from error
     try:
         return from_json(document)
+    except _NewerSchemaError as error:
+        raise SessionError(f"{path}: {error}; update RingDIC") from error
     except SessionError as error:
         raise SessionError(f"{path}: {error}; {REMEDY}") from error
 
@@ -277,6 +283,8 @@ def _without_schema(document: Any) -> dict[str, Any]:
     """The other fields of a record. SessionError where it is no JSON object or has another schema."""
     if not isinstance(document, Mapping):
         raise SessionError("not a record of a session")
-    if document.get("schema") != SCHEMA:
-        raise SessionError(f"a record of schema {document.get('schema')!r}, but this version reads schema {SCHEMA}")
+    schema = document.get("schema")
+    if schema != SCHEMA:
+        error = _NewerSchemaError if isinstance(schema, int) and schema > SCHEMA else SessionError
+        raise error(f"a record of schema {schema!r}, but this version reads schema {SCHEMA}")
     return {name: value for name, value in document.items() if name != "schema"}

@@ -55,7 +55,6 @@ def test_fields_of_a_later_version_survive_what_the_writer_changes(tmp_path) -> 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"schema": 2}, "schema 2, but this version reads schema 1"),
         ({"schema": None}, "schema None"),
         ({"number": 1.0}, "'number' must be a whole number, not 1.0"),
         ({"number": 2}, "'capture_id' '0001-board' is not that of number 2"),
@@ -76,6 +75,14 @@ def test_a_wrong_field_is_named_with_its_file(tmp_path, change: dict[str, Any], 
     assert str(refusal.value).startswith(f"{file}: ")
     assert words in str(refusal.value)
     assert str(refusal.value).endswith("; copy it back, or import the session again")
+
+
+def test_a_record_of_a_newer_schema_asks_for_an_update(tmp_path) -> None:
+    file = tmp_path / "capture.json"
+    file.write_text(json.dumps({**CAPTURE, "schema": 2}))
+    with pytest.raises(SessionError) as refusal:
+        read_capture_record(file)
+    assert str(refusal.value) == f"{file}: a record of schema 2, but this version reads schema 1; update RingDIC"
 
 
 def test_a_missing_field_is_named() -> None:
