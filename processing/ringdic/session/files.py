@@ -1,6 +1,7 @@
-"""Files that are whole from the moment they have their names, and that outlive a power cut.
+"""Atomic and durable writing of files: a file under its name is complete, and survives a power cut.
 
-A file is written aside, flushed to the disk, and then linked or renamed to its name; so is the folder that holds it.
+A file is written under a temporary name, flushed to the disk, and then linked or renamed to its name; then its folder
+is flushed too.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ PARTIAL = ".partial-"  # how the names of files begin that are being written
 
 
 def place(path: Path, content: bytes) -> None:
-    """Write a new file; raises FileExistsError where the name is taken, and never replaces a file."""
+    """Write a new file atomically; raises FileExistsError where the name is taken, and never replaces a file."""
     aside = _write_aside(path, content)
     try:
         os.link(aside, path)
@@ -25,7 +26,7 @@ def place(path: Path, content: bytes) -> None:
 
 
 def link(source: Path, path: Path) -> bool:
-    """Give a file a second name; False where the file system cannot.
+    """Hard-link a file to a second name; returns False where the file system cannot.
 
     Raises FileExistsError where the name is taken, and never replaces a file.
     """
@@ -39,7 +40,7 @@ def link(source: Path, path: Path) -> bool:
 
 
 def replace_json(path: Path, document: dict[str, Any]) -> None:
-    """Replace a JSON file as a whole: whoever reads meanwhile sees the old file or the new one."""
+    """Replace a JSON file atomically: a reader sees either the old file or the new one."""
     aside = _write_aside(path, json.dumps(document, indent=1).encode() + b"\n")
     os.replace(aside, path)
     _flush_folder(path.parent)

@@ -9,18 +9,18 @@
         0001-board/               NNNN-kind, see `ringdic.session.names`
           capture.json            the record, see `ringdic.session.records`: per camera status, file, SHA-256, times,
                                   exposure, metadata
-          201.pgm …               one image a camera, byte for byte as delivered
+          201.pgm …               one image per camera, the camera's bytes unchanged
         0002-target/ …
         0003-specimen/ …          the first specimen capture is the reference, the others are the steps
       mask/<camera>.png           optional region of interest on the reference image
-      calibration/                cameras as calibrated, kept under a key of what they rest on
-      work/                       outputs of the tasks of processing, under keys of what they rest on; may be removed
+      calibration/                calibrated cameras, each stored under a hash of its inputs
+      work/                       outputs of the tasks of processing, each under a hash of its inputs; may be removed
       results/
-        0001/ …                   one folder a processing run, written aside and renamed: results.h5, settings.toml,
+        0001/ …                   one folder a processing run, renamed once complete: results.h5, settings.toml,
                                   calibration.json, summary.json
       live/
-        0005-specimen/ …          the newest steps as shown while the capturing goes on: results.h5 of the reference and
-                                  that step; older ones are taken away
+        0005-specimen/ …          the newest steps, processed during the capture: results.h5 of the reference and
+                                  that step; older ones are removed
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Session:
 
 
 def open_session(path: Path) -> Session:
-    """Read a session folder: its rig, its records, and where its images lie.
+    """Read a session folder: its rig, its records, and the paths of its images.
 
     InputError says which file is missing or damaged.
     """
@@ -128,7 +128,7 @@ def newest_results(path: Path, run: int | None = None) -> Path:
 
 
 def live_results(path: Path) -> tuple[Path, ...]:
-    """Folders of the results of single steps that were processed at once, oldest first.
+    """Folders of the results of single steps that were processed during the capture, oldest first.
 
     Each is named by the step's capture. path : the session folder.
     """
@@ -141,7 +141,7 @@ def live_results(path: Path) -> tuple[Path, ...]:
 
 @contextmanager
 def new_live(path: Path, capture_id: str) -> Iterator[Path]:
-    """Make a folder for the results of a single step, which takes its place once everything is written into it.
+    """Context with a temporary folder for a single step's results, renamed to its final name when the context ends.
 
     Results of older steps are removed, except for the newest few. A step that fails leaves nothing behind.
 
@@ -169,7 +169,7 @@ def new_live(path: Path, capture_id: str) -> Iterator[Path]:
 
 @dataclass
 class NewRun:
-    """A processing run that is being written. folder : where to write. final : where it lies once it is whole."""
+    """A processing run that is being written. folder : where to write. final : path of the complete run."""
 
     folder: Path
     final: Path | None = None
@@ -177,7 +177,7 @@ class NewRun:
 
 @contextmanager
 def new_run(path: Path) -> Iterator[NewRun]:
-    """Make a folder for a processing run, which gets its number once everything is written into it.
+    """Context with a temporary folder for a processing run, renamed to the run's number when the context ends.
 
     It never replaces another run; a run that fails leaves nothing behind. path : the session folder.
     """

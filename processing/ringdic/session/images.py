@@ -1,4 +1,4 @@
-"""Image files and masks decoded to grey levels and regions. A damaged file is refused, never half read."""
+"""Decoding of image files to grey levels and of mask files to regions. A damaged file is refused, never half read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Import of a folder of images: it becomes a session of the form that captures have too.
+"""Import of a folder of images as a session folder, of the same form as that of a captured session.
 
 ::
 
@@ -6,7 +6,7 @@
     SRC/board/<camera>/*.{png,jpg,tif}      checkerboard views, any number a camera
     SRC/target/<camera>.{png,jpg,tif}       calibration object
     SRC/specimen/<camera>/*.{png,jpg,tif}   steps in natural order; the first is the reference configuration
-    SRC/static/<camera>/*.{png,jpg,tif}     optional: captures of the specimen at rest, beside the reference
+    SRC/static/<camera>/*.{png,jpg,tif}     optional: captures of the specimen at rest, as at the reference
     SRC/mask/<camera>.png                   optional region of interest on the reference image
 
 Everything is decoded and checked before the session appears, so a refused folder leaves nothing behind.
@@ -58,14 +58,18 @@ def import_images(
     progress: Progress | None = None,
     wall_ns: Callable[[], int] = time.time_ns,
 ) -> Path:
-    """Make a session folder of a folder of images; the session's path.
+    """Create a session folder from a folder of images, after checking every image.
 
     Parameters
     ----------
     src : the folder that holds ``rig.toml`` and the images.
-    session : the session folder to make; it must not exist.
+    session : the session folder to create; it must not exist.
     progress : called with images checked, images in all, and a file's name.
-    wall_ns : the time that the records bear, ns since the Unix epoch.
+    wall_ns : the time that is written into the records, ns since the Unix epoch.
+
+    Returns
+    -------
+    The session's path.
 
     Raises
     ------

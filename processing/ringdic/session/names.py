@@ -1,7 +1,7 @@
-"""Kinds of capture, and the names that sessions, captures and cameras may bear in folders and in messages.
+"""Kinds of capture, and the names that sessions, captures and cameras may have in folders and in messages.
 
 The messages between node and controller (`ringdic_node.wire`) follow the same kinds and the same rule. A node has no
-package `ringdic`, so they are written there once more; a test holds the two together.
+package `ringdic`, so they are repeated there; a test checks that the two agree.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ _CAPTURE_ID = re.compile(r"(\d{4,})-([a-z]+)")
 
 
 def checked_name(what: str, name: object) -> str:
-    """Return a name that may stand in a file name and in a message's key.
+    """Return a name unchanged if it can be used in file names and in messages' keys, else raise InputError.
 
     Parameters
     ----------
-    what : what bears the name, for the sentence of a refusal, such as "the session name".
+    what : what the name is of, for the error message, such as "the session name".
     name : the candidate.
 
     Raises

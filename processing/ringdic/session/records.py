@@ -1,7 +1,7 @@
 """The JSON records of a session folder: ``session.json`` and each capture's ``capture.json``, typed and checked.
 
-A record of another schema is refused. Fields that this version does not know are ignored when a record is read and
-kept when it is written again. Times are integers, ns since the Unix epoch, or ISO 8601 text in UTC.
+A record of another schema is refused. Unknown fields are ignored when a record is read and
+preserved when it is written again. Times are integers, ns since the Unix epoch, or ISO 8601 text in UTC.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ R = TypeVar("R", bound="_Record")
 
 
 class SessionError(InputError):
-    """A session or a record of it that does not exist, exists already or cannot be used; the text tells which."""
+    """A session or a record of it that does not exist, exists already or cannot be used; the message says which."""
 
 
 class _NewerSchemaError(SessionError):
@@ -79,7 +79,7 @@ _TYPES: dict[str, tuple[str, tuple[type, ...]]] = {
 
 @dataclass(frozen=True)
 class SessionRecord(_Record):
-    """Record of a session, kept in ``session.json``: what it is called, of which rig, and whence its images come.
+    """Record of a session, stored in ``session.json``: its name, its rig and the source of its images.
 
     session : name of the session. rig : name of the rig. created : ISO 8601. source : "capture" or "import".
     """
@@ -96,7 +96,7 @@ class SessionRecord(_Record):
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> SessionRecord:
-        """The record that the JSON object of a ``session.json`` holds. Raises SessionError."""
+        """Parse the record from the JSON object of a ``session.json``. Raises SessionError."""
         return cls._of(_without_schema(document))
 
     def to_json(self) -> dict[str, Any]:
@@ -109,7 +109,7 @@ class ImageDescription:
     """Description of an image that comes from a camera: checksum, size, time of exposure, metadata.
 
     sha256 : hexadecimal digits. width, height : px. time_ns : measured time of the exposure. exposure_us : µs.
-    metadata : JSON values that the camera told. format : extension of the file, without the dot.
+    metadata : JSON values from the camera. format : extension of the file, without the dot.
     """
 
     sha256: str
@@ -127,8 +127,8 @@ class CameraRecord(_Record):
 
     status : "pending" while the image is awaited, "ok", "late" where it came after the close, "failed".
     reason : why it is late or failed. file : name of the image in the capture's folder. sha256, bytes : of that file.
-    width, height : px. time_ns : measured time of the exposure. exposure_us : µs. metadata : JSON values that the
-    camera told. original : the file that was imported.
+    width, height : px. time_ns : measured time of the exposure. exposure_us : µs. metadata : JSON values from
+    the camera. original : the file that was imported.
     """
 
     status: str = "pending"
@@ -157,7 +157,7 @@ class CameraRecord(_Record):
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> CameraRecord:
-        """The entry that a JSON object holds. Raises SessionError."""
+        """Parse the entry from its JSON object. Raises SessionError."""
         return cls._of(document)
 
     def to_json(self) -> dict[str, Any]:
@@ -167,7 +167,7 @@ class CameraRecord(_Record):
 
 @dataclass(frozen=True)
 class CaptureRecord(_Record):
-    """Record of one capture, kept in its ``capture.json``: when it was taken, and what became of each camera's image.
+    """Record of one capture, stored in its ``capture.json``: its times, and the state of each camera's image.
 
     capture_id : ``NNNN-kind``, of `number` and `kind`. session : name of the session. state : "open" or "closed".
     opened_at, closed_at : ISO 8601. fire_at_ns : planned moment of the exposure. skew_ns : spread of the cameras'
@@ -199,7 +199,7 @@ class CaptureRecord(_Record):
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> CaptureRecord:
-        """The record that the JSON object of a ``capture.json`` holds. Raises SessionError."""
+        """Parse the record from the JSON object of a ``capture.json``. Raises SessionError."""
         document = _without_schema(document)
         entries = document.get("cameras", {})
         if not isinstance(entries, Mapping):
@@ -218,7 +218,7 @@ class CaptureRecord(_Record):
         return {"schema": SCHEMA, **self._fields(), "cameras": entries}
 
     def with_entry(self, camera: str, entry: CameraRecord) -> CaptureRecord:
-        """The record with another entry for a camera; the skew of a closed capture is measured anew."""
+        """The record with another entry for a camera; the skew of a closed capture is computed again."""
         changed = replace(self, cameras={**self.cameras, camera: entry})
         return changed._with_skew() if self.state == "closed" else changed
 
@@ -231,7 +231,7 @@ class CaptureRecord(_Record):
         return replace(self, cameras={**self.cameras, camera: entry})
 
     def closed(self, at: str, failures: Mapping[str, str]) -> CaptureRecord:
-        """The record at the end of the capture: every camera without an image has failed, and the skew is measured.
+        """The record at the end of the capture: cameras without an image are marked as failed, the skew is computed.
 
         at : the time of the close, ISO 8601. failures : reasons, by camera.
         """

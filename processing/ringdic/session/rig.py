@@ -1,4 +1,4 @@
-"""The rig as the laboratory describes it: ``rig.toml`` read, checked and frozen."""
+"""Description of a rig by the laboratory, read from ``rig.toml`` and checked: target, checkerboard, cameras, pairs."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class Target:
 
 @dataclass(frozen=True, config=TABLE)
 class Board:
-    """The checkerboard that the lenses are measured on. squares : (across, along). square_mm : their edge."""
+    """The checkerboard from which the lenses are calibrated. squares : (across, along). square_mm : their edge."""
 
     kind: Literal["checkerboard"]
     squares: Annotated[tuple[Squares, Squares], BeforeValidator(_two_numbers)]
@@ -96,11 +96,11 @@ class Board:
 
 @dataclass(frozen=True, config=TABLE)
 class RigCamera:
-    """One camera of the ring as it was set up by hand.
+    """One camera of the ring, with its nominal position as it was set up by hand.
 
     id : names its images and its node. azimuth_deg : about z, nominal, good to ± 5°. height_mm, distance_mm : of the
     camera over z = 0 and from the axis. rotation_deg : of the image about the line of sight. intrinsics : file of a
-    lens that was measured before.
+    lens that was calibrated before.
     """
 
     id: Annotated[str, AfterValidator(_usable_id)]
@@ -219,7 +219,7 @@ def read_rig(path: Path) -> Rig:
 
 
 def parse_rig(text: str) -> Rig:
-    """The rig that the text of a ``rig.toml`` describes.
+    """Parse and check the text of a ``rig.toml``.
 
     Without ``[pairs]``, every adjacent pair of cameras is one.
 

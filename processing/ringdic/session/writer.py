@@ -1,9 +1,10 @@
 """Writing of session folders: images, JSON records, checksums. No image is ever overwritten.
 
-The tree is drawn in `ringdic.session.folder`. An image is written aside, flushed, and linked to its name, which
-refuses to replace another. A capture's record is replaced as a whole whenever a camera's state changes.
+The tree is drawn in `ringdic.session.folder`. An image is written under a temporary name, flushed, and
+linked to its name, which never replaces another file. A capture's record is replaced atomically whenever a camera's
+state changes.
 
-One `Archive` a process writes to a root folder.
+Only one `Archive` of a process may write to a root folder.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ log = logging.getLogger(__name__)
 
 
 class SessionExistsError(SessionError, FileExistsError):
-    """The session's name is taken."""
+    """A session of this name exists already."""
 
 
 class Archive:
@@ -44,7 +45,7 @@ class Archive:
 
     Parameters
     ----------
-    root : the folder; it is made if absent.
+    root : the folder; created if absent.
     wall_ns : the time, ns since the Unix epoch.
     """
 
@@ -55,7 +56,7 @@ class Archive:
         self._lock = threading.RLock()
 
     def create_session(self, name: str, rig_toml: str, *, source: str = "capture") -> SessionWriter:
-        """Make a new, empty session.
+        """Create a new, empty session.
 
         Parameters
         ----------
@@ -133,11 +134,11 @@ class SessionWriter:
         wall_ns: Callable[[], int],
         lock: threading.RLock | None = None,
     ) -> SessionWriter:
-        """Make a new session folder.
+        """Create a new session folder.
 
         Parameters
         ----------
-        path : the folder; its parents are made.
+        path : the folder; its parents are created.
         name : of the session.
         rig_toml : text of its rig file.
         source : "capture" or "import".
@@ -221,10 +222,10 @@ class SessionWriter:
 
 @dataclass(frozen=True)
 class ArchivedImage:
-    """Where an image that was handed over lies, and how it came there.
+    """Outcome of archiving an image: its file, and whether it is new, a repeat or in conflict with another image.
 
-    verdict : "archived"; "repeat" where this very image was there; "conflict" where another was, and this one is kept
-    beside it. file : its name in the capture's folder.
+    verdict : "archived"; "repeat" where the same image was archived before; "conflict" where another one was, and this
+    one is stored under another name. file : its name in the capture's folder.
     """
 
     verdict: str
@@ -234,7 +235,7 @@ class ArchivedImage:
 class CaptureWriter:
     """Writer of one capture folder.
 
-    Every call reads the record afresh, so several writers of one process may be used on a capture.
+    Every call reads the record again, so several writers of one process may be used on a capture.
     """
 
     def __init__(self, path: Path, wall_ns: Callable[[], int], lock: threading.RLock) -> None:
@@ -258,7 +259,7 @@ class CaptureWriter:
     ) -> ArchivedImage:
         """Archive an image under its camera's name.
 
-        An identical repeat changes nothing; another image of the same camera is kept aside and the first stays. After
+        An identical repeat changes nothing; another image of the same camera is stored under another name. After
         the close, the camera's status becomes late.
 
         Parameters
@@ -335,7 +336,7 @@ class CaptureWriter:
         return ArchivedImage(verdict, path.name)
 
     def _keep_aside(self, camera: str, path: Path, image: bytes) -> ArchivedImage:
-        """Write an image that is not the archived one of its camera beside it, once however often it comes."""
+        """Write a second, different image of a camera under another name; repeats of it are not written again."""
         sha256 = hashlib.sha256(image).hexdigest()
         number = 1
         while True:
@@ -352,7 +353,7 @@ class CaptureWriter:
         return ArchivedImage("conflict", aside.name)
 
     def fail(self, camera: str, reason: str) -> None:
-        """Note why a camera has no image; an archived image is never overruled."""
+        """Record why a camera has no image; ignored where its image is archived."""
         with self._lock:
             record = self.record()
             changed = record.with_failure(camera, reason)
@@ -374,7 +375,7 @@ class CaptureWriter:
 
 
 def verify(session: Path) -> list[str]:
-    """Compute every checksum of a session folder anew; a sentence for each image that is not as recorded."""
+    """Check all images of a session folder against their recorded checksums; returns a sentence for each fault."""
     problems = []
     for path in sorted(Path(session).glob("captures/*/capture.json")):
         record = read_capture_record(path)
