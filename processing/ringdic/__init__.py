@@ -1,4 +1,4 @@
-"""From a session of images to displacement, stretch and strain of the whole surface, with nothing to click.
+"""Multi-view 3D digital image correlation: from images of calibrated cameras to displacement and strain of a surface.
 
 Conventions, stated once
 ------------------------

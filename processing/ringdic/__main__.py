@@ -1,4 +1,4 @@
-"""The command ``ringdic``, also as ``python -m ringdic``: sentences instead of tracebacks for what can be mended.
+"""The command ``ringdic``, also as ``python -m ringdic``: bad input ends in one sentence, without a traceback.
 
 Exit codes: 0 done, 2 bad input, 3 could not be computed, 1 a bug.
 """
@@ -25,7 +25,7 @@ def main() -> None:
         if sentence is None:
             raise
         _refuse(sentence)
-    except OSError as error:  # a folder that may not be written, a full disk: the operator's to mend
+    except OSError as error:  # a folder that may not be written, a full disk: the operator can correct that
         if error.filename is None:
             raise
         _refuse(InputError(f"{error.filename}: {error.strerror}; check the path, its permissions and the disk"))

@@ -19,8 +19,8 @@ A session of a calibrated rig, in six::
     run.plot("lambda2")
     run.export("results.vtkhdf")
 
-A mistake that can be mended is an :class:`InputError`, sound input that does not determine an answer a
-:class:`ComputationError`; both say in one sentence what is wrong and what to do.
+Bad input raises :class:`InputError`, valid input that does not determine a result :class:`ComputationError`;
+both say in one sentence what is wrong and what to do.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ ImageSource = str | Path | NDArray
 """An image: the path of a PNG, JPEG, TIFF or PGM file, or an array (height, width) of grey levels."""
 
 ProgressChoice = Callable[[Progress], None] | Literal[False] | None
-"""Where progress goes: None shows a bar in a terminal or notebook, False nothing; a function is called with it."""
+"""Choice of progress reporting: None shows a bar in a terminal or notebook, False nothing; a function is called."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -65,12 +65,12 @@ class Correlation:
     displacement : (n, 2) px, current minus reference position; NaN where a point was not matched.
     gradient : (n, 2, 2), ∂u_i/∂x_j of the subset, no unit.
     zncc : (n,), zero-normalised cross-correlation, 1 for a perfect match.
-    sigma : (n, 2) px, standard deviation of the displacement by the noise of the images.
+    sigma : (n, 2) px, standard deviation of the displacement due to image noise.
     status : (n,), 0 for a match; else why there is none, see :class:`ringdic.correlation.Status`.
     faces : (m, 3) int32, indices of the points of each triangle of the grid.
     seconds : time spent by stage: prepare, start, refine.
     image : (height, width), grey levels of the reference image, over which fields are drawn.
-    matches : all that the correlation tells of the points, see :class:`ringdic.correlation.PointMatches`.
+    matches : all results of the correlation at the points, see :class:`ringdic.correlation.PointMatches`.
     """
 
     matches: PointMatches
@@ -102,7 +102,7 @@ class Correlation:
 
     @property
     def sigma(self) -> Pixels:
-        """Standard deviation of each displacement by the noise of the images, (n, 2) px."""
+        """Standard deviation of each displacement due to image noise, (n, 2) px."""
         return self.matches.sigma
 
     @property
@@ -183,9 +183,10 @@ class Correlation:
         return draw_over_image(axes, self.image, self.xy, self.faces, values, scale)
 
     def save(self, path: str | Path) -> Path:
-        """Write the points as ``ringdic correlate`` does, and return the path of the npz file.
+        """Write the matches to an npz file, and return its path.
 
-        Its arrays are xy, uv (the displacement), gradient, zncc, iterations, status, sigma and faces.
+        The arrays are those that ``ringdic correlate`` writes: xy, uv (the displacement), gradient, zncc, iterations,
+        status, sigma and faces.
         Raises InputError where nothing can be written to the path.
         """
         from ringdic.correlation.command import write_points
@@ -242,7 +243,7 @@ def correlate(
     Raises
     ------
     InputError : an unreadable image, images of different size, a mask without points, a setting out of range.
-    ComputationError : no point of the reference was found in the current image.
+    ComputationError : no point of the reference was matched in the current image.
 
     Examples
     --------
@@ -279,10 +280,10 @@ def correlate(
 
 
 def import_folder(source: str | Path, session: str | Path) -> Session:
-    """Make a session of a folder of images.
+    """Create a session folder from a folder of images, after checking every image.
 
     source : a folder with ``rig.toml`` and the folders ``board``, ``target`` and ``specimen``, each with the images of
-    every camera. session : the folder to make; it must not exist yet.
+    every camera. session : the folder to create; it must not exist yet.
 
     Raises InputError for a missing or damaged image, an unknown key in ``rig.toml``, or a session that exists.
     """
@@ -350,7 +351,7 @@ def process(
 
 
 def read_run(session: Session | str | Path, number: int | None = None) -> Run:
-    """A finished processing run of a session.
+    """Open a finished processing run of a session.
 
     session : a session or its folder. number : of the run, from 1; the newest unless given.
     Raises InputError where the session has not been processed, or has no run of this number.
@@ -367,7 +368,7 @@ def read_run(session: Session | str | Path, number: int | None = None) -> Run:
 
 @contextmanager
 def _reported(progress: ProgressChoice) -> Iterator[Report]:
-    """Where reports of progress go. Inside, a package that is not installed is an InputError with its extra."""
+    """Context that yields the progress function; a package missing inside raises InputError, naming its extra."""
     try:
         if progress is None:
             with progress_bar() as report:

@@ -6,7 +6,7 @@ the old machine code would still be loaded. Hence each state of the sources has 
 
 ``CACHE/kernels-<first 16 digits of the sources' SHA-256>``, where ``CACHE`` is the environment's ``NUMBA_CACHE_DIR``
 or, without it, a folder ``ringdic`` in the user's cache directory. Folders used longest ago are removed, unless a
-running process uses them. Processors and versions of numba are told apart by numba inside the folder.
+running process uses them. Inside the folder, numba itself separates processors and versions of numba.
 
 The module needs the standard library only and is called when :mod:`ringdic` is imported.
 """
@@ -37,7 +37,7 @@ _IN_USE = "in-use"  # a file that every process holds open, and locked, until it
 def source_digest(package: Path = _PACKAGE) -> str:
     """SHA-256 of all Python sources below a folder, by relative path and content, as 64 hexadecimal digits.
 
-    Of the library it is computed when it is imported: a file that is edited later does not change it.
+    The library's own digest is computed at import: a file that is edited later does not change it.
     """
     paths = [Path(folder, name) for folder, _, names in os.walk(package) for name in names if name.endswith(".py")]
     digest = hashlib.sha256()
@@ -49,7 +49,7 @@ def source_digest(package: Path = _PACKAGE) -> str:
 
 
 def choose_cache_folder() -> None:
-    """Let numba keep compiled kernels in the folder of these sources, in this process and those that it starts.
+    """Set numba's cache folder to the one of these sources, for this process and those that it starts.
 
     To be called before a kernel is imported. Where the folder cannot be written, a temporary one of the user is taken.
     """

@@ -1,8 +1,8 @@
-"""What can go wrong, and whose it is to mend.
+"""Errors of the library: bad input, which the operator can correct, and input that does not determine a result.
 
 RingdicError
 ├── InputError        the images, the rig file or the settings are at fault: exit code 2
-└── ComputationError  the input is sound but the answer cannot be computed: exit code 3
+└── ComputationError  the input is valid but the result cannot be computed: exit code 3
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class InputError(RingdicError, ValueError):
 
 
 class ComputationError(RingdicError, RuntimeError):
-    """Sound input that does not determine the answer: no texture in common, a board seen from one side only."""
+    """Valid input that does not determine a result: no texture in common, a board seen from one side only."""
 
     exit_code = 3
 

@@ -1,7 +1,7 @@
-"""How a long computation reports where it is, and the progress bar that shows it.
+"""Progress reports of long computations, and a progress bar that shows them.
 
-A computation calls a function with a :class:`Progress` from time to time; the caller decides what comes of it: a bar,
-a line of JSON, nothing.
+A computation calls a function with a :class:`Progress` from time to time; the caller decides what to do with it: show a
+bar, print a line of JSON, or nothing.
 """
 
 from __future__ import annotations
@@ -15,7 +15,10 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Progress:
-    """One report. ``done`` is the share of the whole job, 0 … 1; ``left_s`` an estimate in seconds, or None."""
+    """Progress of a computation at one moment.
+
+    done : share of the whole job, 0 … 1. rate : speed, in words. left_s : estimate of the time left, s, or None.
+    """
 
     stage: str
     done: float
@@ -38,9 +41,9 @@ def silent(_: Progress) -> None:
 
 @dataclass
 class Stages:
-    """Turns "k of n in this stage" into the share of the whole job and the time left.
+    """Reports of a job in several stages: share of the whole job done, and time left, from the share of a stage done.
 
-    weights : the expected share of each stage, in order; they need not sum to one.
+    weights : the expected duration of each stage, in any unit, in order; they need not sum to one.
     clock : seconds, monotonic.
     """
 

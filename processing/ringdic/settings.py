@@ -33,7 +33,7 @@ def name_without_unit(name: str) -> str:
 
 
 class CorrelationGroup(_Group):
-    """Settings of the 2D matching: the one place of their names, defaults and bounds.
+    """Settings of the 2D correlation, with their defaults and bounds.
 
     radius_px, step_px : subset radius (half the side of a square, less half a pixel) and spacing of the points, px.
     order : of the subset's shape functions, 1 affine, 2 quadratic.
@@ -42,10 +42,10 @@ class CorrelationGroup(_Group):
     tolerance : px; iteration stops when the next step would move the subset's rim by less (root mean square). The next
         step is judged by how the last two shrank (after one: by how those of other points did). It stops too when steps
         below 1e-5 px shrink no more. Below 1e-6 px all is computed in double precision, at a fifth of the speed.
-    max_iterations : after so many the point is lost, or sooner when its steps foretell that these will not do.
+    max_iterations : after so many the point is lost, or sooner when its steps predict that these will not suffice.
     zncc_min : zero-mean normalised cross-correlation below which a point is lost.
 
-    What interpolation and tolerance cost in truth, at radius 20 and speckle of 1.0, 1.5, 2.0 px (standard deviation of
+    Errors due to interpolation and tolerance, at radius 20 and speckle of 1.0, 1.5, 2.0 px (standard deviation of
     its blur): a cubic is biased by up to 4.1, 0.75, 0.22 thousandths of a pixel, a quintic by 0.99, 0.06, 0.01. A
     tolerance of 2e-3 leaves 0.2 thousandths where noise makes 3.5, and a mean of less than 0.01.
     """
@@ -94,11 +94,11 @@ class CalibrationGroup(_Group):
         information criterion (criterion).
     drop_percentile : checkerboard views whose error lies above this percentile are left out and the lens is fitted
         again; 100 keeps all views.
-    print_error_mm, radius_error_mm, pitch_error_mm, tilt_error_deg : of method bundle; standard deviations of the dots'
-        positions, the target's radius, the spacing of its columns and the turn of the printed sheet about what rig.toml
-        says; 0 holds a quantity at that.
-    refine_poses : of surface.method global; where cameras have moved between the steps, their poses are estimated anew
-        from the points that they track.
+    print_error_mm, radius_error_mm, pitch_error_mm, tilt_error_deg : for method bundle; prior standard deviations of
+        the dots' positions, the target's radius, the spacing of its columns and the rotation of the printed sheet about
+        their values in rig.toml; 0 fixes a quantity at that value.
+    refine_poses : for surface.method global; where cameras have moved between the steps, their poses are estimated
+        again from the points that they track.
     """
 
     method: Literal["dlt", "bundle"] = "dlt"
@@ -116,17 +116,17 @@ class CalibrationGroup(_Group):
 
 
 class SurfaceGroup(_Group):
-    """Settings of the surface: how it is made of matches, and where it is searched.
+    """Settings of the surface: how it is reconstructed from the matches, and where in space it is searched for.
 
     method : the surfaces of the camera pairs side by side (pairs), or one lattice of points over the surface, each
         measured by all cameras that see it (global).
     merge : how the pairs' surfaces become one: which triangles of an overlap are removed first, those worst by
         correlation, by distance to the other surfaces, by orientation against theirs, or by all of these and the
         nearness to the border (combined); none leaves the surfaces one over the other.
-    radius_mm : radius of the cylinder about which the surface is searched; 0 takes the target's.
+    radius_mm : radius of the cylinder about which the surface is searched for; 0 takes the target's.
     reach_mm : largest distance of the surface from that cylinder.
     incidence_deg : largest angle between a line of sight and the surface's normal at which a camera is used.
-    sigma_max_px : largest standard deviation of a match; beyond it, where the speckle ends, the point is lost.
+    sigma_max_px : largest standard deviation of a match; a point with a larger one, as where the speckle ends, is lost.
     spacing_mm : spacing of the lattice; 0 takes the correlation's step as the cameras see it.
     curvature : second derivatives of the warps between cameras, held at those of the measured shape (geometry), or
         none.
@@ -143,12 +143,12 @@ class SurfaceGroup(_Group):
 
 
 class TrackingGroup(_Group):
-    """Settings of the tracking of points in time; of surface.method global.
+    """Settings of the tracking of points in time, used where surface.method is global.
 
     two_pass : whether points are matched a second time with affine shape functions, the warp's second derivatives held
         at those of the neighbouring points' displacements.
     update_reference : whether a point that is lost against the reference image is matched from the last image in which
-        it was found.
+        it was matched.
     """
 
     two_pass: bool = True
@@ -229,7 +229,7 @@ def load_settings(path: Path | None = None, overrides: Sequence[str] = ()) -> Se
 
 @lru_cache(maxsize=4)
 def settings_of_run(text: str) -> Settings:
-    """The settings that a run was made with, from the text that its results hold.
+    """Settings of a finished run, from the TOML text that is stored in its results.
 
     Names of another version's settings are ignored, and settings that the text does not give have their defaults.
     Raises InputError where the text is not TOML or a value is not one of this version's.
@@ -289,9 +289,9 @@ _WANTED = {
 
 
 def toml_key(model: type, at: Location) -> str:
-    """How an operator finds a place in a TOML file: ``[http] port``, ``[[cameras]] number 1 id``.
+    """Name of a key in a TOML file, for messages to the operator: ``[http] port``, ``[[cameras]] number 1 id``.
 
-    model : what the file is checked by. at : the place; the whole file has no name.
+    model : pydantic model or dataclass of the file. at : location of the key in it; empty for the whole file.
     """
     words: list[str] = []
     for depth, part in enumerate(at):
@@ -312,10 +312,10 @@ def _unknown_toml_key(model: type, at: Location, known: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class Wording:
-    """How the sentences about a kind of file call its places.
+    """How messages about the keys of a kind of file are worded.
 
-    key : of the model and a place, its name. unknown : of the model, the place of an unknown key and the keys that
-    there are, the sentence.
+    key : function of the model and a key's location; returns the key's name. unknown : function of the model, the
+    location of an unknown key and the known keys; returns the message.
     """
 
     key: Callable[[type, Location], str] = toml_key
@@ -323,13 +323,13 @@ class Wording:
 
 
 def faults(error: ValidationError, model: type, wording: Wording = Wording()) -> str:
-    """What a model refused, a sentence for each fault: where it lies, what is wrong, what is allowed.
+    """Messages of a validation error, one sentence for each fault: the key, what is wrong, what is allowed.
 
     Parameters
     ----------
-    error : the refusal.
-    model : the pydantic model or dataclass that refused.
-    wording : how places are called.
+    error : the validation error.
+    model : the pydantic model or dataclass that raised it.
+    wording : how keys are named.
     """
     return "; ".join(_fault(each, model, wording) for each in error.errors())
 
