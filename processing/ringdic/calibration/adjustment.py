@@ -56,9 +56,9 @@ class State:
     offsets: Floats
 
     def plus(self, step: Floats, dots: Floats) -> State:
-        """The state after a step of the adjustment.
+        """The state after adding a step of the adjustment.
 
-        step : (16 C + 3,) of cameras and sheet; px, rad, mm. dots : (m, 2) mm of the print errors, empty if held.
+        step : (16 C + 3,) of cameras and sheet; px, rad, mm. dots : (m, 2) mm of the print errors, empty if fixed.
         """
         cameras = step[:-3].reshape(-1, PER_CAMERA)
         radius, pitch, tilt = step[-3:]
@@ -81,7 +81,7 @@ class Problem:
     rows, columns : (m,) of the dots on the target, from 1.
     lens, lens_information : (C, 10) prior values of the lenses and (C, 10, 10) their information matrices, in the
         inverse products of the parameters' units, 0 where nothing is known.
-    sheet_sigma : (3,) prior standard deviations of radius (mm), pitch (mm) and tilt (rad); 0 holds the nominal value.
+    sheet_sigma : (3,) prior standard deviations of radius (mm), pitch (mm) and tilt (rad); 0 fixes the nominal value.
     free : (16 C + 3,) bool, which parameters of cameras and sheet are adjusted. The dots are adjusted unless the
         standard deviation of the print errors is 0.
     """
@@ -98,17 +98,17 @@ class Problem:
     free: Mask
 
     def views(self, state: State) -> DotViews:
-        """The observations with the parameters of their cameras and the positions of their dots."""
+        """For each observation the camera parameters and the dot position that a state gives it."""
         sz = sheet_points(self.target, state.sheet, self.rows, self.columns) + state.offsets
         c = self.camera
         return DotViews(state.inner[c], state.rotation[c], state.translation[c], sz[self.dot], state.sheet.radius)
 
     def project(self, state: State) -> Pixels:
-        """Image centroids of the observed dots by a state, (n, 2) px."""
+        """Predicted image centroids of the observed dots for a state of the parameters, (n, 2) px."""
         return project_patches(self.views(state), self.target.dot_shape, self.target.dot_size_mm)
 
     def project_centres(self, state: State) -> Pixels:
-        """Projections of the centres of the observed dots by a state, (n, 2) px."""
+        """Projections of the centres of the observed dots for a state of the parameters, (n, 2) px."""
         return project_centres(self.views(state))
 
     def lens_gap(self, state: State) -> Floats:
@@ -117,16 +117,16 @@ class Problem:
         return np.einsum("ci,cij,cj->c", gap, self.lens_information, gap)
 
     def without(self, left_out: Mask) -> Problem:
-        """The problem without some of its observations. left_out : (n,) bool."""
+        """The problem with some of its observations removed. left_out : (n,) bool, those to remove."""
         return replace(self, px=self.px[~left_out], camera=self.camera[~left_out], dot=self.dot[~left_out])
 
 
 @dataclass(frozen=True)
 class Scales:
-    """Scales of the weights of an adjustment.
+    """Weights of an adjustment: standard deviations of centroids and print errors, and a factor on those of lenses.
 
     px : standard deviation of a centroid, px per component. print : of the print errors, mm per component, 0 where the
-    dots are held. lens : factor, 1 or more, by which the boards' standard errors of the lenses are enlarged so that
+    dots are fixed. lens : factor, 1 or more, by which the boards' standard errors of the lenses are enlarged so that
     they agree with the target.
     """
 
@@ -137,9 +137,9 @@ class Scales:
 
 @dataclass(frozen=True)
 class Solution:
-    """Result of an adjustment: the state, its scales and its covariance.
+    """Result of an adjustment: the adjusted parameters, the scales of the weights and the covariance.
 
-    covariance : (16 C + 3, 16 C + 3) of cameras and sheet, px, mm and rad; zero for parameters that were held.
+    covariance : (16 C + 3, 16 C + 3) of cameras and sheet, px, mm and rad; zero for fixed parameters.
     dots_covariance : (m, 2, 2) mm², of the print errors.
     chi2 : (C,) sum of squared residuals of each camera's centroids in units of their variance, per degree of freedom.
     iterations : number of steps.
@@ -154,9 +154,9 @@ class Solution:
 
 
 def adjust(problem: Problem, start: State, print_sigma: float, *, limit: int = 60) -> Solution:
-    """Adjust all free parameters to convergence by the Levenberg-Marquardt method, with estimation of the scales.
+    """Adjust all free parameters to convergence by the Levenberg-Marquardt method, and estimate the weights' scales.
 
-    print_sigma : mm, prior standard deviation of the print errors, replaced by its estimate; 0 holds the dots.
+    print_sigma : mm, prior standard deviation of the print errors, replaced by its estimate; 0 fixes the dots.
     limit : largest number of steps.
 
     Raises ComputationError where the observations do not determine the free parameters.

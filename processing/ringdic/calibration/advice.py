@@ -1,4 +1,4 @@
-"""Advice to the operator for a better calibration, one sentence for each thing that is worth doing."""
+"""Advice to the operator on improving a calibration, in sentences that each name one action."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from ringdic.calibration.camera_calibration import CameraCalibration
 from ringdic.calibration.quality import CameraQuality, PairQuality
 
-#: Part of the image that the board should cover, and views that a lens should rest on.
+#: Part of the image that the board should cover, and views that a lens should be fitted to.
 _COVERAGE, _VIEWS = 0.5, 8
 #: A view whose error is this many times the median of all views is named.
 _BAD_VIEW = 3.0

@@ -1,8 +1,9 @@
 """Azimuths of all cameras from their images of the target, with detection of a rotated target and of exchanged cameras.
 
-The image of one camera determines its azimuth up to the number of its columns. It determines that too where it shows
-the seam of the columns, and the printed numbers carry it from camera to camera. A deviation from the rig that is common
-to most cameras is a rotation of the target; a deviation of a single camera means that it stands elsewhere.
+The image of one camera determines its azimuth up to a multiple of the columns' angle. The seam of the columns, where
+the image shows it, determines the multiple too, and the printed numbers transfer it to other cameras. A deviation from
+the rig that is common to most cameras is a rotation of the target; a deviation of a single camera means that it stands
+elsewhere.
 """
 
 from __future__ import annotations
@@ -25,17 +26,17 @@ from ringdic.session.rig import RigCamera, Target
 log = logging.getLogger(__name__)
 
 #: Deviation of a camera from its azimuth on the rotated target from which it stands elsewhere; rotation of the target
-#: that the operator is told. Degrees.
+#: that is reported to the operator. Degrees.
 _ELSEWHERE, _TURNED = 8.0, 5.0
 
 
 @dataclass(frozen=True)
 class AzimuthCandidates:
-    """Possible azimuths of one camera by its own image of the target.
+    """Possible azimuths of one camera, from its own image of the target alone.
 
     camera : its entry in the rig.
     azimuths : possible azimuths, degrees, the nearest to the nominal one first; empty where no target is seen.
-    labels : prints above its columns, by the columns' numbers for azimuths[0]; empty where there are none.
+    labels : rectified images of the prints above its columns, by column number, for azimuths[0]; empty for none.
     """
 
     camera: RigCamera
@@ -45,7 +46,7 @@ class AzimuthCandidates:
 
 @dataclass(frozen=True)
 class CameraAzimuths:
-    """Azimuths of all cameras.
+    """Azimuths of all cameras, and the rotation of the target against the rig file.
 
     azimuths : by camera id, degrees. turn_deg : rotation of the target about its axis from where the azimuths in
     rig.toml have it. warnings : sentences for the operator.
@@ -99,17 +100,19 @@ def camera_azimuths(candidates: Mapping[str, AzimuthCandidates], target: Target)
 
     candidates : by camera id. Raises InputError, naming the camera, where one stands elsewhere than the rig says.
     """
-    seen = {id_: each for id_, each in candidates.items() if each.azimuths}
+    with_target = {id_: each for id_, each in candidates.items() if each.azimuths}
     off = {
-        id_: signed_degrees(_azimuth_after_shift(seen[id_], columns, target) - seen[id_].camera.azimuth_deg)
-        for id_, columns in _column_shifts(seen, target).items()
+        id_: signed_degrees(
+            _azimuth_after_shift(with_target[id_], columns, target) - with_target[id_].camera.azimuth_deg
+        )
+        for id_, columns in _column_shifts(with_target, target).items()
     }
     turn = _middle(list(off.values())) if off else 0.0
     for id_, each in off.items():
         if abs(signed_degrees(each - turn)) > _ELSEWHERE:
-            raise InputError(_elsewhere(id_, seen, off, turn))
+            raise InputError(_elsewhere(id_, with_target, off, turn))
     shared = turn if abs(turn) > _TURNED else 0.0
-    azimuths = {id_: (each.camera.azimuth_deg + off.get(id_, shared)) % 360.0 for id_, each in seen.items()}
+    azimuths = {id_: (each.camera.azimuth_deg + off.get(id_, shared)) % 360.0 for id_, each in with_target.items()}
     warnings: tuple[str, ...] = ()
     if abs(turn) > _TURNED:
         warnings = (
@@ -121,37 +124,37 @@ def camera_azimuths(candidates: Mapping[str, AzimuthCandidates], target: Target)
 
 
 def _azimuth_after_shift(each: AzimuthCandidates, columns: int, target: Target) -> float:
-    """The candidate nearest to the first one plus the angle of some columns; the seam has not a column's full width."""
+    """The candidate azimuth nearest to the first one plus a number of columns, since the seam differs from a column."""
     about = each.azimuths[0] + columns * math.degrees(target.column_angle)
     return min(each.azimuths, key=lambda a: abs(signed_degrees(a - about)))
 
 
-def _column_shifts(seen: dict[str, AzimuthCandidates], target: Target) -> dict[str, int]:
+def _column_shifts(with_target: dict[str, AzimuthCandidates], target: Target) -> dict[str, int]:
     """Columns by which the first candidate of a camera is off, for those cameras whose azimuth is determined."""
-    sure = {id_: 0 for id_, each in seen.items() if len(each.azimuths) == 1}
-    labelled = [id_ for id_, each in seen.items() if each.labels]
+    sure = {id_: 0 for id_, each in with_target.items() if len(each.azimuths) == 1}
+    labelled = [id_ for id_, each in with_target.items() if each.labels]
     if not sure or not labelled:
         return sure
-    mean = mean_label(seen[id_].labels for id_ in labelled)
+    mean = mean_label(with_target[id_].labels for id_ in labelled)
     queue = [id_ for id_ in sure if id_ in labelled]
     while queue:
         known = queue.pop(0)
         for other in labelled:
             if other not in sure:
-                shift = column_shift(seen[known].labels, seen[other].labels, mean, target.columns)
+                shift = column_shift(with_target[known].labels, with_target[other].labels, mean, target.columns)
                 if shift is not None:
                     sure[other] = sure[known] + shift
                     queue.append(other)
     return sure
 
 
-def _elsewhere(id_: str, seen: dict[str, AzimuthCandidates], off: dict[str, float], turn: float) -> str:
+def _elsewhere(id_: str, with_target: dict[str, AzimuthCandidates], off: dict[str, float], turn: float) -> str:
     """Message that a camera stands elsewhere than the rig says; off : deviations of all cameras, degrees."""
-    nominal = seen[id_].camera.azimuth_deg
+    nominal = with_target[id_].camera.azimuth_deg
     stands = (nominal + off[id_] - turn) % 360.0
     there = [
         other
-        for other, each in seen.items()
+        for other, each in with_target.items()
         if other != id_ and abs(signed_degrees(each.camera.azimuth_deg - stands)) <= _ELSEWHERE
     ]
     if there:

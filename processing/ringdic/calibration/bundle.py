@@ -1,4 +1,4 @@
-"""Bundle adjustment of all cameras of a rig and their calibration target, started at the cameras' single calibrations.
+"""Bundle adjustment of all cameras of a rig and their calibration target, started from separately calibrated cameras.
 
 The observations are the centroids of the images of printed dots, taken as patches of a cylinder. The lenses are known
 from the boards with their full covariance, and the dots may be printed off their nominal positions. (If centroids were
@@ -41,12 +41,12 @@ _GROSS = 6.0
 
 @dataclass(frozen=True)
 class TargetPrior:
-    """Prior standard deviations of the target about its description; 0 holds the nominal value.
+    """Prior standard deviations of the target's geometry about its values in rig.toml; 0 fixes a nominal value.
 
-    dots : of the print errors, mm in each direction; only the start of their estimation from the images.
+    dots : of the print errors, mm in each direction; a start value, replaced by the estimate from the images.
     radius, pitch : of the printed surface and of its columns, mm. tilt : of the sheet in its surface, rad.
 
-    The distance of the rows is always held: it gives the world its scale.
+    The spacing of the rows is always fixed: it gives the world its scale.
     """
 
     dots: float = 0.03
@@ -61,15 +61,15 @@ class TargetPrior:
 
 @dataclass(frozen=True)
 class BundleFit:
-    """Result of a bundle adjustment beside the cameras: covariance, target geometry and measures of fit.
+    """Results of a bundle adjustment other than the cameras: covariance, target geometry and measures of fit.
 
     cameras : C ids, in the order of the parameters.
     covariance : (16 C + 3, 16 C + 3) of ``fx fy s cx cy k1 k2 p1 p2 k3`` (px or without unit), ω (rad) and τ (mm) of
         each camera, then radius, pitch (mm) and tilt (rad). The pose is changed as ``R ← exp([ω]×) R``, ``t ← t + τ``.
-        Zero for parameters that were held.
+        Zero for fixed parameters.
     sheet : the adjusted geometry of the printed sheet.
     px_sigma : standard deviation of a centroid, px per component, estimated from the residuals.
-    print_sigma : standard deviation of the print errors, mm per component; 0 where the dots were held.
+    print_sigma : standard deviation of the print errors, mm per component; 0 where the dots were fixed.
     rows, columns : (m,) of the dots seen, from 1.
     offsets, offsets_sigma : (m, 2) mm, print errors of these dots along arc and axis, and their standard errors.
     lens_chi2 : (C,) squared Mahalanobis distance of the adjusted lens from the board's estimate, per parameter: about 1
@@ -183,11 +183,11 @@ def bundle_adjustment(
 
     Parameters
     ----------
-    calibrations : single calibrations by camera id, at which the adjustment starts. A lens that was fitted to a board
-        counts as an observation with its covariance; a lens from a file is held; without distortion, focal lengths,
+    calibrations : separate calibrations by camera id, at which the adjustment starts. A lens that was fitted to a board
+        counts as an observation with its covariance; a lens from a file is fixed; without distortion, focal lengths,
         skew and principal point are free.
-    target : description of the target.
-    prior : standard deviations of the target about its description; None is ``TargetPrior()``.
+    target : nominal geometry of the target.
+    prior : standard deviations of the target's geometry about its nominal values; None is ``TargetPrior()``.
 
     Returns
     -------

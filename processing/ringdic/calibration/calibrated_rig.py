@@ -72,7 +72,7 @@ def calibrate_rig(
 ) -> CalibratedRig:
     """Calibrate every camera of a session that has an image of the target.
 
-    progress : called with the part done, 0 to 1, and the name of what is done.
+    progress : called with the share done, 0 to 1, and the name of the current stage.
 
     Raises InputError or ComputationError, naming the camera, for images that do not determine its calibration.
     """

@@ -33,7 +33,7 @@ _OUTLIER_FLOOR = 0.3
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """A calibrated camera with the observations on which it rests.
+    """A calibrated camera with the target dots and the board fit from which it was calibrated.
 
     camera : projection and lens.
     dots : the n dots of the target that were used.
@@ -41,7 +41,7 @@ class CameraCalibration:
     left_out : number of dots that were identified but left out as gross errors.
     fit : the fit of the lens to the board, or None where the lens was given or distortion is not corrected.
     centroid_shift : (n, 2) px, bias of the dots' centroids: centroid of the image minus projection of the centre. Zero
-        after the direct linear transformation, which takes the one for the other.
+        after the direct linear transformation, which neglects the difference.
     views : names of the board images in which the board was detected, in the order of the fit's views.
     blank : names of the board images in which it was not.
     """

@@ -1,4 +1,4 @@
-"""Two figures of a lens calibration: the part of the image that the board covered, and systematic residuals there."""
+"""Quality measures of a lens calibration: part of the image covered by the board, and systematic residuals."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ def coverage(views: Pixels, size: tuple[int, int]) -> float:
     views : (v, n, 2) px, corners of the board in v views. size : (width, height) of the image, px.
     """
     scale = _AREA_CELLS / max(size)
-    seen = np.zeros((max(1, round(size[1] * scale)), max(1, round(size[0] * scale))), np.uint8)
+    covered = np.zeros((max(1, round(size[1] * scale)), max(1, round(size[0] * scale))), np.uint8)
     for view in views:
         hull = cv2.convexHull(np.asarray(view, dtype=np.float32)).reshape(-1, 2)
-        cv2.fillConvexPoly(seen, np.rint((hull + 0.5) * scale - 0.5).astype(np.int32), 1)
-    return float(seen.mean())
+        cv2.fillConvexPoly(covered, np.rint((hull + 0.5) * scale - 0.5).astype(np.int32), 1)
+    return float(covered.mean())
 
 
 def residual_distortion(px: Pixels, residuals: Pixels, size: tuple[int, int]) -> float:

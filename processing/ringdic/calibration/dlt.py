@@ -64,18 +64,18 @@ def residuals(L: Floats, xyz: Points, px: Pixels) -> Pixels:
 
 
 def solve_dlt_robust(xyz: Points, px: Pixels, *, sigmas: float = 5.0, floor: float = 0.5) -> tuple[Floats, Mask]:
-    """DLT parameters from control points, without those that are gross errors.
+    """DLT parameters from control points, with rejection of gross errors.
 
     Parameters
     ----------
     xyz : (n, 3) mm, world frame.
     px : (n, 2) undistorted px.
-    sigmas, floor : a residual longer than ``sigmas`` robust standard deviations and than ``floor`` px is a gross error.
+    sigmas, floor : a residual longer than ``sigmas`` robust standard deviations and ``floor`` px is a gross error.
         The standard deviation is the median length divided by 1.1774, as for normal errors of both components.
 
     Returns
     -------
-    L (11,) and the inliers (n,) bool, on which it rests.
+    L (11,), and the inliers (n,) bool that it was fitted to.
 
     Raises
     ------

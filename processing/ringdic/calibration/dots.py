@@ -56,7 +56,7 @@ class Dots:
 
 
 def find_dots(image: NDArray[np.generic], target: Target, *, linear_light: bool = True) -> Dots:
-    """Dark spots of an image that may be dots of the target, with their centroids.
+    """Detect dark spots of an image that may be dots of the target, and measure their centroids.
 
     image : (height, width) grey, uint8, uint16 or float in 0 … 255.
     target : its description bounds the size of a dot, supposing that all of its rows are in the image.

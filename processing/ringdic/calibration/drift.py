@@ -17,7 +17,7 @@ LIMIT = 0.1
 
 
 def drift_sentences(drift: Mapping[str, Floats], steps: Sequence[str], limit: float = LIMIT) -> tuple[str, ...]:
-    """Sentences that name the cameras that moved before the reference and after it; none where all stood still.
+    """Warnings that name the cameras that moved before or after the reference step; empty where none moved.
 
     drift : for each camera or pair (F,) px, signed mean distance from the epipolar line at each step, NaN where not
     measured. steps : F names. limit : px.

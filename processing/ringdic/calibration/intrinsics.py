@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 PARAMETERS = ("fx", "fy", "s", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 
-#: A third radial term with a larger standard error is held at zero: the views do not separate it from the second.
+#: A third radial term with a larger standard error is fixed at zero: the views do not separate it from the second.
 K3_SIGMA_LIMIT = 0.2
 #: With fewer views than this, none is left out for an error above the percentile.
 VIEWS_FOR_DROPPING = 10
@@ -50,11 +50,11 @@ class IntrinsicsFit:
     """Intrinsics of a camera from views of a board, with their uncertainty and measures of fit.
 
     intrinsics : the lens.
-    sigma : (10,) standard errors in the order of ``PARAMETERS``, px or without unit; 0 for a parameter that was held.
+    sigma : (10,) standard errors in the order of ``PARAMETERS``, px or without unit; 0 for a fixed parameter.
     view_errors : (n,) px, RMS residual of the corners of each view, also of the views that were left out.
-    inliers : (n,) bool, the views on which the fit rests.
+    inliers : (n,) bool, the views that the lens was fitted to.
     rms : RMS residual over these views, px.
-    covariance : (10, 10) of the parameters in the order of ``PARAMETERS``; 0 for those that were held.
+    covariance : (10, 10) of the parameters in the order of ``PARAMETERS``; 0 for fixed ones.
     model : the free terms of the lens, in words. reason : why these were chosen.
     coverage : part of the image that the board covers in these views together, 0 to 1.
     residual_distortion : px, RMS over cells of the image of the mean residual in a cell, less what noise explains; it
@@ -175,7 +175,7 @@ def calibrate_intrinsics(
     state, _ = _refine(_start(px, board, size), px, board, models[0].free)
     inliers = _inlier_views(_view_errors(state, px, board), drop_percentile)
     choice, state, covariance = _fit_of_chosen_model(models, state, px, board, inliers, fewest_terms)
-    state, _ = _refine(state, px, board, np.zeros(10, dtype=bool))  # poses of all views, with the intrinsics held
+    state, _ = _refine(state, px, board, np.zeros(10, dtype=bool))  # poses of all views, with the intrinsics fixed
     errors = _view_errors(state, px, board)
     residuals = (px - _project(state, board))[inliers]
     rms = float(np.sqrt(np.mean(errors[inliers] ** 2)))
@@ -301,7 +301,7 @@ def _jacobians(state: _State, board: Points) -> tuple[Pixels, Floats, Floats]:
 def _refine(state: _State, px: Pixels, board: Points, free: Mask) -> tuple[_State, Floats]:
     """Fit the free inner parameters (10,) and all poses by the Levenberg-Marquardt method, to convergence.
 
-    Returns the state and the covariance of the inner parameters (10, 10), 0 where held.
+    Returns the state and the covariance of the inner parameters (10, 10), 0 where fixed.
     """
     damping = 1e-3
     projected, by_inner, by_pose = _jacobians(state, board)

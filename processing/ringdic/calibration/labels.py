@@ -1,4 +1,4 @@
-"""Correspondence of the target's columns between cameras, by the numbers that are printed above them.
+"""Correspondence of the target's columns between cameras, by correlating the numbers printed above them.
 
 The numbers are not read. The image of what is printed above each column is rectified to the sheet, the mean over all
 columns is subtracted, and the rest is correlated between cameras: two views of one number agree.
@@ -37,7 +37,7 @@ _FEWEST = 3
 
 
 def column_labels(image: NDArray[np.generic], dots: DotObservations, target: Target, *, below: bool = False) -> Labels:
-    """Rectified images of what is printed above each column that the camera sees well.
+    """Rectified images of the number printed above each column of the target that the camera sees well.
 
     image : (height, width) grey, the image in which the dots were found. below : True takes what is printed below the
     lowest row instead of above the highest.
@@ -70,7 +70,7 @@ def column_labels(image: NDArray[np.generic], dots: DotObservations, target: Tar
 
 
 def has_labels(labels: Labels) -> bool:
-    """Whether the labels are numbers: prints that differ from column to column."""
+    """Whether the labels differ from column to column, as printed numbers do."""
     if len(labels) < 3:
         return False
     patches = np.stack(list(labels.values()))

@@ -1,7 +1,7 @@
 """Rows and columns of the dots in an image, by linking neighbouring dots to a lattice.
 
 Scale and perspective are taken from the dots themselves: the target gives the distance of neighbours in dot sizes, and
-the width and height of a dot give the size at its place in the image.
+the width and height of a dot give the size at its position in the image.
 """
 
 from __future__ import annotations
@@ -115,9 +115,9 @@ def _lattice_positions(columns: list[list[int]], right: Indices) -> dict[int, tu
             links[c].append((other, shift, 1))
             links[other].append((c, -shift, -1))
     best: dict[int, tuple[int, int]] = {}
-    seen: set[int] = set()
+    visited: set[int] = set()
     for first in links:
-        if first in seen:
+        if first in visited:
             continue
         origins = {first: (0, 0)}  # row of its lowest dot, and column, of each linked chain
         queue = deque([first])
@@ -127,7 +127,7 @@ def _lattice_positions(columns: list[list[int]], right: Indices) -> dict[int, tu
                 if other not in origins:
                     origins[other] = (origins[c][0] + shift, origins[c][1] + step)
                     queue.append(other)
-        seen |= set(origins)
+        visited |= set(origins)
         positions = {
             spot: (row + r, column) for c, (row, column) in origins.items() for r, spot in enumerate(columns[c])
         }

@@ -1,4 +1,4 @@
-"""A camera by the sixteen parameters that an adjustment estimates, and derivatives of image points by them.
+"""The sixteen parameters of a camera in an adjustment, and derivatives of image points with respect to them.
 
 The parameters are ``fx fy s cx cy k1 k2 p1 p2 k3`` of the lens, and ω (rad) and τ (mm) of a small motion of the pose,
 ``R ← exp([ω]×) R``, ``t ← t + τ``.
@@ -39,7 +39,7 @@ class CameraParameters:
         return cls(np.array([K[0, 0], K[1, 1], K[0, 1], K[0, 2], K[1, 2], *distortion]), *nearest_pose(camera.P, lens))
 
     def plus(self, step: Floats) -> CameraParameters:
-        """The parameters after a step of the adjustment. step : (16,) px or without unit, rad, mm."""
+        """The parameters after adding a step of the adjustment. step : (16,) px or without unit, rad, mm."""
         turn = cv2.Rodrigues(np.asarray(step[LENS : LENS + 3], dtype=np.float64))[0]
         return CameraParameters(
             self.inner + step[:LENS], turn @ self.rotation, np.asarray(self.translation + step[LENS + 3 :])
@@ -97,11 +97,11 @@ def nearest_pose(P: Floats, lens: Intrinsics | None) -> tuple[Floats, Vectors]:
 
 
 def projection_jacobians(parameters: CameraParameters, xyz: Points) -> tuple[Pixels, Floats, Floats]:
-    """Projections of world points and their derivatives by the parameters of the camera and by the points.
+    """Projections of world points and their derivatives with respect to camera parameters and points.
 
     xyz : (n, 3) mm, world frame.
 
-    Returns image px (n, 2), derivatives by the parameters (n, 2, 16) and by the points (n, 2, 3) px/mm.
+    Returns image px (n, 2), derivatives with respect to the parameters (n, 2, 16) and the points (n, 2, 3) px/mm.
     """
     rotated = np.asarray(xyz, dtype=float) @ parameters.rotation.T
     px, by_inner, by_pose, by_point = pose_jacobians(
@@ -111,12 +111,12 @@ def projection_jacobians(parameters: CameraParameters, xyz: Points) -> tuple[Pix
 
 
 def pose_jacobians(lens: Intrinsics, rotated: Points, in_camera: Points) -> tuple[Pixels, Floats, Floats, Floats]:
-    """Projections of points in the camera frame and their derivatives by lens, pose and point.
+    """Projections of points in the camera frame and their derivatives with respect to lens, pose and point.
 
     rotated, in_camera : (..., n, 3) mm, the points ``R X`` and ``R X + t``.
 
-    Returns image px (..., n, 2) and derivatives by the lens's parameters (..., n, 2, 10), by ω and τ of the pose
-    (..., n, 2, 6), and by the point in the camera frame (..., n, 2, 3) px/mm.
+    Returns image px (..., n, 2) and derivatives with respect to the lens's parameters (..., n, 2, 10), ω and τ of the
+    pose (..., n, 2, 6), and the point in the camera frame (..., n, 2, 3) px/mm.
     """
     xy = in_camera[..., :2] / in_camera[..., 2:]
     px, by_inner, by_ideal = lens_jacobians(lens, xy)
@@ -130,10 +130,10 @@ def pose_jacobians(lens: Intrinsics, rotated: Points, in_camera: Points) -> tupl
 
 
 def lens_jacobians(lens: Intrinsics, xy: Floats) -> tuple[Pixels, Floats, Floats]:
-    """Image pixels of ideal normalised points and their derivatives by the parameters of the lens and by the points.
+    """Image pixels of ideal normalised points and their derivatives with respect to lens parameters and points.
 
-    xy : (..., 2) without unit. Returns px (..., 2), derivatives by fx fy s cx cy k1 k2 p1 p2 k3 (..., 2, 10) and by xy
-    (..., 2, 2) px.
+    xy : (..., 2) without unit. Returns px (..., 2), derivatives with respect to fx fy s cx cy k1 k2 p1 p2 k3
+    (..., 2, 10) and xy (..., 2, 2) px.
     """
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y

@@ -1,4 +1,4 @@
-"""Image centroids of printed dots, taken as patches of a cylinder and not as points, with their derivatives.
+"""Image centroids of printed dots, modelled as patches of a cylinder and not as points, with their derivatives.
 
 The centroid of a dot's image is not the projection of its centre: perspective, the curvature of the cylinder and the
 lens enlarge some parts of the dot more than others. With the image ``p(s, z)`` of a point of the sheet (s along the
@@ -36,11 +36,11 @@ class PrintedSheet:
 
     @classmethod
     def nominal(cls, target: Target) -> PrintedSheet:
-        """The sheet as the rig's description of the target has it, without tilt."""
+        """The nominal sheet of a target as rig.toml describes it, without tilt."""
         return cls(target.radius_mm, target.column_spacing_mm)
 
     def seam(self, target: Target) -> float:
-        """Length of the arc from the last column on to the first, mm."""
+        """Arc length across the seam, from the last column to the first, mm."""
         return 2 * np.pi * self.radius - (target.columns - 1) * self.pitch
 
 
@@ -55,7 +55,7 @@ def sheet_points(target: Target, sheet: PrintedSheet, rows: Indices, columns: In
 
 
 def sheet_jacobians(target: Target, rows: Indices, columns: Indices) -> Floats:
-    """Derivatives of :func:`sheet_points` by pitch (mm) and tilt (rad).
+    """Derivatives of :func:`sheet_points` with respect to pitch (mm) and tilt (rad).
 
     rows, columns : (n,), from 1. Returns (n, 2, 2), last axis the parameter.
     """
@@ -124,7 +124,7 @@ class DotViews:
 
 
 def project_patches(views: DotViews, shape: str, size: float) -> Pixels:
-    """Centroids of the images of printed dots, (n, 2) px; shape and size (mm) of a dot are those of `quadrature`."""
+    """Centroids of the images of printed dots, (n, 2) px; shape, size : of a dot, mm, as for `quadrature`."""
     distorted = _centroids(views, quadrature(shape, size))
     return _to_px(views.inner, distorted)
 
@@ -139,9 +139,9 @@ def patch_jacobians(views: DotViews, shape: str, size: float) -> tuple[Pixels, F
 
     shape, size : of a dot, mm, as for `quadrature`.
 
-    Returns centroids (n, 2) px and their derivatives by the inner parameters (n, 2, 10), by the pose (n, 2, 6), by the
-    position sz (n, 2, 2) and by the radius (n, 2, 1), in px per unit of the parameter. The parameters of the pose are ω
-    (rad) and τ (mm) with ``R ← exp([ω]×) R``, ``t ← t + τ``.
+    Returns centroids (n, 2) px and their derivatives with respect to the inner parameters (n, 2, 10), the pose
+    (n, 2, 6), the position sz (n, 2, 2) and the radius (n, 2, 1), in px per unit of the parameter. The parameters of
+    the pose are ω (rad) and τ (mm) with ``R ← exp([ω]×) R``, ``t ← t + τ``.
     """
     rule = quadrature(shape, size)
     distorted = _centroids(views, rule)

@@ -1,8 +1,8 @@
 """Refinement of camera poses on matched points of a specimen, so that the cameras' lines of sight meet.
 
 The cost ``Σ ρ(r / σ) + pᵀ Σ⁻¹ p`` is minimised over the points and a small motion p = (ω, τ) of each camera, with the
-lenses held. r are the reprojection residuals with Huber's ρ, and Σ is the covariance of the poses by the calibration,
-which fixes what the points alone leave open: position, orientation and scale of the world. The points are eliminated
+lenses fixed. r are the reprojection residuals with Huber's ρ, and Σ is the covariance of the calibrated poses, which
+fixes what the points alone leave open: position, orientation and scale of the world. The points are eliminated
 from the normal equations (Schur complement).
 """
 
@@ -33,7 +33,7 @@ LOOSE = (1e-3, 0.5)
 
 @dataclass(frozen=True)
 class PoseRefinement:
-    """Refined poses of C cameras.
+    """Refined poses of C cameras, with their standard errors and residuals.
 
     cameras : with the refined poses, in the order given.
     motion : (C, 6) ω (rad) and τ (mm), by which ``R ← exp([ω]×) R``, ``t ← t + τ``. sigma : (C, 6) its standard errors.
@@ -173,9 +173,9 @@ def _step(
         expected, by_parameters, by_point = projection_jacobians(pose, xyz)
         r = px[c] - expected
         spread = scale * sigma[c]
-        seen = np.isfinite(r)
-        r = np.where(seen, r, 0.0)
-        w = np.where(seen, huber_weights(r, spread), 0.0)
+        visible = np.isfinite(r)
+        r = np.where(visible, r, 0.0)
+        w = np.where(visible, huber_weights(r, spread), 0.0)
         A = by_parameters[:, :, LENS:]
         at = slice(POSE * c, POSE * (c + 1))
         N[at, at] += np.einsum("nra,nr,nrb->ab", A, w, A)

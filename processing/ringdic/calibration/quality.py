@@ -47,17 +47,17 @@ def reconstruction_error(xyz_true: Points, xyz_reconstructed: Points) -> Reconst
 
 @dataclass(frozen=True)
 class CameraQuality:
-    """Figures of one camera's calibration, a row of the calibration's table.
+    """Quality measures of one camera's calibration, shown as a row of the calibration's table.
 
     dots, columns : number of dots used, and the columns in which they are.
     residual_rms : RMS length of the dots' residuals, undistorted px.
     left_out : number of dots that were identified but left out as gross errors.
     azimuth_deg, azimuth_off_deg : azimuth of the camera about +z from +x, and its difference from that in rig.toml.
-    board_views, board_views_used, board_rms : number of views of the checkerboard, how many of them the lens rests on,
-        and RMS length of their residuals, px; 0, 0 and None where the lens was not calibrated from views.
+    board_views, board_views_used, board_rms : number of views of the checkerboard, number of those that the lens was
+        fitted to, and RMS length of their residuals, px; 0, 0 and None where the lens was not calibrated from views.
     board_coverage : part of the image that the board covers in these views, 0 to 1, or None without views.
     residual_distortion : RMS over cells of the image of the mean residual in a cell, px, or None without views.
-    lens_error : RMS displacement of the dots' images by the standard errors of the lens, px, less the part that a
+    lens_error : RMS displacement of the dots' images due to the standard errors of the lens, px, less the part that a
         change of the pose would compensate; None without views.
     lens_terms, lens_reason : free terms of the lens, and why these; None without views.
     focal, centre : focal lengths and principal point along x and y, px, None without a lens.
@@ -86,7 +86,7 @@ class CameraQuality:
 
 
 def camera_quality(calibration: CameraCalibration, nominal_azimuth_deg: float | None = None) -> CameraQuality:
-    """Figures of one calibrated camera; nominal_azimuth_deg : its azimuth in rig.toml, None for no comparison."""
+    """Quality measures of one calibrated camera. nominal_azimuth_deg : from rig.toml, None for no comparison."""
     fit, lens = calibration.fit, calibration.camera.intrinsics
     azimuth = calibration.camera.azimuth_deg % 360.0
     off = 0.0 if nominal_azimuth_deg is None else signed_degrees(azimuth - nominal_azimuth_deg)
@@ -122,7 +122,7 @@ def camera_quality(calibration: CameraCalibration, nominal_azimuth_deg: float | 
 
 @dataclass(frozen=True)
 class PairQuality:
-    """Figures of the agreement of two calibrated cameras.
+    """Quality measures of two calibrated cameras: how well they reconstruct the dots that both see.
 
     points : number of dots of the target that both see. mean, rms : reconstruction error of these dots, mm. angle_deg :
     angle between the cameras' lines of sight to the target. epipolar_rms : RMS reprojection error of the dots, px.
@@ -137,22 +137,22 @@ class PairQuality:
 
 
 def pair_quality(first: CameraCalibration, second: CameraCalibration) -> tuple[ReconstructionError, PairQuality]:
-    """Reconstruction error of the dots that two cameras both see, and figures of the pair.
+    """Reconstruction error of the dots that two cameras both see, and quality measures of the pair.
 
     The true positions are those of the calibrations' dots: after a bundle adjustment they contain the estimated print
     errors. Raises ComputationError where no dot is seen by both.
     """
-    seen = [
+    indices = [
         {(int(row), int(column)): i for i, (row, column) in enumerate(zip(dots.rows, dots.columns, strict=True))}
         for dots in (first.dots, second.dots)
     ]
-    common = sorted(seen[0].keys() & seen[1].keys())
+    common = sorted(indices[0].keys() & indices[1].keys())
     if not common:
         raise ComputationError(
             f"cameras {first.camera.id} and {second.camera.id} have no dot of the target in common; "
             "check that nothing hides the target, and their azimuths in rig.toml"
         )
-    chosen = [[index[dot] for dot in common] for index in seen]
+    chosen = [[index[dot] for dot in common] for index in indices]
     px = np.stack([first.dot_centres[chosen[0]], second.dot_centres[chosen[1]]])
     cameras = [first.camera, second.camera]
     xyz = triangulate(cameras, px)

@@ -27,7 +27,7 @@ LIMIT = 0.03
 class RefinedCameras:
     """The cameras of a rig at every step, with refined poses where they have moved since the calibration.
 
-    cameras : as calibrated. refinements : by step, for the steps at which a camera was found to have moved.
+    cameras : as calibrated. refinements : by step, for the steps at which a camera has moved.
     """
 
     cameras: Sequence[Camera]
@@ -51,7 +51,7 @@ class RefinedCameras:
         return refined.cameras
 
     def figures(self, steps: Sequence[str]) -> list[dict[str, Any]]:
-        """Figures of the steps at which cameras had moved, as JSON values: residuals (px), rotations and translations.
+        """Residuals (px), rotations and translations at the steps at which cameras had moved, as JSON values.
 
         steps : names of all steps.
         """
@@ -72,7 +72,7 @@ class RefinedCameras:
         return rows
 
     def sentences(self, steps: Sequence[str]) -> list[str]:
-        """A sentence for the operator that names the steps at which cameras had moved; none where all stood still."""
+        """A sentence for the operator that names the steps at which cameras had moved; empty where none moved."""
         rows = self.figures(steps)
         if not rows:
             return []

@@ -1,4 +1,4 @@
-"""Identification of the dots of the calibration cylinder in an image: row, column and point in space of each.
+"""Identification of the dots of the calibration cylinder in an image: row, column and position in space of each.
 
 The dots that face the camera are linked to a lattice. If all rows are in the image, the lattice gives the row numbers.
 The column numbers follow from a rough azimuth of the camera: each possible numbering gives a camera by DLT, and
@@ -69,7 +69,7 @@ class DotObservations:
         return len(self.px)
 
     def subset(self, which: Mask) -> DotObservations:
-        """The observations of some of the dots. which : (n,) bool."""
+        """The observations restricted to some of the dots. which : (n,) bool."""
         return DotObservations(
             self.camera,
             self.rows[which],
@@ -130,7 +130,7 @@ def identify_dots(
     height_mm: float | None = None,
     max_incidence_deg: float = 55.0,
 ) -> DotObservations:
-    """Identify the dots of the target in an image: row, column and point in space of each.
+    """Identify the dots of the target in an image: row, column and position in space of each.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def identify_dots(
 
 
 def possible_azimuths(dots: Dots, target: Target, rotation_deg: float = 0.0) -> Floats:
-    """Possible azimuths of a camera by its own image of the target alone.
+    """Possible azimuths of a camera, from the dots in its own image alone.
 
     rotation_deg : clockwise rotation of the image; the nearest multiple of 90 is used.
 
@@ -342,14 +342,14 @@ def _with_rows(
         possible = [each for each in possible if abs(each[0] - height_mm) < target.row_spacing_mm / 2]
     if len(possible) == 1:
         return possible[0][1]
-    seen = f"camera {camera}: {numbering.rows} rows of dots are seen in the target image, "
+    intro = f"camera {camera}: {numbering.rows} rows of dots are seen in the target image, "
     if possible:
         raise InputError(
-            f"{seen}[target] in rig.toml says {target.rows}, and neither the lowest nor the highest is in view; show "
+            f"{intro}[target] in rig.toml says {target.rows}, and neither the lowest nor the highest is in view; show "
             f"one of them, or give the camera's height_mm in rig.toml to within {target.row_spacing_mm / 3:.0f} mm"
         )
     raise InputError(
-        f"{seen}[target] in rig.toml says {target.rows}; rows within the image must not be hidden over the whole "
+        f"{intro}[target] in rig.toml says {target.rows}; rows within the image must not be hidden over the whole "
         "width, and [target] rows must be right"
     )
 
