@@ -1,4 +1,4 @@
-"""The results of a run of the processing, the file that they are stored in, and what is evaluated from them.
+"""The results of a processing run: their arrays, the file that stores them, and the fields evaluated from them.
 
 ``results``        the results and the 2D matches, as arrays
 ``series``         results of many steps, one step at a time

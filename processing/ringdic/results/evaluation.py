@@ -1,4 +1,4 @@
-"""Results evaluated with another reference step, another strain window or another family of strains than the run's.
+"""Evaluation of stored results with another reference step, strain window or family of strains than the run's.
 
 Every field is computed from the stored positions; no image is correlated again.
 """
@@ -22,7 +22,7 @@ from ringdic.uncertainty.window import WindowScatter
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How the fields are computed from the positions.
+    """Options by which fields are computed from the measured positions.
 
     previous : each step is compared with the one before it, instead of with the reference.
     rigid_motion_removed : each step is first moved back by its rigid motion.
@@ -51,7 +51,7 @@ class Evaluation:
         window: float | None = None,
         exponent: float | None = None,
     ) -> Evaluation:
-        """The evaluation whose reference is given by a word: "first", or "previous" for the step before each step.
+        """Evaluation options with the reference given by name: "first", or "previous" for the step before each step.
 
         Raises InputError for any other word; the other arguments are those of the class.
         """
@@ -61,7 +61,7 @@ class Evaluation:
 
 
 class EvaluatedResults:
-    """Results with the fields of an evaluation, which are computed a step at a time when they are asked for."""
+    """Results with the fields of an evaluation, computed one step at a time on request."""
 
     def __init__(self, results: Results, evaluation: Evaluation = Evaluation()) -> None:
         self.results = results
@@ -81,7 +81,7 @@ class EvaluatedResults:
 
     @cached_property
     def fields(self) -> tuple[Field, ...]:
-        """All fields that these results have under this evaluation."""
+        """All fields that these results have with this evaluation."""
         exponent = self.evaluation.exponent
         return (*available(self._names), *(() if exponent is None else seth_hill_fields(exponent)))
 
@@ -94,7 +94,7 @@ class EvaluatedResults:
         return self.step(0).names
 
     def field(self, name: str) -> Field:
-        """The field of a name; raises InputError if the results do not have it under this evaluation."""
+        """The field of a name; raises InputError if the results do not have it with this evaluation."""
         try:
             entry = field(name)
         except KeyError:
@@ -106,7 +106,7 @@ class EvaluatedResults:
         return entry
 
     def step(self, step: int) -> StepFields:
-        """The arrays of a step from which every field follows; those of the last step asked for are cached."""
+        """The arrays of a step from which every field follows; those of the last requested step are cached."""
         if self._last is None or self._last[0] != step:
             how = self.evaluation
             self._last = (
@@ -143,5 +143,5 @@ class EvaluatedResults:
 
 
 def evaluate_results(results_path: Path, evaluation: Evaluation = Evaluation()) -> EvaluatedResults:
-    """The results in a file under an evaluation, read without the 2D matches."""
+    """Read the results in a file, without the 2D matches, for evaluation with given options."""
     return EvaluatedResults(read_results(results_path, matches=False), evaluation)

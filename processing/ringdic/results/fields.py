@@ -3,7 +3,7 @@
 Every strain is a function of the two principal values E1, E2 of the Green-Lagrange strain and of their directions, so
 few arrays are stored and the table gives the function for each field. A rigid motion changes displacements, the
 Euler-Almansi tensor and directions in the current configuration; stretches, J, principal strains, magnitudes,
-equivalent strain, shear and isotropy do not depend on it. Linear strain would take a rotation for strain, so it is
+equivalent strain, shear and isotropy do not depend on it. Linear strain would count a rotation as strain, so it is
 always computed after the rigid motion is removed.
 """
 
@@ -69,7 +69,8 @@ class Field:
     def from_arrays(self, array: Callable[[str], Floats], rigid_motion_removed: bool = False) -> Floats:
         """Values of the field, (N,) or (M,) by its location, in its unit.
 
-        array : returns the array of a name in ``of``. rigid_motion_removed : the values after the rigid motion.
+        array : function that returns the array of a name in ``of``. rigid_motion_removed : the values after the rigid
+        motion is removed.
         """
         suffix = "_without_rigid_motion" if self.rigid and rigid_motion_removed else ""
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -236,9 +237,9 @@ class StepFields:
 class StepQuality:
     """Correlation and standard deviations of the points and triangles at one step; None for what is not known.
 
-    correlation : (N,) C_LS. sigma_xyz, sigma_displacement : (N, 3) mm, and sigma_lambda : (M, 2), of λ1 and λ2, all by
-    the noise of the images. chi2 : (N,) χ² a degree of freedom. sigma_calibration, sigma_displacement_calibration :
-    (N, 3) mm, and sigma_lambda_calibration : (M, 2), by the covariance of the cameras' parameters.
+    correlation : (N,) C_LS. sigma_xyz, sigma_displacement : (N, 3) mm, and sigma_lambda : (M, 2), of λ1 and λ2, all due
+    to image noise. chi2 : (N,) χ² a degree of freedom. sigma_calibration, sigma_displacement_calibration :
+    (N, 3) mm, and sigma_lambda_calibration : (M, 2), due to the covariance of the cameras' parameters.
     """
 
     correlation: Floats

@@ -13,9 +13,9 @@
         matches/<k>/             2D matches of a camera pair, or of a camera alone: xy, px, c_ls, sigma, status, vertex
         settings, calibration, summary    text: TOML, JSON, JSON
 
-What follows from the stored arrays is computed when it is read: a step takes about 100 bytes a point, 130 a triangle.
+Fields are computed from the stored arrays when they are read: a step takes about 100 bytes a point, 130 a triangle.
 A reader ignores groups, arrays and attributes that it does not know, and refuses a file of another schema than its own.
-The schema is raised by a change that an older reader would misunderstand.
+The schema number is raised by a change that an older reader would misunderstand.
 """
 
 from __future__ import annotations

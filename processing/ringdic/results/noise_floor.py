@@ -1,4 +1,4 @@
-"""The noise floor of a run: statistics of the motion and strain that it measures on captures of the specimen at rest.
+"""Noise floor of a run: statistics of the displacement and strain measured on captures of the specimen at rest.
 
 Captures of kind ``static`` are tracked as steps right after the reference and left out of the results.
 """

@@ -31,7 +31,7 @@ class Ranges:
         self.take(self.extent(fields))
 
     def extent(self, fields: StepFields) -> Extent:
-        """The percentiles of one step, for :meth:`take`; several threads may compute those of several steps."""
+        """Percentiles of the fields at one step, for :meth:`take`; several threads may call it at a time."""
         return {
             (entry.name, removed): percentiles(fields.scalar(entry, removed).astype(np.float32))
             for entry in self._fields
@@ -39,7 +39,7 @@ class Ranges:
         }
 
     def take(self, extent: Extent) -> None:
-        """Add the percentiles of the next step; the reference comes first."""
+        """Add the percentiles of the next step, from :meth:`extent`; the reference comes first."""
         for key, values in extent.items():
             self._extents.setdefault(key, []).append(values)
 
@@ -69,7 +69,7 @@ class Ranges:
 
 
 def even_limits(span: Sequence[float] | None, centre: float | None) -> tuple[float, float]:
-    """Limits (low, high) of a colour scale for a range of values.
+    """Limits (low, high) of a colour scale that cover a range of values, symmetric about a centre if one is given.
 
     span : [low, high], None for an unknown range. centre : the limits are symmetric about it; None for none.
     Limits that would be equal are set 1 apart.

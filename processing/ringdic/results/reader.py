@@ -1,4 +1,4 @@
-"""Reads results.h5: everything of a run, or its summary, its mesh, the positions or one field at one step.
+"""Reading of results.h5: all results of a run, or its summary, its mesh, the positions or a field at one step.
 
 The layout of the file is drawn in `ringdic.results.layout`.
 """
@@ -26,7 +26,7 @@ from ringdic.strain.rigid_motion import RigidMotion
 
 
 def read_results(path: Path, matches: bool = True) -> Results:
-    """The results in a file, as they were written; fields are not read, since they follow from the positions.
+    """Read all results in a file; fields are not read, since they follow from the positions.
 
     matches : whether to read the 2D matches as well.
     Raises InputError for a file that is missing, unreadable, unfinished or of another schema.
@@ -61,7 +61,7 @@ def read_results(path: Path, matches: bool = True) -> Results:
 
 
 def read_summary(path: Path) -> dict[str, Any]:
-    """The contents of a file as JSON values: rig, steps, cameras, pairs, counts, the table of fields with their ranges.
+    """Read a file's contents except its arrays, as JSON values: rig, steps, cameras, pairs, counts, table of fields.
 
     ``fields`` : name, label, unit, location, centre, group, rigid (whether removing the rigid motion changes it),
     ``range`` (2nd to 98th percentile over all steps after the reference), ``steps`` ([least, greatest] of each step,

@@ -28,7 +28,7 @@ class Matches:
     """2D matches at F steps, of a camera pair (C = 2) or of one camera that was tracked by itself (C = 1).
 
     cameras : the C ids, reference camera first.
-    xy : (n, 2) px, the matched points in the reference image. For a camera alone: the pixel as it was matched from
+    xy : (n, 2) px, the matched points in the reference image. For a camera alone: the pixel as matched from
         another camera.
     px : (F, C, n, 2) px, the matches in the images of each camera. For a camera alone px[0] is the projection of the
         vertex, from which the point is tracked.
@@ -64,13 +64,13 @@ class Results:
     vertices_ref : (N, 3) mm, finite. vertices : (F, N, 3) mm, NaN where lost.
     faces : (M, 3) vertex indices, normals outwards. pair : (M,) index of the pair that measured the triangle, -1 where
         a triangle joins two pairs. vertex_pair : (N,) index of the pair that measured the vertex.
-    correlation : (F, N) C_LS, the largest over the images used. sigma_xyz : (F, N, 3) mm, standard deviations by the
-        noise of the images. status : (F, N), 0 measured.
+    correlation : (F, N) C_LS, the largest over the images used. sigma_xyz : (F, N, 3) mm, standard deviations due to
+        image noise. status : (F, N), 0 measured.
     matches : the 2D matches, of each pair or of each camera. settings : TOML text. calibration, summary : JSON values.
-    sigma_displacement : (F, N, 3) mm, and sigma_lambda : (F, M, 2), of λ1 and λ2, both by the noise of the images.
+    sigma_displacement : (F, N, 3) mm, and sigma_lambda : (F, M, 2), of λ1 and λ2, both due to image noise.
     chi2 : (F, N) reprojection residual of the point, χ² a degree of freedom.
-    sigma_calibration, sigma_displacement_calibration : (F, N, 3) mm, and sigma_lambda_calibration : (F, M, 2), by the
-        covariance of the cameras' parameters alone.
+    sigma_calibration, sigma_displacement_calibration : (F, N, 3) mm, and sigma_lambda_calibration : (F, M, 2), due to
+        the covariance of the cameras' parameters alone.
 
     The arrays with default None are None where they are not known.
     """
@@ -141,7 +141,7 @@ class Results:
         return float(np.nanmedian(scale)) if np.isfinite(scale).any() else float("nan")
 
     def scatter(self, window: StrainWindow) -> WindowScatter | None:
-        """How the noise of displacements propagates to the stretches over the windows of a strain window.
+        """Propagation of the displacements' noise to the stretches over strain windows.
 
         Distances of subsets in the images are taken as the points' distances on the surface times the image scale.
         None where the displacements' standard deviations, the subset radius or the image scale are unknown.
@@ -152,11 +152,11 @@ class Results:
         return window_scatter(window, lambda apart: subset_correlation(apart * scale, radius), (2 * radius + 1) / scale)
 
     def reference_positions(self, step: int, previous: bool = False) -> Points:
-        """Positions (N, 3) mm that a step is compared with: the reference, or the step before it; NaN where lost."""
+        """Positions (N, 3) mm that displacements count from: the reference, or the step before it; NaN where lost."""
         return self.vertices[step - 1] if previous and step > 0 else self.vertices_ref
 
     def motion(self, step: int, previous: bool = False) -> RigidMotion:
-        """The rigid motion that takes a step back onto the reference, or onto the step before it."""
+        """Least-squares rigid motion that takes a step back onto the reference, or onto the step before it."""
         return motion_to_reference(self.reference_positions(step, previous), self.vertices[step])
 
     def deformation(
@@ -201,10 +201,10 @@ class Results:
         return compute_fields(reference, current, self.faces, motion, quality, self.pair, window, scatter)
 
     def quality(self, step: int, previous: bool = False) -> StepQuality:
-        """Correlation and standard deviations at a step.
+        """Correlation coefficients and standard deviations at a step.
 
-        previous : those of the motion since the step before, instead of since the reference; what the calibration
-        adds to that motion is not known and left out.
+        previous : those of the motion since the step before, instead of since the reference; the part of
+        the calibration is then unknown and left out.
         """
         of_motion = None if previous else step
         return StepQuality(

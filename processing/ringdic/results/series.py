@@ -1,4 +1,4 @@
-"""Results of many steps, one step at a time: the whole need not fit into memory.
+"""Series of results that are read or computed one step at a time, so that not all need fit into memory.
 
 A step is given as results of two steps, the reference and the step itself.
 """
@@ -23,7 +23,7 @@ from ringdic.results.results import MATCH_ARRAYS, Results
 
 
 class Series(Protocol):
-    """The surface at F steps, the reference first, read or computed a step at a time."""
+    """Results at F steps, the reference first, read or computed one step at a time."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -51,7 +51,7 @@ class Series(Protocol):
 
 @dataclass(frozen=True)
 class InMemorySeries:
-    """Results of all steps, held in memory, as a series."""
+    """Series of results that are all in memory."""
 
     results: Results
 
@@ -103,9 +103,9 @@ def select_steps(results: Results, steps: Sequence[int]) -> Results:
 
 
 def join_steps(parts: Sequence[Results]) -> Results:
-    """Results of all steps of a series from the results of its single steps.
+    """Join the results of single steps to the results of all steps of a series.
 
-    parts : as `Series.at` gives them for steps 0, 1, 2, … or for 1, 2, …
+    parts : from `Series.at`, for steps 0, 1, 2, … or for 1, 2, …
     """
     first, *others = parts
     return _with_steps(first, [(first, range(len(first.steps))), *((other, [1]) for other in others)])

@@ -1,8 +1,8 @@
-"""Completes results with the standard deviations of displacements and stretches.
+"""Standard deviations of displacements and stretches, by which results are completed.
 
-They are stored by cause, in two separate parts: the noise of the images, which another exposure would draw anew, and
-the calibration, whose error all points and steps share. The surface measured by all cameras together comes with the
-part of the noise; for surfaces of camera pairs it is computed here, from the matches.
+They are stored in two parts, by cause: image noise, which differs from exposure to exposure, and the calibration, whose
+error all points and steps share. The surface measured by all cameras together comes with the
+part due to noise; for surfaces of camera pairs it is computed here, from the matches.
 
 Each camera of a pair is tracked in its own images, from its reference image to that of the step. Let δ_c be the error
 that noise gives the subset in camera c's reference image, ε_c the error in the step's image, and A_c the gain from the
@@ -42,7 +42,7 @@ from ringdic.uncertainty.matches import INTERPOLATED_NOISE
 from ringdic.uncertainty.position import covariance, position_gain
 from ringdic.uncertainty.strain import corner_correlations, stretch_sigma
 
-# The variance that a correlation states, in units of the variance by the noise of one image: it contains the noise of
+# The variance that a correlation states, in units of the variance due to noise of one image: it contains the noise of
 # the reference image and that of the interpolated current one.
 _BOTH_IMAGES = 1.0 + INTERPOLATED_NOISE
 # Shift between the pixel coordinates of different reference images, px: their subsets share no pixels.
@@ -60,7 +60,7 @@ def camera_covariance(fit: BundleFit | None) -> CameraCovariance | None:
 def add_uncertainty(results: Results, known: CameraCovariance | None) -> Results:
     """Complete results with the standard deviations of all steps.
 
-    known : covariance of the cameras; None where it is unknown, then the part of the calibration is left out.
+    known : covariance of the cameras; None where it is unknown, and the part due to the calibration is left out.
     """
     series = InMemorySeries(results)
     uncertainty = StepUncertainty(series.reference, known, series.noise)
@@ -70,10 +70,10 @@ def add_uncertainty(results: Results, known: CameraCovariance | None) -> Results
 
 
 class StepUncertainty:
-    """The standard deviations of a run's results, computed a step at a time.
+    """The standard deviations of a run's results, computed one step at a time.
 
     reference : the results of the reference alone. known : covariance of the cameras, None where it is unknown.
-    noise : for each of the matches, (F, C) px, as `Series.noise` gives it.
+    noise : for each of the matches, (F, C) px, from `Series.noise`.
     """
 
     def __init__(self, reference: Results, known: CameraCovariance | None, noise: Sequence[Floats]) -> None:
@@ -85,7 +85,7 @@ class StepUncertainty:
     def complete(self, results: Results, step: int, deformation: Deformation | None = None) -> Results:
         """Complete the results of one step with its standard deviations.
 
-        results : of the reference and this step, as `Series.at` gives them. step : its number in the series.
+        results : of the reference and this step, from `Series.at`. step : its number in the series.
         deformation : of the step since the reference; computed where it is None.
         """
         last = len(results.steps) - 1
@@ -99,7 +99,7 @@ class StepUncertainty:
 
 
 class _CalibrationUncertainty:
-    """Standard deviations by the covariance of the cameras.
+    """Standard deviations due to the covariance of the cameras.
 
     tracked : whether each camera tracked the points from the projection of their reference position.
     """
@@ -155,7 +155,7 @@ class _Sources:
 
 
 class _NoiseUncertainty:
-    """Standard deviations of displacements and stretches measured by camera pairs, by the noise of the images.
+    """Standard deviations of displacements and stretches measured by camera pairs, due to image noise.
 
     noise : for each pair (F, 2) px, as `Series.noise` gives it. The residual of the step where it is smallest is taken
     as noise; what other steps have more is due to motion and light.

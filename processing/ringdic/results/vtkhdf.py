@@ -18,7 +18,7 @@ _CELL_GROUPS = ("Vertices", "Lines", "Polygons", "Strips")
 
 
 def create_group(file: h5py.File, faces: Indices, points: int, steps: int) -> h5py.Group:
-    """Create the group for a surface with constant triangles; its arrays are filled by `write_step`.
+    """Create the VTKHDF group for a surface with constant triangles; its arrays are filled by `write_step`.
 
     faces : (M, 3) vertex indices. points : number of vertices. steps : number of steps.
     """

@@ -1,4 +1,4 @@
-"""Writes results.h5, a step at a time.
+"""Writing of results.h5, one step at a time.
 
 The layout of the file is drawn in `ringdic.results.layout`.
 """
@@ -68,9 +68,9 @@ def write_series(
 
 
 def map_in_order(compute: Callable[[int], T], steps: Sequence[int]) -> Iterator[T]:
-    """Values of a function at some steps, in their order; computed in threads.
+    """Yield the values of a function at some steps, in order, computed by several threads.
 
-    Only a few more values than there are cores are held at a time, which bounds the memory.
+    At most a few more values than there are cores are in memory at a time.
     """
     waiting: deque[Future[T]] = deque()
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -84,10 +84,10 @@ def map_in_order(compute: Callable[[int], T], steps: Sequence[int]) -> Iterator[
 
 @dataclass(frozen=True)
 class StepRecord:
-    """The contents of the file for one step.
+    """Contents of the results file for one step.
 
     positions : (N, 3) mm, finite: a lost point has its reference position. point : arrays (N, ...) of the vertices by
-    name. face : arrays (M, ...) of the triangles by name. extent : percentiles of the fields.
+    name. face : arrays (M, ...) of the triangles by name. extent : percentiles of the fields, from `Ranges.extent`.
     motion : takes the step back onto the reference. matches : of each matches the arrays of this step by name.
     """
 
@@ -100,7 +100,7 @@ class StepRecord:
 
 
 class ResultsWriter:
-    """A results file that is being written, the reference first.
+    """Writer of a results file, one step after the other, the reference first.
 
     path : of the new file; FileExistsError where there is one. names : (F,) capture ids of the steps.
     reference : the results of the reference alone; they have the same optional arrays as every later step.
@@ -154,7 +154,7 @@ class ResultsWriter:
         self._motions.append(record.motion)
 
     def finish(self, calibration: dict[str, Any], summary: dict[str, Any]) -> None:
-        """Write what belongs to the whole run; a file without it is refused by the reader.
+        """Write the parts that belong to the whole run; the reader refuses a file without them.
 
         calibration, summary : JSON values.
         """
