@@ -1,4 +1,4 @@
-"""Standard deviations of positions, displacements and stretches by the covariance of the camera parameters.
+"""Standard deviations of positions, displacements and stretches due to the covariance of the camera parameters.
 
 All points and steps share the errors of the calibration, so repeating the images does not show them. With errors dp of
 the parameters p_c of the cameras a point moves by ``-Σ_c A_c (∂u_c/∂p_c) dp_c``, where A_c is the gain from camera c's
@@ -48,7 +48,7 @@ class CameraCovariance:
     def root(self) -> Floats:
         """Root R (16 K, S) of the covariance, R Rᵀ, in the units of the parameters (px, rad, mm); S = 16 K.
 
-        Parameters that the adjustment held fixed have zeros.
+        The rows of fixed parameters are zero.
         """
         values, vectors = np.linalg.eigh(self.parameters)
         return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
@@ -116,7 +116,7 @@ def sensitivity_sigma(sensitivity: Sensitivity) -> Floats:
 def stretch_sigma_by_cameras(
     deformed: Deformation, reference: Points, faces: Indices, at_reference: Sensitivity, at_step: Sensitivity
 ) -> Floats:
-    """Standard deviations (M, 2) of the stretches λ1 and λ2 by the covariance of the cameras.
+    """Standard deviations (M, 2) of the stretches λ1 and λ2 due to the covariance of the cameras.
 
     deformed : deformation of the M triangles at the step. reference : (N, 3) mm. faces : (M, 3) vertex indices.
     at_reference, at_step : sensitivities (N, 3, S) mm of the vertices at the reference and at the step.

@@ -31,9 +31,10 @@ _REMAINING = 0.7
 class MatchUncertainty:
     """Standard deviations of n matches by cause, (n, 2) px each.
 
-    reference : by the noise of the reference image, in its pixels. current : by the noise of the current image, in its
-    pixels. systematic : by the residual that is no noise, in pixels of the current image. reference_systematic : that
-    part in pixels of the reference image. How much of it is due to either image cannot be known from one pair.
+    reference : due to the noise of the reference image, in its pixels. current : due to the noise of the current image,
+    in its pixels. systematic : due to the residual that is not noise, in pixels of the current image.
+    reference_systematic : that part in pixels of the reference image. How much of it is due to either image cannot be
+    known from one pair.
     """
 
     reference: Pixels
@@ -54,7 +55,7 @@ def match_uncertainty(
     noise: tuple[float, float],
     gradient: Floats | None = None,
 ) -> MatchUncertainty:
-    """Split the standard deviations that a correlation states by their causes.
+    """Split the standard deviations of matches by cause: noise of either image, and systematic residual.
 
     Where the known noise would give a larger residual than the correlation has, the noise is scaled down to it.
 

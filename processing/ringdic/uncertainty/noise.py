@@ -58,7 +58,7 @@ def flat_noise(image: GreyImage) -> float:
 
 
 def rest_noise(images: Sequence[GreyImage]) -> float:
-    """Variance of the noise, grey levels², from the differences of images of a scene at rest, whatever it shows.
+    """Variance of the noise, grey levels², from the differences of images of a scene at rest.
 
     images : K ≥ 2 images (h, w), grey levels; ValueError for fewer.
     """

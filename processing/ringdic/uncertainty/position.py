@@ -30,8 +30,8 @@ def position_gain(cameras: Sequence[Camera], xyz: Points, sigma: Pixels) -> Floa
     """Gain ``A_c`` from the pixels of each camera to positions triangulated from all cameras with weights 1 / σ².
 
     xyz : (n, 3) mm, the positions. sigma : (C, n, 2) px, standard deviations of the pixels that they were triangulated
-    from, NaN for a camera that took no part.
-    Returns (C, n, 3, 2) mm a px; zero for a camera that took no part.
+    from, NaN for a camera that was not used.
+    Returns (C, n, 3, 2) mm a px; zero for a camera that was not used.
     """
     sigma = np.ascontiguousarray(sigma, dtype=float)
     slopes = np.full((len(cameras), len(xyz), 2, 3), np.nan)
@@ -54,7 +54,7 @@ def covariance(gain: Floats, sigma: Pixels) -> Floats:
 
 
 def along_surface(cameras: Sequence[Camera], reference: Indices, xyz: Points, normals: Vectors) -> Floats:
-    """Derivative ``B = ∂X/∂p`` of the point of the surface that a pixel shows, with respect to that pixel.
+    """Derivative ``B = ∂X/∂p`` of the surface point that a pixel shows with respect to that pixel.
 
     It is the inverse of the projection, restricted to the surface: ``B = T (J T)⁻¹`` with any basis T of the tangent
     plane.
@@ -75,9 +75,9 @@ def along_surface(cameras: Sequence[Camera], reference: Indices, xyz: Points, no
 
 
 def reference_covariance(gain: Floats, sigma: Pixels, reference: Indices, label: Floats) -> Floats:
-    """Covariance, by the noise of the images, of reference positions that a pixel of their reference camera defines.
+    """Covariance due to image noise of reference positions, each defined by a pixel of its reference camera.
 
-    gain : (C, n, 3, 2) mm a px, of `position_gain`. sigma : (C, n, 2) px, by the noise of each image alone.
+    gain : (C, n, 3, 2) mm a px, of `position_gain`. sigma : (C, n, 2) px, due to the noise of each image alone.
     reference : (n,) index of the reference camera. label : (n, 3, 2) mm a px, of `along_surface`.
     Returns (n, 3, 3) mm².
     """
@@ -89,11 +89,11 @@ def reference_covariance(gain: Floats, sigma: Pixels, reference: Indices, label:
 def step_covariance(
     gains: tuple[Floats, Floats], sigma: Pixels, tracked: tuple[Pixels, Pixels], reference: Indices, label: Floats
 ) -> Floats:
-    """Covariance, by the noise of the images, of positions at a later step.
+    """Covariance of positions at a later step due to image noise.
 
     gains : (C, n, 3, 2) mm a px each, of `position_gain` at the reference and at the step.
-    sigma : (C, n, 2) px, of the matches between the cameras by the noise of each reference image alone.
-    tracked : (C, n, 2) px each, of the matches in time by the noise of the reference image alone and by that of the
+    sigma : (C, n, 2) px, of the matches between the cameras due to the noise of each reference image alone.
+    tracked : (C, n, 2) px each, of the matches in time due to the noise of the reference image alone and to that of the
         step's image alone.
     reference : (n,) index of the reference camera. label : (n, 3, 2) mm a px, of `along_surface`.
     Returns (n, 3, 3) mm².
@@ -121,7 +121,7 @@ def step_covariance(
 
 
 def position_sigma(cameras: Sequence[Camera], px: Pixels, sigma: Pixels) -> Floats:
-    """Standard deviations of linearly triangulated positions from those of their pixels, which are independent.
+    """Standard deviations of linearly triangulated positions from those of their pixels, taken as independent.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def position_sigma(cameras: Sequence[Camera], px: Pixels, sigma: Pixels) -> Floa
 
 
 def linear_sigma(cameras: Sequence[Camera], system: LinearSystem, sigma: Pixels) -> Floats:
-    """Standard deviations of positions from the linear equations that they were triangulated with.
+    """Standard deviations of positions from the linear equations by which they were triangulated.
 
     cameras : the C cameras. system : the equations of the n points. sigma : (C, n, 2) px, standard deviations of the
     pixels, which are independent. Returns (n, 3) mm, world frame.

@@ -62,7 +62,7 @@ def stretch_sigma(
     correlation: Floats,
     sigma: Pixels,
 ) -> Floats:
-    """Standard deviations of the stretches λ1 and λ2 at one step by the noise of its images.
+    """Standard deviations of the stretches λ1 and λ2 at one step due to image noise.
 
     Where λ1 and λ2 are nearly equal, sorting them by size sorts the noise as well; there the standard deviations are a
     little too large.
@@ -74,7 +74,7 @@ def stretch_sigma(
     faces : (M, 3) vertex indices.
     gain : (C, N, 3, 2) mm a px, of `position_gain` at the step.
     correlation : (C, M, 3), of `corner_correlations`; (1, M, 3) where it is equal in all cameras.
-    sigma : (C, N, 2) px, of the displacement in each camera, by noise.
+    sigma : (C, N, 2) px, of the displacement in each camera, due to noise.
 
     Returns
     -------

@@ -43,14 +43,14 @@ class Texture:
         return Texture(self.contrast[index], self.slopes[index], self.peakedness[index])
 
     def clean_slopes(self, noise: float) -> Floats:
-        """Mean squares of fx and fy, (n, 2) grey levels² a px², without the slopes of the noise.
+        """Mean squares of fx and fy, (n, 2) grey levels² a px², without the part due to noise.
 
         noise : its variance, grey levels².
         """
         return np.asarray(self.slopes[:, [0, 2]] - noise * SLOPE_GAIN)
 
     def inverse_diagonal(self, noise: float) -> Floats:
-        """Diagonal of the inverse of the mean of ∇f ∇fᵀ, (n, 2) px² a squared grey level, without the noise's slopes.
+        """Diagonal of the inverse of the mean of ∇f ∇fᵀ, (n, 2) px² a squared grey level, without that of noise.
 
         It is proportional to the variance of a match in x and y. NaN where the pattern does not vary in some direction.
         noise : its variance, grey levels².

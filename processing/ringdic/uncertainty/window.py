@@ -42,7 +42,7 @@ class WindowScatter:
     def stretch_sigma(self, deformed: Deformation, sigma: Floats) -> Floats:
         """Standard deviations (M, 2) of the stretches λ1 and λ2 over the windows at one step; NaN where not measured.
 
-        deformed : the deformation over the windows. sigma : (N, 3) mm, of the displacements, by noise.
+        deformed : the deformation over the windows. sigma : (N, 3) mm, of the displacements, due to noise.
         """
         before = np.stack([deformed.direction1_reference, deformed.direction2_reference], axis=1)  # (M, 2, 3)
         after = np.stack([deformed.direction1_current, deformed.direction2_current], axis=1)
@@ -54,7 +54,7 @@ class WindowScatter:
 
 
 def window_scatter(window: StrainWindow, correlation: Callable[[Floats], Floats], reach: float) -> WindowScatter:
-    """The propagation of variance in the windows of a mesh.
+    """Compute the propagation of the displacements' variance to the stretches in the strain windows of a mesh.
 
     correlation : correlation coefficients (n,) of the errors of two points, as a function of their distances (n,), mm.
     reach : distance from which on the correlation is 0, mm.
