@@ -1,4 +1,4 @@
-"""A job as a set of tasks with one output file each, so that a job started again computes only missing outputs.
+"""Jobs divided into tasks with one output file each, so that a repeated job computes only missing outputs.
 
 A task is a pure function of file paths and small values. Its output file lies in ``SESSION/work``, named by a key: a
 digest of everything that the output depends on. A task whose output file exists is done. An executor runs the others:

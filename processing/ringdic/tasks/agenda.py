@@ -1,4 +1,4 @@
-"""Which tasks of a job may start and which have ended: the part that all executors have in common."""
+"""Scheduling of a job's tasks by their dependencies: which may start, and which have ended."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from ringdic.tasks.task import OnTaskEnd, Task, TaskReport
 
 
 class Agenda:
-    """The tasks of a job that have not ended, in order. Tasks that are done already are reported when it is built.
+    """The tasks of a job that have not ended, in order. Tasks that are done already are reported on construction.
 
-    tasks : each after the tasks that it needs. on_end : called for each task that has ended, with its report.
+    tasks : in an order in which each follows the tasks that it needs. on_end : called for each task that has ended,
+    with its report.
     """
 
     def __init__(self, tasks: Sequence[Task], on_end: OnTaskEnd) -> None:
@@ -38,7 +39,7 @@ class Agenda:
         return sum(self._may_start(task) for task in self._waiting)
 
     def start(self) -> Task | None:
-        """Take the first task whose needed tasks have all ended; None where no task may start now."""
+        """Remove and return the first task whose needed tasks have all ended; None where no task may start now."""
         for task in self._waiting:
             if self._may_start(task):
                 self._waiting.remove(task)

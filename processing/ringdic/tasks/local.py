@@ -1,4 +1,4 @@
-"""The executor of one machine: runs tasks in threads of this process, one for each core."""
+"""Executor for one machine: runs tasks in threads of this process, one per core."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _THREAD_SAFE = ("omp", "tbb")  # threading layers of numba whose kernels several
 class LocalExecutor:
     """Runs tasks in threads of this process.
 
-    workers : tasks at a time; None for one a core. The kernels of tasks that run at a time share the cores; those of a
-    task that all others wait for use all cores.
+    workers : number of tasks at a time; None for one per core. The kernels of tasks that run at a time share the cores;
+    those of a task that all others wait for use all cores.
     """
 
     def __init__(self, workers: int | None = None) -> None:

@@ -1,4 +1,4 @@
-"""The cache of a process between tasks: decoded images, prepared references. Its size is bounded."""
+"""A cache in memory that the tasks of a process share: decoded images, prepared references. Its size is bounded."""
 
 from __future__ import annotations
 
@@ -48,9 +48,10 @@ class Memory:
             return sum(max(entry.bytes, 0) for entry in self._entries.values())
 
     def get(self, key: Hashable, compute: Callable[[], T], size: Callable[[T], int]) -> T:
-        """The value of a key, computed where it is not in the cache.
+        """The value stored under a key, computed where it is not in the cache.
 
-        compute : gives the value; an exception that it raises is raised and not cached. size : bytes of a value.
+        compute : function that returns the value; an exception that it raises is raised and not cached. size : bytes of
+        a value.
         """
         with self._lock:
             entry = self._entries.setdefault(key, _Entry())
@@ -70,7 +71,7 @@ class Memory:
         return value
 
     def image(self, path: Path) -> Image:
-        """The grey levels, (height, width), of an image file; read again when its size or time of change differs."""
+        """The grey levels, (height, width), of an image file; read again if the file has changed since."""
         stat = path.stat()
         key = (str(path), stat.st_size, stat.st_mtime_ns)
         return self.get(key, lambda: read_gray(path), lambda image: int(image.nbytes))

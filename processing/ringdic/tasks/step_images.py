@@ -1,4 +1,4 @@
-"""The images of a session's steps as the tasks read them, cached between tasks, and digests of the image files."""
+"""Reading of a session's images by tasks, with a cache, and digests of the image files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Digests:
     known: dict[Path, str] = field(default_factory=dict)
 
     def image(self, capture: Capture, id_: str) -> str | None:
-        """Digest of a camera's image in a capture; None where the capture has none of this camera."""
+        """Digest of a camera's image in a capture; None where there is no such image."""
         path = capture.images.get(id_)
         if path is None:
             return None

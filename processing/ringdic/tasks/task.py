@@ -1,4 +1,4 @@
-"""A task, the key of everything that its output depends on, and its output file."""
+"""Tasks: functions with an output file, named by a hash of everything that the output depends on."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ _ERROR = "error"  # name of the only array in the output of a task that ended wi
 
 @dataclass(frozen=True)
 class TaskReport:
-    """How a task ended.
+    """Outcome of a task.
 
-    computed : whether its output was computed now, rather than there already. points : number of matches. seconds :
-    time it took.
+    computed : whether its output was computed now; False where the file existed already. points : number of matches.
+    seconds : time spent.
     """
 
     computed: bool
@@ -44,7 +44,7 @@ class TaskReport:
 class Task:
     """A function of paths and small values, whose result is stored in a folder under a key.
 
-    key : digest of everything that the output depends on. name : for the operator.
+    key : digest of everything that the output depends on. name : for messages to the operator.
     function : a function of a module, called with ``arguments`` and with ``inputs``, the output files of the tasks in
         ``needs``; returns arrays by name. The array "points", where there is one, is the number of matches.
     folder : of the output file. needs : keys of tasks whose outputs lie in the same folder.
@@ -77,7 +77,7 @@ class Task:
         return tuple(self.folder / f"{key}.npz" for key in self.needs)
 
     def run(self) -> TaskReport:
-        """Compute the output unless it is there. A ComputationError of the function is stored as the output."""
+        """Compute the output unless its file exists. A ComputationError of the function is stored as the output."""
         if self.done:
             os.utime(self.output)
             return TaskReport(computed=False)
@@ -96,14 +96,15 @@ class Executor(Protocol):
     def run(self, tasks: Sequence[Task], on_end: OnTaskEnd) -> None:
         """Run every task that is not done.
 
-        tasks : each after the tasks that it needs. on_end : called in the calling thread, once for each task.
+        tasks : in an order in which each follows the tasks that it needs. on_end : called in the calling thread, once
+        for each task.
         Raises the InputError, or the unexpected exception, of the first task that has one; outputs computed until then
         remain.
         """
 
 
 def read_output(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an output file by name, each with the shape, (n, ...), and unit that the function gave it.
+    """Read the arrays of a task's output file, by name; each (n, ...) has the shape and unit of the task's result.
 
     Raises the ComputationError that the task ended with, InputError where the file is not readable.
     """
@@ -118,7 +119,7 @@ def read_output(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def digest(*parts: Any) -> str:
-    """Digest of some values, 32 hexadecimal digits.
+    """Digest (32 hexadecimal digits) that identifies a set of values, for the key of a task.
 
     parts : numbers, text, arrays, sequences, mappings, dataclasses and groups of settings; TypeError for others.
     """
@@ -129,12 +130,12 @@ def digest(*parts: Any) -> str:
 
 
 def code_stamp() -> str:
-    """Digest of the source of this package. It is part of every key, so another version computes all outputs anew."""
+    """Digest of the source of this package. It is part of every key, so another version computes all outputs again."""
     return source_digest()
 
 
 def file_digest(path: Path, record: CameraRecord | None = None) -> str:
-    """The SHA-256 of a file. record : of the file in its capture; its digest is used where the size in bytes agrees."""
+    """SHA-256 of a file. record : its entry in the capture's record; that digest is used where the size agrees."""
     if record is not None and record.sha256 and record.bytes == path.stat().st_size:
         return record.sha256
     with path.open("rb") as file:
@@ -154,7 +155,7 @@ def _write(path: Path, arrays: Arrays) -> None:
 
 
 def _pieces(value: Any) -> list[bytes]:
-    """A value as bytes that no other value gives."""
+    """Bytes that identify a value: different values have different bytes."""
     if isinstance(value, BaseModel):
         return [type(value).__name__.encode(), *_pieces(value.model_dump())]
     if is_dataclass(value) and not isinstance(value, type):
