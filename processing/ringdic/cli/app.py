@@ -1,4 +1,4 @@
-"""The table of commands of ``ringdic``: each is a thin call of the library's public functions.
+"""The commands of ``ringdic``, each a thin call of the library's public functions.
 
 Commands of other packages are added through the entry-point group ``ringdic.commands``: each entry names a function
 that is called with the :class:`typer.Typer` application and adds its commands to it. This is how ``demo``,
@@ -72,10 +72,10 @@ def _common_options(
 
 def import_command(
     source: Annotated[Path, typer.Argument(help="A folder with rig.toml, board, target and specimen.")],
-    session: Annotated[Path, typer.Argument(help="The session folder to make.")],
+    session: Annotated[Path, typer.Argument(help="The session folder to create.")],
     as_json: AsJson = False,
 ) -> None:
-    """Make a session of a folder of images."""
+    """Create a session folder from a folder of images."""
     ringdic.import_folder(source, session)
     if as_json:
         print_json({"session": str(session)})
@@ -110,7 +110,7 @@ def correlate_command(
     threads: Annotated[int | None, typer.Option(min=1, help="Threads; all cores unless given.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """2D correlation of one pair of images."""
+    """2D digital image correlation of one pair of images."""
     from ringdic.correlation.command import correlate_files
     from ringdic.correlation.settings import CorrelationSettings
 
@@ -134,7 +134,7 @@ def export_command(
     run: Run = None,
     as_json: AsJson = False,
 ) -> None:
-    """Results in another program's form, evaluated anew from their positions."""
+    """Export results in a file format of other programs, with fields evaluated from the stored positions."""
     from ringdic.export import export as export_session
     from ringdic.results.evaluation import Evaluation
 

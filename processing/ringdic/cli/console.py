@@ -1,4 +1,4 @@
-"""What the commands print: tables and sentences on standard error, JSON on standard output."""
+"""Output of the commands: tables and sentences on standard error, JSON on standard output."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _console = Console(stderr=True)
 
 
 def show_table(title: str, rows: Sequence[Mapping[str, str]]) -> None:
-    """A table of figures on standard error; the columns are the keys of the first row."""
+    """Print a table of figures on standard error; the columns are the keys of the first row."""
     if not rows:
         return
     table = Table(title=title, title_justify="left")
@@ -27,10 +27,10 @@ def show_table(title: str, rows: Sequence[Mapping[str, str]]) -> None:
 
 
 def say(sentence: str) -> None:
-    """One sentence on standard error."""
+    """Print one sentence on standard error."""
     _console.print(sentence, highlight=False, soft_wrap=True, markup=False)
 
 
 def print_json(value: Mapping[str, Any]) -> None:
-    """One JSON object on a line of standard output; numbers of NumPy become JSON numbers."""
+    """Print one JSON object on a line of standard output; numbers of NumPy become JSON numbers."""
     sys.stdout.write(json.dumps(value, ensure_ascii=False, default=float) + "\n")

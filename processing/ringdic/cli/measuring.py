@@ -1,4 +1,4 @@
-"""``ringdic measure …`` and ``ringdic strain``: tools on results, as tables in CSV or JSON.
+"""The commands ``ringdic measure …`` and ``ringdic strain``: measurements on results, as tables in CSV or JSON.
 
 CSV goes to standard output, or to a file; notes go to standard error.
 """
@@ -56,7 +56,7 @@ def point_command(
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
-    """Time series of material places: the nearest to positions in the reference, points or faces."""
+    """Time series at material points: the nearest to positions in the reference, vertices or centroids of faces."""
     from ringdic.measure.place import nearest_place, place_of_face, place_of_vertex
     from ringdic.measure.series import time_series
 
@@ -82,7 +82,7 @@ def extensometer_command(
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
-    """Length between two material places through time, along the surface and straight."""
+    """Virtual extensometer: length between two material points at every step, along the surface and straight."""
     from ringdic.measure.extensometer import extensometer
     from ringdic.measure.place import nearest_place
 
@@ -107,7 +107,7 @@ def section_command(
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
-    """Fields along a cut of the reference surface, followed through the steps."""
+    """Fields along a cut of the reference surface, followed through all steps."""
     from ringdic.measure.section import section
 
     cut = _cut(z, theta, plane)

@@ -1,4 +1,4 @@
-"""The options that several commands share, and the results that they choose."""
+"""Options that several commands share, and the results that they select."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def results_of(
     window: float | None = None,
     exponent: float | None = None,
 ) -> EvaluatedResults:
-    """The results of a run as the options evaluate them. Raises InputError for a run that is not there."""
+    """Read the results of a run for evaluation with the given options. Raises InputError where there is no such run."""
     from ringdic.results.evaluation import Evaluation, evaluate_results
     from ringdic.session.folder import newest_results
 

@@ -1,4 +1,4 @@
-"""``ringdic report``, ``ringdic overlay`` and ``ringdic animate``: results as a page, as pictures, as films."""
+"""The commands ``ringdic report``, ``ringdic overlay`` and ``ringdic animate``: results as report, pictures, films."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def report_command(
     run: Run = None,
     as_json: AsJson = False,
 ) -> None:
-    """One self-contained HTML page of a run: reporting tables, calibration, noise floor, maps."""
+    """Write the report of a run as one HTML page: reporting tables, calibration, noise floor, maps."""
     from ringdic.report import write_report
 
     with progress_bar() as show:
@@ -53,7 +53,7 @@ def overlay_command(
     window: Window = None,
     as_json: AsJson = False,
 ) -> None:
-    """A field over the photographs that the cameras took."""
+    """Draw a field over the cameras' photographs of a step."""
     from PIL import Image
 
     from ringdic.pictures.overlay import overlay, photograph, with_bar
@@ -91,7 +91,7 @@ def animate_command(
     window: Window = None,
     as_json: AsJson = False,
 ) -> None:
-    """A field over all steps as GIF or MP4: on one camera's photographs, or on the body seen from a side."""
+    """Animate a field over all steps as GIF or MP4: on one camera's photographs, or on the body seen from a side."""
     from ringdic.pictures.animation import overlay_frames, surface_frames, write_animation
     from ringdic.pictures.views import mean_azimuth
     from ringdic.session.folder import open_session
