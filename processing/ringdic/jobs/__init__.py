@@ -1,10 +1,10 @@
-"""Jobs on a session: processing it as a whole, one step at once, in a warm process, or on a cluster of machines.
+"""Jobs on a session: processing all of it or a single step, in this process, in a waiting one or on a cluster.
 
 ``pipeline``    from the session folder to the results
 ``summary``     the figures of a run
 ``run``         a finished run as an object: fields, drawings, measurements, exports
-``live_step``   one step, while the capturing goes on
-``serving``     a process with loaded kernels, which carries out one order after the other
+``live_step``   processing of a single step during the capture
+``serving``     a waiting process with loaded kernels, which carries out orders
 ``warm_up``     compiles the kernels that follow the matching
 ``allocation``  how the process asks the system for memory
 ``cluster``     tasks on more than one machine

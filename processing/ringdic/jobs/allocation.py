@@ -13,7 +13,7 @@ _OWN_PAGES = 32 << 20  # bytes from which on an array gets pages of its own; the
 
 
 def keep_freed_memory() -> None:
-    """Have the process reuse freed memory instead of getting new pages, which the system has to clear first.
+    """Set the C library to reuse freed memory instead of requesting new pages, which the system has to clear first.
 
     Arrays of several megabytes are allocated and freed all the time, so this saves much of the system's time. Nothing
     changes where the C library is not glibc. To be called before threads are started.

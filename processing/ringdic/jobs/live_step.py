@@ -1,7 +1,7 @@
-"""Processes one step of a session at once, while the capturing goes on; its results are shown until those of a run.
+"""Processing of a single step during the capture, for display until a run processes the whole session.
 
-The matches of the step are stored as those of a run are, so the run later computes only what is missing. All steps are
-shown on the surface of the reference, which is merged once. It is always measured by pairs of cameras, whatever the
+The matches of the step are stored like those of a run, so that a later run computes only what is missing. All steps
+are shown on the surface of the reference, which is merged once. It is always measured by pairs of cameras, whatever the
 settings say, because only pairs need no matches of the steps in between.
 """
 
@@ -29,7 +29,7 @@ _WEIGHTS = {"prepare": 0.01, "calibrate": 0.02, "correlate": 0.8, "triangulate":
 def process_step(
     path: Path, capture_id: str, settings: Settings, report: Report = silent, executor: Executor | None = None
 ) -> Path:
-    """Process the reference and one step of the specimen, and write their results to the session's live folder.
+    """Process the reference and one specimen step of a session, and write their results to its live folder.
 
     The results have neither 2D matches, nor standard deviations of displacements and strains, nor a full summary.
 

@@ -1,4 +1,4 @@
-"""Processes a session folder: calibrates, correlates, triangulates, computes deformation, writes the results.
+"""Processing of a session folder: calibration, correlation, triangulation, deformation, results file.
 
 The stages do not import one another; this is the only module that calls them all.
 """
@@ -47,12 +47,12 @@ _WEIGHTS = {"prepare": 0.03, "calibrate": 0.25, "correlate": 0.62, "triangulate"
 
 @dataclass(frozen=True)
 class SessionMatches:
-    """A session's surface at some steps, from matched images, and figures of its quality.
+    """Results of matching a session: calibrated rig, surface at some steps, and quality measures.
 
     series : the surface, step by step. rig : the calibrated cameras.
-    errors : of the control points as each pair reconstructs them.
+    errors : reconstruction errors of the control points, by pair.
     drift : (F,) px by pair or camera, mean vertical reprojection residual at each step.
-    agreement : of the pairs' surfaces, or of the cameras about common points, as JSON values.
+    agreement : figures of how well the pairs' surfaces, or the cameras' views of a point, agree, as JSON values.
     warnings : sentences for the operator.
     """
 

@@ -29,7 +29,7 @@ Position = Sequence[float]
 
 
 class EvaluationOptions(TypedDict, total=False):
-    """How fields follow from the measured positions; every method of a run that has them takes them by keyword.
+    """Options by which fields are computed from the measured positions; keyword arguments of a run's methods.
 
     reference : what a step is compared with: the "first" step, the reference (default), or the "previous" one.
     without_rigid_motion : move each step back by its rigid motion first; False unless given.
@@ -44,10 +44,10 @@ class EvaluationOptions(TypedDict, total=False):
 
 
 class Run:
-    """A finished processing run: everything measured on a session's specimen, at every step.
+    """A finished processing run: access to all that was measured on a session's specimen, at every step.
 
-    Fields are evaluated from the stored positions when they are asked for, so that a step may be compared with the
-    one before it, freed of its rigid motion, or given strains over another window than the run's, without correlating
+    Fields are evaluated from the stored positions on request, so that a step may be compared with the
+    one before it, without its rigid motion, or given strains over another window than the run's, without correlating
     again; see :class:`EvaluationOptions` for these keywords. Steps are given by their number from 0, the reference,
     or by the name of their capture; -1 is the last. What was not measured at a step is NaN there.
 
@@ -81,12 +81,12 @@ class Run:
 
     @cached_property
     def results(self) -> Results:
-        """The stored arrays of the run, without the 2D matches; read when first asked for."""
+        """The stored arrays of the run, without the 2D matches; read on first use."""
         return read_results(self.path / "results.h5", matches=False)
 
     @cached_property
     def summary(self) -> dict[str, Any]:
-        """What the run reports of itself: cameras, agreement of the pairs, noise floor, warnings, a table of steps."""
+        """Summary of the run as JSON values: cameras, agreement of the pairs, noise floor, warnings, table of steps."""
         summary: dict[str, Any] = json.loads((self.path / "summary.json").read_text(encoding="utf-8"))
         return summary
 
@@ -102,11 +102,11 @@ class Run:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Names of the fields there are, on points and on triangles."""
+        """Names of all available fields, on points and on triangles."""
         return tuple(field.name for field in self.evaluated().fields)
 
     def evaluated(self, **evaluation: Unpack[EvaluationOptions]) -> EvaluatedResults:
-        """The results under an evaluation, as the functions of `ringdic.measure` and `ringdic.pictures` take them.
+        """The results evaluated with given options, for the functions of `ringdic.measure` and `ringdic.pictures`.
 
         Raises InputError for a reference, window or exponent that does not exist.
         """
@@ -176,7 +176,7 @@ class Run:
         show: bool = True,
         **evaluation: Unpack[EvaluationOptions],
     ) -> Plotter:
-        """Show the surface at a step, coloured by a field, in a window or notebook where it can be turned and zoomed.
+        """Show the surface at a step, coloured by a field, in an interactive 3D view in a window or notebook.
 
         Parameters
         ----------
@@ -203,7 +203,7 @@ class Run:
         within: float = 5.0,
         **evaluation: Unpack[EvaluationOptions],
     ) -> Table:
-        """Position and fields of one material point through all steps, a row a step.
+        """Position and fields of one material point through all steps, one row per step.
 
         Parameters
         ----------
@@ -232,7 +232,7 @@ class Run:
         within: float = 5.0,
         reference: Literal["first", "previous"] = "first",
     ) -> Table:
-        """Virtual extensometer: the length between two material points along the surface and straight, a row a step.
+        """Virtual extensometer: length between two material points along the surface and straight, one row per step.
 
         Parameters
         ----------
@@ -240,7 +240,7 @@ class Run:
         within : largest distance from the positions to the surface, mm.
         reference : the step whose length a strain is related to: the "first" or the "previous" one.
 
-        Raises InputError where the surface is farther away, ComputationError where no way along it joins the points.
+        Raises InputError where the surface is farther away, ComputationError where no path along it joins the points.
         """
         from ringdic.measure.extensometer import extensometer
         from ringdic.measure.place import nearest_place
@@ -323,7 +323,7 @@ class Run:
         *,
         reference: Literal["first", "previous"] = "first",
     ) -> Table:
-        """Study of the strain window: strain, its scatter and its virtual strain gauge length for several widths.
+        """Study of the strain window: strain, its scatter and the virtual strain gauge length for several widths.
 
         window_mm : widths of the window, mm; 0 for the strain of each triangle alone. reference : a step is compared
         with the "first" or the "previous" one. A row for each width and step.
@@ -341,16 +341,16 @@ class Run:
         colour: str | None = None,
         **evaluation: Unpack[EvaluationOptions],
     ) -> Path:
-        """Write the results in the form of another program; returns the file or folder that was written.
+        """Export the results in a file format of other programs; returns the file or folder that was written.
 
         Parameters
         ----------
-        path : its suffix tells the form: .npz, .vtkhdf, .mat write one file; .vtp, .csv, .ply, .glb write one file a
+        path : its suffix gives the format: .npz, .vtkhdf, .mat write one file; .vtp, .csv, .ply, .glb write one file a
             step into a folder of this name without the suffix.
-        format : the form, where the path has another suffix or none; the path is then taken as it is.
+        format : the format, where the path has another suffix or none; the path is then used unchanged.
         colour : field that ply and glb are coloured by; displacement unless given.
 
-        Raises InputError for an unknown form or field, and where nothing can be written to the path.
+        Raises InputError for an unknown format or field, and where nothing can be written to the path.
 
         >>> run.export(folder / "results.npz").name
         'results.npz'
@@ -367,9 +367,9 @@ class Run:
         return export_run(self.session.path, chosen, path, _evaluation(**evaluation), colour, self.number)
 
     def report(self, path: str | Path | None = None, progress: Callable[[float], None] = lambda _: None) -> Path:
-        """Write the run's report as one HTML file that needs no other; returns where it lies.
+        """Write the run's report as one self-contained HTML file; returns its path.
 
-        path : the file; ``report.html`` beside the results unless given. progress : is called with the share done.
+        path : the file; ``report.html`` in the run's folder unless given. progress : called with the share done.
         Raises InputError where nothing can be written to the path.
         """
         from ringdic.report import write_report
@@ -377,7 +377,7 @@ class Run:
         return write_report(self.session.path, None if path is None else Path(path), self.number, progress)
 
     def _step(self, step: int | str) -> int:
-        """The number of a step from 0, of a number that may be negative or a name."""
+        """Number of a step, from 0, given by a number, which may be negative, or by name."""
         count = len(self.steps)
         if isinstance(step, str):
             if step not in self.steps:

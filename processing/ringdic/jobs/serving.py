@@ -1,12 +1,13 @@
-"""A warm processing: a process that keeps its kernels loaded and carries out one order after the other.
+"""A waiting worker process that keeps its kernels loaded and processes sessions on order, one after the other.
 
 Orders are lines of JSON on standard input, ``{"order": 1, "session": PATH, "step": null | CAPTURE, "settings": null |
-FILE}``; with a ``step`` that capture alone is processed, at once. ``{"stop": 1}`` asks order 1 to stop at its next
+FILE}``; with a ``step``, only that capture is processed. ``{"stop": 1}`` asks order 1 to stop at its next
 report of progress.
 
 Reports are lines of JSON too. At the start come ``{"worker": "warming", "compiling": true}``, where kernels have to be
-compiled, and ``{"worker": "ready", "seconds": 1.2}``. Of an order come the lines that `ringdic.jobs.__main__`
-describes, with ``{"state": "stopped"}`` as a third outcome. The process ends when its standard input does.
+compiled, and ``{"worker": "ready", "seconds": 1.2}``. An order is answered by the lines that
+`ringdic.jobs.__main__` describes, with ``{"state": "stopped"}`` as a third outcome. The process ends when its standard
+input does.
 """
 
 from __future__ import annotations
@@ -45,11 +46,11 @@ def _memory() -> int:
 
 
 class StoppedError(Exception):
-    """The order was asked to stop."""
+    """Raised in a computation to stop it, when its order is cancelled."""
 
 
 def serve(lines: Iterable[str], say: Say) -> None:
-    """Load all kernels, then carry out the orders of ``lines`` until they end. ``say`` is called with each report."""
+    """Load all kernels, then carry out the orders in ``lines`` until these end; ``say`` is called with each report."""
     orders = _Orders(lines)
     began = time.monotonic()
     process_memory.limit = _memory()
@@ -90,11 +91,11 @@ def compile_kernels(say: Say) -> None:
 
 
 def carry_out(session: Path, settings: Settings, report: Report, step: str | None = None) -> dict[str, Any]:
-    """Process a session and return the outcome as JSON values.
+    """Process a session, or one step of it, and return the outcome as JSON values.
 
-    session : its folder. settings : of the run. report : is called with the progress. step : a capture to process
-    alone and at once; None processes all.
-    Raises RingdicError for what an operator can mend.
+    session : its folder. settings : of the run. report : called with the progress. step : the only capture to
+    process; None processes all.
+    Raises RingdicError for faults that the operator can correct.
     """
     if step is not None:
         process_step(session, step, settings, report)
@@ -105,7 +106,7 @@ def carry_out(session: Path, settings: Settings, report: Report, step: str | Non
 
 
 def progress_values(progress: Progress) -> dict[str, Any]:
-    """A report of progress as the JSON values of one line."""
+    """JSON values of a progress report, for one line of output."""
     return {name: getattr(progress, name) for name in ("stage", "done", "message", "rate", "left_s")}
 
 

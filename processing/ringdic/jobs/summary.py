@@ -18,7 +18,7 @@ from ringdic.results.results import Results
 from ringdic.strain.deformation import Deformation
 from ringdic.strain.rigid_motion import RigidMotion
 
-#: Why the uncertainty by the calibration is unknown where each camera was calibrated alone.
+#: Why the uncertainty due to the calibration is unknown where each camera was calibrated alone.
 ALONE = (
     "each camera was calibrated alone, which states no covariance: what the calibration adds to the uncertainty is not "
     "known; with calibration.method=bundle it is"
@@ -27,7 +27,7 @@ ALONE = (
 
 @dataclass(frozen=True)
 class StepFigures:
-    """The figures of one step in the summary.
+    """Summary of one step: counts, medians and standard deviations.
 
     row : counts and medians of the step. uncertainty : medians of its standard deviations by cause.
     """
@@ -45,17 +45,17 @@ def summarise(
     agreement: Mapping[str, Any],
     warnings: tuple[str, ...],
 ) -> dict[str, Any]:
-    """The summary of a run as JSON values; its ``table`` is what the terminal shows.
+    """Summarise a run as JSON values; ``table`` holds the rows that the terminal shows.
 
     Parameters
     ----------
     reference : the results of the reference alone.
     steps : figures of all steps, the reference first.
     rig : the calibrated cameras.
-    errors : of the control points as each pair reconstructs them.
+    errors : reconstruction errors of the control points, by pair.
     drift : (F,) px by pair or camera, the mean vertical reprojection residual at each step, which shows cameras that
         moved between the steps.
-    agreement : of the surfaces of camera pairs, or of all cameras at the points that they measured together.
+    agreement : figures of how well the surfaces of camera pairs, or the cameras' views of a point, agree.
     warnings : sentences for the operator.
     """
     control = {
@@ -83,7 +83,7 @@ def summarise(
 
 
 def step_figures(results: Results, motion: RigidMotion, deformation: Deformation) -> StepFigures:
-    """The figures of the last step of some results.
+    """Summarise the last step of some results.
 
     motion : takes this step back onto the reference. deformation : of this step since the reference.
     """
@@ -115,7 +115,7 @@ def _strain(results: Results) -> dict[str, float | None]:
 
 
 def _uncertainty(results: Results, step: int) -> dict[str, Any]:
-    """Medians of the standard deviations at a step, by noise and by the calibration; None for what is not known."""
+    """Medians of the standard deviations at a step, due to noise and to the calibration; None where unknown."""
     arrays = results.quality(step).fields()
     known = {entry.name: entry for entry in available(arrays.names)}
 

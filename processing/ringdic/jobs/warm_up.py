@@ -1,4 +1,4 @@
-"""Compiles or loads the kernels that follow the matching, by processing a small synthetic plate once.
+"""Compilation or loading of the kernels used after the matching, by processing a small synthetic plate once.
 
 Triangulation, merging, deformation, uncertainty and the writing of results run on the exact matches of the plate, so
 the first step of a session need not wait for their compilation.
@@ -32,7 +32,7 @@ _STEPS = 2
 def run_small_plate() -> None:
     """Process a synthetic plate at the reference and slightly stretched, seen by two overlapping pairs of cameras.
 
-    The three cameras stand in a row. All that is computed is discarded; the compiled kernels stay.
+    The three cameras stand in a row. The results are discarded; the compiled kernels remain.
     """
     cameras = [_camera(str(k), x) for k, x in enumerate((-80.0, 0.0, 80.0))]
     settings = Settings()

@@ -1,4 +1,4 @@
-"""The driver's side of a cluster: submits tasks to the scheduler as they may start, and takes their outcomes."""
+"""The driver's side of a cluster: submits tasks to the scheduler once they may start, and collects their outcomes."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _INSPECTION_S = 600.0  # a worker may have to compile the kernels first
 class ClusterExecutor:
     """Runs tasks on the workers of a dask scheduler. A worker runs as many tasks at a time as it has threads.
 
-    address : of the scheduler, such as ``tcp://192.168.1.10:8786``. answer_s : time in which the scheduler must answer.
-    idle_s : time that a job waits while there is no worker. Raises InputError where dask is not installed.
+    address : of the scheduler, such as ``tcp://192.168.1.10:8786``. answer_s : time limit of the scheduler's answer, s.
+    idle_s : time limit of waiting while there is no worker, s. Raises InputError where dask is not installed.
     """
 
     def __init__(self, address: str, *, answer_s: float = 10.0, idle_s: float = 60.0) -> None:
@@ -35,7 +35,7 @@ class ClusterExecutor:
         self._idle_s = idle_s
 
     def check(self, folder: Path) -> None:
-        """Check that every worker can run tasks in this folder, which exists, and have it load its kernels.
+        """Check that every worker can run tasks in an existing folder, and have each load its kernels.
 
         Raises InputError where the scheduler does not answer, there is no worker, or one does not see the folder or
         runs another version of this program.
@@ -63,7 +63,8 @@ class ClusterExecutor:
     def run(self, tasks: Sequence[Task], on_end: OnTaskEnd) -> None:
         """Run every task that is not done on the workers; a worker that fails the check gets no tasks.
 
-        tasks : each after the tasks that it needs. on_end : called in the calling thread, once for each task.
+        tasks : in an order in which each follows the tasks that it needs. on_end : called in the calling thread, once
+        for each task.
         Raises InputError where the scheduler does not answer or no worker passes the check, ComputationError where the
         cluster is lost meanwhile.
         """
@@ -202,7 +203,7 @@ def _distributed() -> Any:
 
 
 def _wait(futures: list[Any], timeout: float, until: str) -> list[Any]:
-    """Wait no longer than ``timeout`` seconds; the futures that have ended."""
+    """Wait for at most ``timeout`` seconds until a future has ended; returns the futures that have ended."""
     try:
         return list(_distributed().wait(futures, timeout=timeout, return_when=until).done)
     except TimeoutError:

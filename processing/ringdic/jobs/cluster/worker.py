@@ -1,4 +1,4 @@
-"""Runs one task on a worker of a cluster, with its share of the worker's threads, after a check of the worker."""
+"""The worker's side of a cluster: checks the worker and runs a task with its share of the threads."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _accepted: set[Handshake] = set()  # checked by this process, without a refusal
 
 @dataclass(frozen=True)
 class Handshake:
-    """What a worker is checked against: the driver's version, and a file with a random text in the session's folder.
+    """Values that a worker is checked against: the driver's version, and a random text in the session's folder.
 
     stamp : digest of the driver's source. file, text : the file and its contents.
     """
@@ -39,9 +39,9 @@ class Handshake:
 
 @dataclass(frozen=True)
 class TaskOutcome:
-    """How a task ended on a worker: with a report, a refusal of this worker to run tasks, or an error of the input.
+    """Outcome of a task on a worker: a report, the reason why this worker cannot run tasks, or an error of the input.
 
-    worker : its address. One of the others is not None; refusal and input_error are sentences.
+    worker : its address. Exactly one of report, refusal and input_error is not None; the last two are sentences.
     """
 
     worker: str
@@ -74,7 +74,7 @@ def inspect(handshake: Handshake) -> str | None:
 
 
 def run_task(task: Task, handshake: Handshake, share: int) -> TaskOutcome:
-    """Run a task in this process.
+    """Run a task in this process after checking it against the driver.
 
     handshake : to check the worker against. share : threads for the task's kernels, so that the tasks running at a time
     use no more than the worker's threads. Where kernels cannot run side by side, one task at a time uses all of them.
@@ -96,9 +96,9 @@ def run_task(task: Task, handshake: Handshake, share: int) -> TaskOutcome:
 
 
 def visible(there: Callable[[], bool], folder: Path, limit: float = VISIBLE_S) -> bool:
-    """Wait until a file that another machine has written becomes visible here; whether it did within ``limit`` seconds.
+    """Wait until a file written by another machine is visible here; returns whether it was within ``limit`` seconds.
 
-    there : whether the file is visible now. folder : of the file.
+    there : function that says whether the file is visible now. folder : of the file.
     """
     deadline = time.monotonic() + limit
     while not there():
