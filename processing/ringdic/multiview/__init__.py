@@ -1,4 +1,4 @@
-"""One surface measured by all cameras together: every material point has one identity in all of them.
+"""Measurement of one surface by all cameras together, where each material point is matched in all cameras that see it.
 
 The surface is described by its radius over a lattice of angle and height about the target's axis.
 
@@ -6,7 +6,7 @@ At the reference:
 ``lattice`` is the lattice and the smooth pieces that are fitted to it, ``depth`` a first rough surface from sweeps of
 the camera pairs, ``views`` the visibility of the lattice's nodes in the cameras, ``warps`` the deformation of a subset
 between two cameras by the shape, ``matching`` the matches of the nodes, ``agreement`` their triangulation without
-views that contradict the others, ``weights`` the weights of the views, ``tube`` the triangles between the nodes, and
+inconsistent views, ``weights`` the weights of the views, ``tube`` the triangles between the nodes, and
 ``shape`` all of these together.
 
 In time:

@@ -1,4 +1,4 @@
-"""Triangulation of points from all their views, except those that contradict the others."""
+"""Triangulation of points from all cameras, with rejection of inconsistent views by a χ² test."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ _ROUNDS = 2
 def triangulate_agreeing(
     cameras: Sequence[Camera], px: Pixels, sigma: Floats, fixed: Indices | None = None
 ) -> tuple[WeightedPoints, Mask]:
-    """Triangulate points from all cameras and drop up to two views of a point whose χ² is far beyond the usual.
+    """Triangulate points from all cameras, and drop up to two views of each point whose χ² is too large.
 
-    A point of two views that contradict one another is lost.
+    A point whose only two views are inconsistent is lost.
 
     Parameters
     ----------
     cameras : the C cameras.
     px, sigma : (C, n, 2) float64, px, pixels of the points and their standard deviations, NaN where a camera has none.
-    fixed : (n,) int, index of a camera whose pixel defines the point and is never dropped; None: any view may go.
+    fixed : (n,) int, index of a camera whose pixel defines the point and is never dropped; None: any view may be
+        dropped.
 
     Returns
     -------
-    The points, NaN where lost, and the views (C, n) bool that they rest on.
+    The points, NaN where lost, and the views (C, n) bool that they were triangulated from.
     """
     px = px.copy()
     points = triangulate_weighted(cameras, px, sigma)
@@ -56,7 +57,7 @@ def _median_chi2(points: WeightedPoints) -> float:
 
 
 def _contradicted(points: WeightedPoints, median_chi2: float) -> Mask:
-    """Points (n,) whose χ² is far beyond the usual: some view contradicts the others."""
+    """Points (n,) whose χ² is far above the median, as when one view is inconsistent with the others."""
     return np.asarray((points.degrees > 0) & (np.nan_to_num(points.chi2) > _LIMIT * median_chi2 * points.degrees))
 
 

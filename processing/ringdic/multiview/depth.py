@@ -1,4 +1,4 @@
-"""A first rough radius of the surface over the lattice, from depth sweeps of the camera pairs."""
+"""First approximation of the surface: its radius over a lattice, from depth sweeps of the camera pairs."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ class SurfaceLattice:
 
 @dataclass(frozen=True)
 class Pieces:
-    """A smooth piece of surface about each node of a lattice.
+    """Smooth pieces of surface, one about each node of a lattice, as polynomials of the radius.
 
     lattice : its nodes. coefficients : (columns, rows, 10) float64, mm, of the powers ``POWERS``, the first one the
     radius; NaN where too little is known around. support : (columns, rows), share of the nodes within reach that are
@@ -164,10 +164,10 @@ def robust_pieces(
     floor: float = 0.1,
     density: float = 1.0,
 ) -> tuple[Pieces, Mask]:
-    """Fit smooth pieces of surface without the nodes that lie off them.
+    """Fit smooth pieces of surface with rejection of outlying nodes.
 
-    A node lies off if its distance is more than ``floor`` and more than 6 standard deviations of the usual residual.
-    The most distant nodes are left out first, so that they do not draw the pieces away from good ones.
+    A node is an outlier if its distance is more than ``floor`` and more than 6 standard deviations of the usual
+    residual. The most distant nodes are rejected first, so that they do not bias the fit near good ones.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ def evaluate(coefficients: Floats, a: Floats, b: Floats) -> tuple[Floats, Floats
     """Evaluate the polynomials of pieces of surface.
 
     coefficients : (..., 10) mm. a, b : (...) mm, arc and height from the pieces' nodes. Returns the radius, mm, and its
-    derivatives by a and by b, (...) each.
+    derivatives with respect to a and b, (...) each.
     """
     c = np.moveaxis(coefficients, -1, 0)
     value = (

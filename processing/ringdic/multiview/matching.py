@@ -1,4 +1,4 @@
-"""Matches of the surface's nodes from the camera that faces them to the others, with start values from the shape."""
+"""Matching of surface nodes from their reference camera to other cameras, with start values from the fitted surface."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ _PATIENCE = 25  # iterations at most; steep and small subsets take some ten
 
 @dataclass
 class ReferenceImages:
-    """The reference images of all cameras, filtered where the surface is searched.
+    """The reference images of all cameras, with B-spline coefficients and texture where the surface is searched for.
 
-    cameras : C calibrated cameras. image : gives the grey image of a camera id, (height, width) grey levels, or None
-    where there is none. masks : (height, width) bool, regions drawn by the user, by camera id. settings : of the
-    correlation.
+    cameras : C calibrated cameras. image : function that returns the image of a camera id, (height, width) grey levels,
+    or None where there is none. masks : (height, width) bool, regions drawn by the user, by camera id. settings : of
+    the correlation.
     """
 
     cameras: Sequence[Camera]
@@ -62,9 +62,7 @@ class ReferenceImages:
         return matches
 
     def current(self, k: int) -> Current:
-        """Image of camera number k as a current image, filtered about the pixels of ``look_at``; the latest
-        are cached.
-        """
+        """Image of camera k as a current image, filtered about the pixels of ``look_at``; recent ones are cached."""
         if k not in self._filtered:
             while len(self._filtered) >= _CACHED:
                 self._filtered.popitem(last=False)
@@ -73,7 +71,7 @@ class ReferenceImages:
         return self._filtered[k]
 
     def look_at(self, k: int, px: Pixels) -> None:
-        """Restrict later searches in the image of camera number k to the surroundings of px (n, 2) px."""
+        """Restrict later matching in the image of camera number k to the surroundings of px (n, 2) px."""
         box = self._boxes.get(k)
         edge = np.array(self.cameras[k].size)
         low, high = (np.clip(values, 0, edge) for values in (px.min(axis=0), px.max(axis=0)))
@@ -115,9 +113,9 @@ class NodeMatches:
     """Matches of n nodes in C cameras.
 
     px : (C, n, 2) px, NaN where a camera has none; in the reference camera of a node a whole pixel. noise, systematic :
-    (C, n, 2) px, standard deviations by the noise of each image alone and by what is not noise, also of the reference
-    camera. c_ls : (C, n). status : (n,), 0 for a node with two views or more, else the reason. count : number of
-    matches that were computed.
+    (C, n, 2) px, standard deviations due to the noise of each image alone and due to other causes, also of the
+    reference camera. c_ls : (C, n). status : (n,), 0 for a node with two views or more, else the reason. count : number
+    of matches that were computed.
     """
 
     px: Pixels
@@ -143,7 +141,7 @@ def match_nodes(
     Parameters
     ----------
     images : of all C cameras.
-    pieces : the surface, which gives the start values.
+    pieces : the surface, from which start values are computed.
     nodes : columns (n,) int and rows (n,) int.
     reference : (n,) int, index of the camera that each node is matched from.
     partners : (C, n) bool, cameras that each node is matched in.
@@ -192,7 +190,7 @@ def match_nodes(
 class _Parts:
     """Variances of the matches by cause, and the number of matches of each node.
 
-    noise, systematic : (C, n, 2) px², by noise and by what is not noise. matches : (n,).
+    noise, systematic : (C, n, 2) px², due to noise and to other causes. matches : (n,).
     """
 
     noise: Floats
@@ -221,7 +219,7 @@ class _Parts:
 
 
 def _of_order(settings: CorrelationSettings, order: int) -> CorrelationSettings:
-    """Settings of subsets of an order.
+    """Correlation settings with another order of the shape functions.
 
     Those of second order serve the smooth pieces alone and need not converge to the last digit.
     """

@@ -30,10 +30,10 @@ _LEAST_SIGMA = 1e-3  # px, of the best of matches
 class VertexTrack:
     """The k points that one camera tracked through F steps, with their uncertainty.
 
-    camera : its index. vertex : (k,) int, the points. px : (F, k, 2) px. sigma : (F, k, 2) px, standard deviation by
-    all causes. noise : (F, k, 2) px, of the displacement by the images' noise alone. weight : (F, k, 2) px, standard
+    camera : its index. vertex : (k,) int, the points. px : (F, k, 2) px. sigma : (F, k, 2) px, standard deviation due
+    to all causes. noise : (F, k, 2) px, of the displacement due to image noise alone. weight : (F, k, 2) px, standard
     deviation smoothed over the image, by which positions are weighted. grey_noise : variance, grey levels². c_ls,
-    status : (F, k). used : (F, k) bool, whether the position rests on this camera.
+    status : (F, k). used : (F, k) bool, whether the position was triangulated from this camera.
     """
 
     camera: int
@@ -80,7 +80,7 @@ def vertex_track(
     vertex : (k,) int, which points of the shape they are.
     track : at all F steps, the reference first.
     step : px, of the correlation's grid.
-    sigma_max : px, greatest standard deviation of a match that is believed.
+    sigma_max : px, greatest standard deviation of an accepted match.
     """
     with np.errstate(invalid="ignore"):
         uncertain = (track.status == 0) & (track.sigma > sigma_max).any(axis=2)
@@ -94,7 +94,7 @@ def vertex_track(
 
 
 def _displacement_sigma(track: CameraTrack, texture: Texture, variance: float) -> tuple[Floats, Floats]:
-    """Standard deviations (F, k, 2) px of the displacements: by noise alone and by all causes.
+    """Standard deviations (F, k, 2) px of the displacements: due to noise alone and due to all causes.
 
     variance : of the noise, grey levels².
     """
@@ -115,9 +115,8 @@ def surface_motion(
 ) -> Motion:
     """Triangulate the points of a shape at every step from the tracks of all cameras.
 
-    tracks : of the cameras that see any of the points. steps : their number. refine_poses : gives the cameras as
-    they stood at a step, from the pixels and standard deviations (C, n, 2) px of that step; None: they have not
-    moved.
+    tracks : of the cameras that see any of the points. steps : their number. refine_poses : function that returns the
+    cameras at a step from the pixels and standard deviations (C, n, 2) px of that step; None: they have not moved.
     """
     n, count = len(shape.xyz), len(cameras)
     motion = Motion(

@@ -1,4 +1,4 @@
-"""Measurement of the reference shape: from all cameras' reference images to one set of points and triangles.
+"""Measurement of the reference shape, one set of points and triangles, from the reference images of all cameras.
 
 Sweeps of the camera pairs give a first rough surface and a lattice over it. The nodes of the lattice (of a dense one,
 every second in either direction) are matched from the camera that faces them to two others, with second-order subsets.
@@ -51,9 +51,9 @@ class ShapeSettings:
 
     incidence : steepest angle of a view that is used. spacing : of the lattice, 0 for the correlation's step as the
     cameras see it. curvature : "geometry" to hold the second derivatives that the measured shape gives each warp,
-    "none" for flat subsets. piece : reach of the smooth pieces. sigma_max : px, greatest standard deviation of a
-    match that is believed. floor : px, standard deviation of a pixel by what neither noise nor the difference of the
-    images shows: the cameras, and a shape that bends otherwise than its pieces do.
+    "none" for flat subsets. piece : reach of the smooth pieces. sigma_max : px, greatest standard deviation of an
+    accepted match. floor : px, standard deviation of a pixel due to causes other than noise and the difference of the
+    images: errors of the cameras, and curvature that the fitted pieces do not represent.
     """
 
     incidence: float = 65.0
@@ -69,13 +69,13 @@ class ReferenceShape:
     """Measured points of a surface at the reference and the triangles between them: n points, C cameras, M triangles.
 
     xyz : (n, 3) mm, world frame. node : (n, 2) int, column and row on the lattice. reference : (n,) int, index of the
-    camera that each point was matched from and in which it lies on a whole pixel. px : (C, n, 2) px, NaN for a
-    camera that was not used. sigma : (C, n, 2) px, standard deviation by all causes, smoothed over the image.
-    noise : (C, n, 2) px, by the noise of each image alone. textures : of each camera's image at px. grey_noise : (C,),
-    variance of each camera's noise, grey levels², NaN where it has no image. covariance : (n, 3, 3) mm². chi2,
-    degrees : (n,), of the triangulation. c_ls : (n,), the largest over the cameras. faces : (M, 3) int, normals
-    outwards. pieces : the fitted surface. status : (columns, rows) of all nodes, 0 where measured, NOT_REACHED also
-    where there is no surface. match_count : number of matches that were computed.
+    camera that each point was matched from and in which it lies on a whole pixel. px : (C, n, 2) px, NaN for a camera
+    that was not used. sigma : (C, n, 2) px, standard deviation due to all causes, smoothed over the image. noise : (C,
+    n, 2) px, due to the noise of each image alone. textures : of each camera's image at px. grey_noise : (C,), variance
+    of each camera's noise, grey levels², NaN where it has no image. covariance : (n, 3, 3) mm². chi2, degrees : (n,),
+    of the triangulation. c_ls : (n,), the largest over the cameras. faces : (M, 3) int, normals outwards. pieces : the
+    fitted surface. status : (columns, rows) of all nodes, 0 where measured, NOT_REACHED also where there is no surface.
+    match_count : number of matches that were computed.
     """
 
     xyz: Points
@@ -96,7 +96,7 @@ class ReferenceShape:
     match_count: int
 
     def arrays(self) -> dict[str, NDArray]:
-        """Arrays of the shape by name, as a task's output holds them.
+        """Arrays of the shape by name, as stored in a task's output.
 
         Shapes and units are those of the class: (n, ...) mm or px for the points, (M, 3) indices for the faces.
         """
@@ -113,7 +113,7 @@ class ReferenceShape:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray]) -> ReferenceShape:
-        """Shape from its arrays by name.
+        """The shape from its arrays by name, as read from a task's output.
 
         arrays : as from :meth:`arrays`, (n, ...) mm or px for the points, (M, 3) indices for the faces.
         """
@@ -143,7 +143,8 @@ def reference_shape(
     Parameters
     ----------
     cameras : the C calibrated cameras.
-    image : gives the grey reference image of a camera id, (height, width), or None; a camera without one takes no part.
+    image : function that returns the reference image of a camera id, (height, width) grey levels, or None; a camera
+        without one is not used.
     masks : (height, width) bool, regions drawn by the user, by camera id.
     pairs : indices of neighbouring cameras, for the sweeps.
     search : where the surface may lie, mm.
@@ -194,7 +195,7 @@ def _samples(images: ReferenceImages, pairs: Sequence[tuple[int, int]], search: 
 
 
 class _Surface:
-    """The surface while it is measured: for each node of the lattice what is known so far."""
+    """State of the measurement of the surface: positions, pixels and uncertainty at each node of the lattice so far."""
 
     def __init__(self, images: ReferenceImages, settings: ShapeSettings, pieces: Pieces) -> None:
         count, (columns, rows) = len(images.cameras), pieces.lattice.shape
@@ -222,7 +223,7 @@ class _Surface:
         """Match the nodes that have a smooth piece and triangulate them; the number of nodes that were gained.
 
         A node is matched from the camera that faces it, or, where that failed, from the next: what hides it or
-        glares in one camera spares the others. order : of the subsets. views : most cameras beside the reference
+        glares in one camera spares the others. order : of the subsets. views : most cameras besides the reference
         camera that a node is matched to.
         """
         images, settings = self.images, self.settings
@@ -278,7 +279,7 @@ class _Surface:
     def _node_radius(self) -> Floats:
         """Radius at the nodes, (columns, rows) mm, from points measured near them.
 
-        A point lies beside its node by less than a pixel; the radius changes between the two as the smooth piece does.
+        A point is less than a pixel away from its node; the radius changes between the two as the smooth piece does.
         """
         lattice, coefficients = self.pieces.lattice, self.pieces.coefficients
         theta, z = lattice.coordinates

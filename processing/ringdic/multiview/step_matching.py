@@ -1,11 +1,11 @@
-"""Matches of a camera's points in a later image: whole-pixel subsets in two passes, with the field's curvature.
+"""Matching of a camera's points in a later image, in two passes that account for the displacement field's curvature.
 
 A first-order subset in a curved displacement field is biased; one of second order is not, but is nearly twice as noisy.
 So there are two passes. The first is of second order, at the knots, a part of the points. A quadratic fitted to its
 displacements over the neighbours gives every point its start value, and second derivatives far less noisy than a
 subset's own; the second pass is of first order and holds these fixed. What bias remains (where the surface turns away,
-the field is not quadratic) is the smooth part of the difference of the two passes. It is subtracted as far as it stands
-out of the noise.
+the field is not quadratic) is the smooth part of the difference of the two passes. It is subtracted as far as it
+exceeds the noise.
 
 A subset of the reference lies on a whole pixel, where nothing is interpolated; gradient and curvature carry the result
 to the point, less than a pixel away.
@@ -95,7 +95,7 @@ def match_tracked_points(
         sought in the images.
     settings : of the correlation; order 2 with ``two_pass`` False leaves the second derivatives to each subset.
     two_pass : whether second derivatives of the neighbours' displacement are held fixed in a second, first-order pass.
-    search : whether start values are sought in the images where too few of those given hold.
+    search : whether start values are sought in the images where too few of those given are valid.
     """
     pixel_start = None if start is None else shift_warps(start, points.shift)
     if not two_pass:
@@ -114,7 +114,7 @@ def match_tracked_points(
 
 
 def shift_warps(warp: Floats, shift: Pixels) -> Floats:
-    """Warps at points that are moved by a shift: displacement and gradient by their Taylor series.
+    """Warps at points displaced by a shift within their subsets: displacement and gradient by Taylor series.
 
     warp : (n, 12). shift : (n, 2) px. Returns (n, 12).
     """
@@ -130,7 +130,7 @@ def shift_warps(warp: Floats, shift: Pixels) -> Floats:
 
 
 def _of_knots(settings: CorrelationSettings) -> CorrelationSettings:
-    """Settings of the first of two passes: second order, with no more iterations than a point needs that converges."""
+    """Settings of the first of two passes: second order, with as many iterations as a converging point needs."""
     return replace(
         settings,
         order=2,
@@ -172,7 +172,7 @@ def _at_knots(
 
 
 def with_matches(matches: PointMatches, index: Indices, other: PointMatches) -> PointMatches:
-    """Matches in which the points ``index`` (k,) are replaced by those of other matches where these are good."""
+    """Replace the matches of the points ``index`` (k,) by those of other matches where these are good."""
     good = other.good
     arrays = {}
     for each in fields(matches):
@@ -185,7 +185,7 @@ def with_matches(matches: PointMatches, index: Indices, other: PointMatches) -> 
 
 
 def _about(positions: Pixels, radius: int, part: Current, whole: Current) -> Current:
-    """Part of the current image about positions (n, 2) px, NaN where unknown: the present part if it covers them."""
+    """Current image with a box about positions (n, 2) px, NaN where unknown; unchanged if its box covers them."""
     known = positions[np.isfinite(positions).all(axis=1)]
     if not len(known):
         return whole

@@ -1,4 +1,4 @@
-"""One surface from all cameras at once: the reference shape and the cameras' tracks combined into results.
+"""Results of the measurement by all cameras together, from the reference shape and the cameras' tracks.
 
 The points of the reference shape are tracked by every camera against its own reference image and triangulated from all
 cameras together. The camera pair of a point is formed by the two cameras that face it most squarely.
@@ -34,8 +34,8 @@ class MultiviewSurface:
 
     drift : (F,) px for each camera id, mean vertical residual at each step. agreement : mean number of views of a
     point, RMS residual of the cameras at the reference (px), spacing of the lattice (mm), numbers of lost nodes by
-    reason, and the steps at which cameras were found to have moved. warnings : a sentence for each camera that took
-    no part or moved.
+    reason, and the steps at which cameras had moved. warnings : a sentence for each camera that was
+    not used or moved.
     """
 
     results: Results
@@ -87,7 +87,7 @@ def surface_of_tracks(
 
 
 def reference_pixels(camera: Camera, shape: ReferenceShape, k: int) -> tuple[Indices, Pixels]:
-    """Points of the shape that camera number k saw, and the pixels from which it tracks them.
+    """Points of the shape that camera number k sees, and the pixels from which it tracks them.
 
     Returns indices (n,) int of the points, and their projections (n, 2) float64, px, into the reference image.
     """
@@ -102,7 +102,7 @@ def pair_indices(cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]]) ->
 
 
 def shape_settings(settings: Settings) -> ShapeSettings:
-    """Settings of the reference shape from those of a run."""
+    """Settings of the reference shape's measurement, from the settings of a run."""
     return ShapeSettings(
         incidence=settings.surface.incidence_deg,
         spacing=settings.surface.spacing_mm,
@@ -112,7 +112,7 @@ def shape_settings(settings: Settings) -> ShapeSettings:
 
 
 def _drift(cameras: Sequence[Camera], residuals: Pixels, motion: Motion) -> dict[str, Floats]:
-    """Mean vertical residual (F,) px of each camera that took part, by id.
+    """Mean vertical residual (F,) px of each camera that was used, by id.
 
     residuals : (C, n, 2) px at the reference, where they are between the cameras. Points are tracked from where the
     reference puts them, so the residuals of later steps are added to those.
@@ -155,7 +155,7 @@ def _idle(cameras: Sequence[Camera], shape: ReferenceShape) -> list[str]:
 
 
 def tracking_settings(settings: Settings) -> Tracking:
-    """Settings of the tracking in time from those of a run."""
+    """Settings of the tracking in time, from the settings of a run."""
     order = settings.correlation.order
     return Tracking(
         two_pass=settings.tracking.two_pass and order == 1,

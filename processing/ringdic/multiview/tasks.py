@@ -49,7 +49,7 @@ class MultiviewJob:
     def outputs(self) -> tuple[ReferenceShape, dict[int, CameraTrack]]:
         """Reference shape, and the track through all steps of each camera that sees some of it, by index of the camera.
 
-        Raises the ComputationError with which the shape ended.
+        Raises ComputationError where the shape could not be measured.
         """
         shape = ReferenceShape.from_arrays(read_output(self.shape.output))
         tracks = {}
@@ -69,10 +69,10 @@ def multiview_job(
     search: DepthSearch,
     settings: Settings,
 ) -> MultiviewJob:
-    """Lay out the tasks of a session's measurement by all cameras together.
+    """Create the tasks of a session's measurement by all cameras together.
 
     cameras : all with a reference image. pairs : ids of neighbouring cameras. steps : captures, the reference first.
-    search : where the surface may lie.
+    search : region in which the surface may lie.
     """
     digests, folder = Digests(session), work_folder(session.path)
     correlation = CorrelationSettings(**settings.correlation.keywords)

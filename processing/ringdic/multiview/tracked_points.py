@@ -1,7 +1,7 @@
-"""Points that are tracked through a camera's images, with what is computed once for all images.
+"""Points tracked through a camera's images, with quantities that are computed once for all images.
 
-What is smooth over the image, the field's curvature and the bias that subsets leave, is computed at a part of the
-points only, the knots: one in each square not quite a subset's radius wide.
+Quantities that are smooth over the image, the field's curvature and the bias of the subsets, are computed at a part
+of the points only, the knots: one in each square not quite a subset's radius wide.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class TrackedPoints:
     """Points of a reference image that are tracked through later images: n points, of which m are knots.
 
     positions : (n, 2) float64, px. pixels : (n, 2) float64, px, the whole pixels next to them, on which their
-    subsets lie. variance : (n,), of the grey levels there, grey levels². least : mean square difference that
-    rounding to whole grey levels makes, grey levels². seeds : (s,) int, some points spread evenly. knots : (m,) int,
+    subsets lie. variance : (n,), of the grey levels there, grey levels². least : mean square difference due
+    to rounding to whole grey levels, grey levels². seeds : (s,) int, some points spread evenly. knots : (m,) int,
     indices of the knots. knot : (n,) int, the knot next to each point. neighbourhoods : of the knots. quartile : of
     the knots about each point.
     """
@@ -70,14 +70,14 @@ class TrackedPoints:
         return out
 
     def quadratics(self, values: Pixels, sigma: Floats) -> QuadraticFit:
-        """Fit local quadratics of a displacement field about the knots, without those that contradict their neighbours.
+        """Fit local quadratics of a displacement field about the knots, with rejection of outlying knots.
 
         values : (n, 2) px, at the points. sigma : (n,) px.
         """
         return robust_quadratics(self.neighbourhoods, values[self.knots], sigma[self.knots])
 
     def contradict(self, values: Pixels, sigma: Floats) -> Mask:
-        """Points whose displacement lies far off the quadratic of their neighbours.
+        """Outlying points, whose displacement is far from the quadratic fitted to their neighbours.
 
         values : (n, 2) px, NaN where unknown. sigma : (n,) px. Returns (n,) bool, False where the displacement is
         unknown.
@@ -92,11 +92,11 @@ class TrackedPoints:
             return np.asarray(distance > _limit(distance))
 
     def largest_difference(self, mean_square: Floats) -> Floats:
-        """Largest mean square difference that a good match may have, from those of all points.
+        """Limit of the mean square difference of a good match at each point, from those of its neighbours.
 
-        A point whose subsets differ by far more than those about it is partly covered or worn; beside an obstacle
-        only the best of its neighbours are clear, so the lower quartile about a point is taken. Noise contributes
-        equally in weak and in strong texture, so weak texture is not mistaken for a difference.
+        A point whose subsets differ by far more than those about it is partly covered or worn; next to an obstacle
+        only the best of its neighbours are unobstructed, so the lower quartile about a point is taken. Noise
+        contributes equally in weak and in strong texture, so weak texture is not mistaken for a difference.
 
         mean_square : (n,) grey levels², NaN where unknown. Returns (n,) grey levels², NaN where nothing is known.
         """
@@ -152,7 +152,7 @@ def thin_to_grid(xy: Pixels, side: float) -> Indices:
 
 
 def robust_quadratics(neighbourhoods: Neighbourhoods, values: Pixels, sigma: Floats) -> QuadraticFit:
-    """Fit local quadratics of a field without the points that lie far off them.
+    """Fit local quadratics of a field with rejection of outlying points.
 
     neighbourhoods : of the m points. values : (m, 2) px. sigma : (m,) px.
     """

@@ -1,8 +1,8 @@
 """Tracking of one camera's points through all its images, each compared with the camera's own reference image.
 
-No image is compared with the one before unless it must be, so errors do not add up. Where the surface has changed so
-much that a point is not matched from the reference image, the last image in which it was matched takes the reference's
-place, and displacement, gradient and variances are composed.
+Images are not compared with the one before unless necessary, so errors do not accumulate. Where the surface has changed
+so much that a point is not matched from the reference image, the last image in which it was matched serves as
+reference, and displacement, gradient and variances are composed.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ class CameraTrack:
     """Track of n points of one camera through F steps; NaN where status is not 0.
 
     px : (F, n, 2) px. sigma : (F, n, 2) px, standard deviation of the displacement since the reference, 0 there.
-    c_ls : (F, n), 0 at the reference; for a point that was matched by way of another image the largest on the way.
-    status : (F, n) int. updated : (F, n) bool, matched by way of another image than the reference.
+    c_ls : (F, n), 0 at the reference; for a point matched via other images, the largest of all matches on the way.
+    status : (F, n) int. updated : (F, n) bool, matched via an image other than the reference.
     """
 
     px: Pixels
@@ -81,7 +81,7 @@ class CameraTrack:
 
     @classmethod
     def joined(cls, blocks: Sequence[CameraTrack]) -> CameraTrack:
-        """Track through the steps of several tracks of the same points, one after the other."""
+        """Concatenate tracks of the same points over successive steps."""
         names = [each.name for each in fields(cls)]
         return cls(*(np.concatenate([getattr(block, name) for block in blocks]) for name in names))
 
@@ -96,7 +96,7 @@ class TrackState:
 
     Only points inside the reference image are counted. warp : (k, 12), since the reference, in px and its powers.
     before : (k, 12), at the step before that, NaN if lost there. sigma : (k, 2) px. c_ls : (k,). last : (k,) int,
-    the step. by_way : (k,) int, step of the image that took the reference's place, or 0. moved : () bool, whether
+    the step. by_way : (k,) int, step of the image that served as reference, or 0. moved : () bool, whether
     any point was matched in any image.
     """
 
@@ -136,8 +136,8 @@ def track_block(
     Parameters
     ----------
     reference_image : (h, w) grey levels.
-    image_of_step : gives the image of a step, or None, and then all points are lost there. It may be called twice for a
-        step, and for earlier steps.
+    image_of_step : function that returns the image of a step, or None, and then all points are lost there. It may be
+        called twice for a step, and for earlier steps.
     steps : of the block.
     x0 : (n, 2) float64, px, anywhere in the reference image, about ``settings.step`` apart; NaN where the camera does
         not see the point.
@@ -172,7 +172,7 @@ def track_block(
 
 
 def at_reference(x0: Pixels, shape: tuple[int, ...]) -> CameraTrack:
-    """Track of points at the reference, as a track of one step.
+    """Track of a single step, the reference, at which the points have no displacement.
 
     x0 : (n, 2) float64, px. shape : (h, w) of the image.
     """
@@ -285,7 +285,7 @@ class _CameraTracker:
         return float(np.median(zncc))
 
     def _steps_to_search(self, matches: ImageMatches) -> list[int]:
-        """Steps whose images showed most of the points lost now; a few at most, since each has to be filtered anew."""
+        """Steps whose images showed most of the points lost now; a few at most, since each has to be filtered again."""
         last = self.state.last
         step, count = np.unique(last[~matches.good & (last > 0)], return_counts=True)
         order = np.argsort(-count, kind="stable")[:_ASKED]

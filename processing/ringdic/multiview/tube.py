@@ -1,4 +1,4 @@
-"""Triangles between the measured nodes of a lattice: closed all round where the nodes are, small holes filled.
+"""Triangulation of the measured nodes of a lattice about an axis, closed all round, with small holes filled.
 
 No vertex is added: a hole is filled with triangles between the measured nodes about it.
 """
@@ -54,11 +54,11 @@ class _Nodes:
 
 
 def lattice_faces(xyz: Points) -> tuple[Indices, tuple[Indices, Indices]]:
-    """Lay triangles between the measured nodes of a lattice whose last column adjoins the first.
+    """Triangulate the measured nodes of a lattice whose last column adjoins the first.
 
     A cell with four measured corners is divided along its shorter diagonal, one with three is one triangle. Holes of a
-    single lost node, or of up to 5 mm², are filled. Where the surface would hang together in a point alone, its smaller
-    part is left out, and so are loose scraps.
+    single lost node, or of up to 5 mm², are filled. Where two parts of the surface would touch in one point only, the
+    smaller one is left out, and so are small separate pieces.
 
     xyz : (columns, rows, 3) float64, mm, NaN where not measured. Returns faces (M, 3) int, counter-clockwise seen from
     outside, and the columns and rows (n,) int of the nodes that they use.
@@ -130,9 +130,9 @@ def _holes(nodes: _Nodes) -> tuple[Indices, Indices]:
     numbers = np.arange(lost.size).reshape(lost.shape)
     links = []
     for step in (-1, 0, 1):
-        beside = np.roll(numbers, -1, axis=0)
+        following = np.roll(numbers, -1, axis=0)
         low, high = max(0, -step), rows - max(0, step)
-        here, there = numbers[:, low:high], beside[:, low + step : high + step]
+        here, there = numbers[:, low:high], following[:, low + step : high + step]
         links.append((here, there))
     links.append((numbers[:, :-1], numbers[:, 1:]))
     pairs = np.concatenate([np.stack([a.ravel(), b.ravel()], 1) for a, b in links])

@@ -1,4 +1,4 @@
-"""Standard deviations of the surface's points by the noise of the images: positions, displacements and stretches."""
+"""Standard deviations due to image noise of a surface's positions, displacements and stretches."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ringdic.uncertainty.strain import corner_correlations, stretch_sigma
 
 @dataclass(frozen=True)
 class SurfaceUncertainty:
-    """Standard deviations by the noise of the images, at F steps of n points and M triangles; NaN where lost.
+    """Standard deviations due to image noise, at F steps of n points and M triangles; NaN where lost.
 
     position : (F, n, 3) mm. displacement : (F, n, 3) mm, zero at the reference. stretches : (F, M, 2), of the principal
     stretches λ1 and λ2.
@@ -71,7 +71,7 @@ def surface_uncertainty(
 
 
 def _of_step(count: int, motion: Motion, step: int) -> tuple[Floats, Floats]:
-    """Standard deviations (C, n, 2) px of the pixels that a step's positions rest on: by all causes, by noise alone."""
+    """Standard deviations (C, n, 2) px of the pixels that a step was triangulated from: total, and due to noise."""
     n = motion.status.shape[1]
     sigma, noise = np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan)
     for one in motion.tracks:

@@ -1,7 +1,7 @@
-"""Warp of a subset between two cameras by a curved surface, to second order.
+"""Second-order warps of subsets between two cameras, computed from the shape of a curved surface.
 
 A pixel of the reference camera is taken along its line of sight to the surface and from there into the other camera.
-The derivatives are central differences over the reach of a subset, so they are those that a subset of that size sees.
+The derivatives are central differences over the reach of a subset, so they suit a subset of that size.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _NEWTON = 6  # iterations
 def surface_stencil(
     lattice: SurfaceLattice, coefficients: Floats, theta: Floats, z: Floats, camera: Camera, px: Pixels, reach: float
 ) -> Points:
-    """Intersect the lines of sight of pixels and of their eight neighbours with pieces of surface.
+    """Intersections of the lines of sight of pixels and of eight neighbours of each with pieces of surface.
 
     Parameters
     ----------

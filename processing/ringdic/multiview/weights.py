@@ -1,9 +1,9 @@
-"""Standard deviations that are smooth over the image, by which the views of a point are weighted.
+"""Smoothing of pixels' standard deviations over the image, for the weights of the views in triangulation.
 
 Where cameras have moved a little since they were calibrated, their lines of sight miss one another by far more than
-noise, and alike all over the surface; a point then lies between them as the weights divide the misfit. The standard
-deviation of a single match scatters by a tenth from one texture to the next: divided by it, a smooth misfit would
-become rough.
+the noise, and similarly all over the surface; the weights then decide where between them a point lies. The standard
+deviation of a single match varies by a tenth with the texture: weights from it would turn a smooth misfit into a rough
+surface.
 """
 
 from __future__ import annotations
