@@ -1,1 +1,1 @@
-"""Surfaces of camera pairs: matched between the cameras and in time, triangulated, and merged into one surface."""
+"""Measurement by camera pairs: matching between cameras and in time, triangulation, and merging of the surfaces."""

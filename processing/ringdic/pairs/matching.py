@@ -1,8 +1,8 @@
-"""Matches of one camera pair: between its reference images, and with the tracks of both cameras at every later step.
+"""Matching of one camera pair: between its reference images, then at every step by tracking in either camera.
 
 The reference is the first camera's first image (Solav et al. 2018, step 2). Start values between the cameras come from
-the calibration and a sweep of proxy cylinders. Later images are matched each to its own camera's reference image
-(``tracking``); the second camera's points there are the pixels matched here.
+the calibration and a sweep of proxy cylinders. Each later image is matched to the reference image of its own camera
+(``tracking``), in the second camera at the pixels matched here.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ringdic.sweep.sweep import SWEEP_SPACING, DepthSearch, search_radii, sweep_
 
 @dataclass(frozen=True)
 class Stereo:
-    """Two calibrated cameras, the first that of the reference image, and the settings by which they are matched."""
+    """Two calibrated cameras, the reference camera first, and the settings by which they are matched."""
 
     cameras: tuple[Camera, Camera]
     search: DepthSearch
@@ -60,7 +60,7 @@ class StepMatches:
     """Matches of a pair's n points in both cameras' images of one step; NaN where a camera has no match.
 
     px : (2, n, 2) px. sigma : (2, n, 2) px. c_ls : (n,), the largest over the images used. status : (n,) int, 0 where
-    good in both. seconds : time of the match between the cameras, by stage.
+    matched in both images. seconds : time of the match between the cameras, by stage.
     """
 
     px: Pixels

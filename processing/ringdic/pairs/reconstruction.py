@@ -1,4 +1,4 @@
-"""Reconstruction of a camera pair's surface: from its matches to points in space and triangles, one step at a time."""
+"""Reconstruction of a camera pair's surface, points and triangles, from its matches, one step at a time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ringdic.uncertainty.position import linear_sigma
 
 
 class PairMatches(Protocol):
-    """Matches of a pair's n points in both images of one step, as the reconstruction needs them."""
+    """Interface of the matches that a reconstruction needs: a pair's n points in both images of one step."""
 
     @property
     def px(self) -> Floats:
@@ -46,7 +46,7 @@ class PairStep:
     """Surface of a pair at one step: N points in space, of n matches.
 
     vertices : (N, 3) mm, world frame, NaN where lost. correlation : (N,) C_LS. sigma : (N, 3) mm. status : (n,) int, of
-    the matches, with the reasons of those that cannot be right in space. drift : px, mean vertical reprojection
+    the matches, with the reasons of those rejected in space. drift : px, mean vertical reprojection
     residual of the first camera.
     """
 
@@ -59,12 +59,12 @@ class PairStep:
 
 @dataclass(frozen=True)
 class PairShape:
-    """Surface of a pair at the reference: n matches, N vertices, M triangles, and what later steps are computed from.
+    """Surface of a pair at the reference: n matches, N vertices, M triangles, and the data that later steps need.
 
     xy : (n, 2) px, the grid. rows : (N,) int, the matches that are vertices. faces : (M, 3) int, normals outwards.
     reference : the step of the reference. neighbours : (n, 4, 2) int, of the matches on the grid, from
     ``grid_neighbours``. xyz : (n, 3) mm, world frame, NaN where lost. scatter : (2, n, 2) px, standard deviations of
-    the match between the cameras. sigma_max_px : greatest standard deviation of a match that is believed.
+    the match between the cameras. sigma_max_px : greatest standard deviation of an accepted match.
     """
 
     cameras: tuple[Camera, Camera]
@@ -91,7 +91,7 @@ class PairShape:
 
     def step(self, matches: PairMatches) -> PairStep:
         """Surface at a later step, from the matches of that step."""
-        # The second camera's pixel rests on the match between the cameras and on that in time. The noise of its
+        # The second camera's pixel depends on the match between the cameras and on that in time. The noise of its
         # reference image enters both with opposite signs and cancels, so the larger deviation of the two holds.
         scatter = np.fmax(self.scatter, matches.sigma)
         xyz, sigma, status, drift = _triangulate_step(self.cameras, matches, scatter, self.sigma_max_px)
@@ -111,16 +111,16 @@ def pair_shape(
     step_px: int,
     sigma_max_px: float,
 ) -> PairShape:
-    """Triangulate a pair's reference matches, drop those that cannot be right, and lay triangles between the rest.
+    """Triangulate a pair's reference matches, reject outliers, and form triangles between the remaining points.
 
     Parameters
     ----------
     cameras : of the pair.
     xy : (n, 2) float64, px, the grid in the first camera's image.
-    faces : (m, 3) int, triangles over the grid.
+    faces : (m, 3) int, triangles of the grid.
     matches : at the reference.
     step_px : spacing of the grid.
-    sigma_max_px : greatest standard deviation of a match that is believed.
+    sigma_max_px : greatest standard deviation of an accepted match.
     """
     neighbours = grid_neighbours(xy, step_px)
     xyz, sigma, status, drift = _triangulate_step(cameras, matches, matches.sigma, sigma_max_px)

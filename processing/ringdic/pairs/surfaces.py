@@ -1,4 +1,4 @@
-"""Surfaces of all camera pairs in one set of arrays, merged into one surface or side by side, one step at a time."""
+"""Results of all camera pairs' surfaces, merged or separate, in one set of arrays, one step at a time."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from ringdic.results.results import Matches, Results
 from ringdic.results.series import StepCache, median_deviations
 from ringdic.settings import Settings
 
-_MOST = 0.5  # share of a pair's points that a step must have measured to tell good points from bad ones
+_MOST = 0.5  # share of a pair's points that a step must have measured to distinguish good points from bad ones
 
 
 @dataclass(frozen=True)
 class PairSurface:
-    """Surface of a pair through F steps, each read from a cache when it is needed.
+    """Surface of a pair at F steps, each read from a cache on request.
 
-    shape : at the reference. at : gives the surface and the matches of a step. correlation : (N,) C_LS, of each
-    point the largest over the steps, NaN if it was lost at one. drift : (F,) px, of `PairStep`. noise : (F, 2) px,
-    median standard deviation of each camera's matches.
+    shape : at the reference. at : function that returns the surface and the matches of a step. correlation : (N,) C_LS,
+    of each point the largest over the steps, NaN if it was lost at one. drift : (F,) px, of `PairStep`. noise : (F, 2)
+    px, median standard deviation of each camera's matches.
     """
 
     shape: PairShape
@@ -59,7 +59,8 @@ def reconstruct_pair(
 ) -> PairSurface:
     """Reconstruct a pair's surface at all steps.
 
-    matches_at : gives the matches of a step. steps : their number. cache : for the points in space of every step.
+    matches_at : function that returns the matches of a step. steps : their number. cache : for the points in space of
+    every step.
     """
     worst = shape.reference.correlation.astype(float)
     drift, noise = np.full(steps, np.nan), np.full((steps, 2), np.nan)
@@ -74,7 +75,7 @@ def reconstruct_pair(
 
 
 def merge_surfaces(pairs: Sequence[PairSurface], heuristic: str) -> MergedSurface:
-    """Merge the pairs' surfaces into one, by a heuristic of ``merging``."""
+    """Merge the pairs' reference surfaces into one, by one of the heuristics of ``merging``."""
     return merge([pair.part for pair in pairs], heuristic)
 
 
@@ -88,8 +89,7 @@ def pairs_surface(
 ) -> tuple[PairsSeries, dict[str, Any]]:
     """Combine the pairs' surfaces into a series of results, with figures of how well they agree, as JSON values.
 
-    With the setting surface.merge "none" the surfaces stay side by side, one over the other where several pairs saw the
-    body.
+    With the setting surface.merge "none" the surfaces stay separate, and overlap where several pairs see the body.
 
     Parameters
     ----------
@@ -98,25 +98,25 @@ def pairs_surface(
     pairs : their surfaces.
     names : of the steps, the reference first.
     settings : of the run.
-    merging : merges the surfaces otherwise, by the heuristic that the setting names.
+    merging : function that merges the surfaces by the heuristic that the setting names.
     """
     names = tuple(names)
-    beside = _side_by_side(rig, cameras, pairs, names[0], settings)
+    separate = _side_by_side(rig, cameras, pairs, names[0], settings)
     heuristic = settings.surface.merge
     if heuristic == "none":
         parts = [pair.part for pair in pairs]
         distances = mismatches(parts, Seam().layers * Seam.mean_edge(parts))
-        series = PairsSeries(names, beside, tuple(pairs), np.arange(len(beside.vertices_ref)))
-        return series, {"heuristic": heuristic, **_agreement(beside, distances)}
+        series = PairsSeries(names, separate, tuple(pairs), np.arange(len(separate.vertices_ref)))
+        return series, {"heuristic": heuristic, **_agreement(separate, distances)}
     merged = merging(pairs, heuristic)
     figures = {"heuristic": heuristic, "removed": len(merged.removed), "added": merged.added}
-    series = PairsSeries(names, _over_merged_vertices(beside, merged), tuple(pairs), merged.vertex)
-    return series, {**figures, **_agreement(beside, merged.mismatch)}
+    series = PairsSeries(names, _over_merged_vertices(separate, merged), tuple(pairs), merged.vertex)
+    return series, {**figures, **_agreement(separate, merged.mismatch)}
 
 
 @dataclass(frozen=True)
 class PairsSeries:
-    """Series of results of the pairs' surfaces, in one set of arrays.
+    """Series of results whose vertices are those of all pairs' surfaces, in one set of arrays.
 
     names : of the steps. reference : results of the reference alone. pairs : their surfaces. vertex : (N,) int,
     vertices that are used, of those of all pairs numbered one pair after the other.
@@ -137,7 +137,7 @@ class PairsSeries:
         return replace(self, reference=replace(self.reference, matches=()))
 
     def at(self, step: int) -> Results:
-        """Results of the reference and a later step; of step 0 those of the reference alone."""
+        """Results of the reference and a later step; for step 0 those of the reference alone."""
         if not step:
             return self.reference
         reference, steps_and_matches = self.reference, [pair.at(step) for pair in self.pairs]

@@ -1,4 +1,4 @@
-"""Tasks of the matching of all camera pairs: one for each pair's reference images, one for each camera and later step.
+"""Tasks of matching all camera pairs: one for each pair's reference images, one for each camera and later step.
 
 The steps of a camera are independent of one another, as each is matched from the reference. So one more capture, or
 the newest step alone, leaves the outputs of all other steps valid.
@@ -92,10 +92,10 @@ def pair_jobs(
     search: DepthSearch,
     correlation: CorrelationSettings,
 ) -> list[PairJob]:
-    """Lay out the tasks of all pairs over a session's steps.
+    """Create the tasks of all pairs for a session's steps.
 
-    cameras : by id. pairs : ids of the cameras. steps : captures, the reference first. search : where the surface
-    may lie.
+    cameras : by id. pairs : ids of the cameras. steps : captures, the reference first. search : region in
+    which the surface may lie.
     """
     digests, folder = Digests(session), work_folder(session.path)
     references: dict[tuple[str, str], Task] = {}
@@ -130,7 +130,7 @@ def pair_jobs(
 
 
 def ordered_tasks(jobs: Sequence[PairJob]) -> list[Task]:
-    """All tasks, camera by camera, so that what the steps of a camera share is read while it is still in memory."""
+    """All tasks in order, camera by camera, so that a camera's reference image is prepared once for all its steps."""
     camera_jobs = {id(each): each for job in jobs for each in job.camera_jobs}
     later = [task for each in camera_jobs.values() for task in each.steps if task is not None]
     return [*(job.reference for job in jobs), *later]
@@ -164,7 +164,7 @@ def camera_task(
 ) -> Arrays:
     """Match a camera's grid in its image of one step.
 
-    is_first : whether it is the first camera of each pair whose output is in ``inputs``. reference, image : files.
+    is_first : for each pair whose output is in ``inputs``, whether the camera is its first. reference, image : files.
     Returns the arrays of the matches, and "points", the number of points.
     """
     grid, prepared = _grid_and_reference(camera, settings, is_first, reference, inputs)
@@ -176,7 +176,7 @@ def camera_task(
 def _grid_and_reference(
     camera: Camera, settings: CorrelationSettings, is_first: tuple[bool, ...], image: Path, pairs: tuple[Path, ...]
 ) -> tuple[CameraGrid, Reference]:
-    """Grid of a camera and its prepared reference image, kept in memory for all its steps."""
+    """Grid of a camera and its prepared reference image, cached in memory for all its steps."""
 
     def make() -> tuple[CameraGrid, Reference]:
         first_views: list[FirstCameraView] = []

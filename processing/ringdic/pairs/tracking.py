@@ -1,4 +1,4 @@
-"""Tracking of one camera in time: a grid of its own over what its pairs see, matched from its reference image.
+"""Tracking in one camera: a grid over the regions of its pairs, matched from its reference image in each later image.
 
 The points of a pair's first camera lie on that grid. Those of its second camera, at the pixels where the pair's
 reference images were matched, lie between the grid's points, and their displacement is interpolated. So every image is
@@ -44,7 +44,7 @@ SecondCameraView = tuple[Pixels, NDArray[np.int32]]
 
 @dataclass(frozen=True)
 class CameraGrid:
-    """Region of interest and grid of one camera in its reference image, over what all its pairs see.
+    """Region of interest and grid of one camera in its reference image, covering the regions of all its pairs.
 
     region : (height, width) bool. xy : (n, 2) float64, px, points of the grid. step : px, of which they are multiples.
     """
@@ -87,7 +87,7 @@ class CameraPixels:
 def camera_grid(
     size: tuple[int, int], step: int, first: Sequence[FirstCameraView], second: Sequence[SecondCameraView]
 ) -> CameraGrid:
-    """Lay the grid of a camera over what its pairs see.
+    """Determine the region and grid of a camera from the matches of its pairs.
 
     size : (width, height) of its images, px. step : px, of the grid. first : views of the pairs of which it is the
     first camera. second : views of the pairs of which it is the second camera.
@@ -130,7 +130,7 @@ def match_camera(reference: Reference, image: Image, grid: CameraGrid, settings:
 
 
 def interpolate_matches(matches: CameraMatches, xy: Pixels) -> CameraPixels:
-    """Interpolate a camera's matches at points of its reference image, for their pixels in the image of the step.
+    """Interpolate a camera's matches at points of its reference image, to get their pixels in the image of a step.
 
     xy : (n, 2) float64, px, in the reference image.
     """
@@ -148,7 +148,7 @@ def interpolate_matches(matches: CameraMatches, xy: Pixels) -> CameraPixels:
 def track_points(reference: Reference, current: Current, xy: Pixels, settings: CorrelationSettings) -> PointMatches:
     """Match points of a camera's reference image in a later image, with start values from optical flow.
 
-    Where these lead to few matches, the correlation seeks start values in its own ways. xy : (n, 2) float64, px.
+    Where these give few matches, the correlation searches for start values itself. xy : (n, 2) float64, px.
     """
     sparse = np.flatnonzero(on_lattice(xy, lattice_spacing(settings)))
     flow = flow_start_values(reference, current, xy[sparse], settings.radius)[:, [0, 6, 1, 2, 7, 8]]

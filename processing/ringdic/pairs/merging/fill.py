@@ -1,4 +1,4 @@
-"""Filling of small holes with triangles between the vertices round them."""
+"""Filling of small holes of a surface with triangles between the vertices of their outlines."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def fill(mesh: Mesh, area: float, bridge: float, seam: Mask, seam_area: float) -
 
     Returns
     -------
-    New triangles (K, 3) int, turned as the surface is.
+    New triangles (K, 3) int, oriented as the surface.
     """
     normals = np.nan_to_num(mesh.vertex_normals)
     fillings = [np.zeros((0, 3), np.int64)]

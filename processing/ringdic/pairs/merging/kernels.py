@@ -1,4 +1,7 @@
-"""Loops of the overlap's removal that go from triangle to triangle, compiled."""
+"""Compiled loops over triangles for the removal of overlaps between surfaces.
+
+Triangles that are separated by less than the gap that is to be left count as overlapping.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +16,11 @@ from ringdic.mesh.nearest import near
 
 @nb.njit(cache=True, nogil=True)
 def peel_triangles(start, rival, beside, living, bad):  # type: ignore[no-untyped-def]
-    """Remove border triangles that compete with remaining ones, the worst first, as long as the border reaches any.
+    """Remove border triangles that overlap remaining ones of other surfaces, worst first, as far as the border reaches.
 
-    start : (M + 1,), where the rivals of each triangle, those it competes with, begin in ``rival``. rival : (R,),
-    triangles. beside : (M, 3), the neighbours of each triangle, -1 at a border. living : (M,) bool, triangles that
-    remain, changed in place. bad : (M,), the larger the worse.
+    start : (M + 1,), where the triangles that each one overlaps begin in ``rival``. rival : (R,), triangles. beside :
+    (M, 3), the neighbours of each triangle, -1 at a border. living : (M,) bool, triangles that remain, changed in
+    place. bad : (M,), badness, the larger the worse.
     """
     left = np.zeros(len(living), np.int64)
     queue = [(0.0, 0) for _ in range(0)]
@@ -48,12 +51,12 @@ def peel_triangles(start, rival, beside, living, bad):  # type: ignore[no-untype
 
 @nb.njit(cache=True, nogil=True)
 def regrow_triangles(start, rival, beside, living, wanted, bad):  # type: ignore[no-untyped-def]
-    """Put removed triangles back where none that they compete with remains, beside remaining ones of their surface.
+    """Restore removed triangles that overlap no remaining one and adjoin remaining ones of their own surface.
 
-    Those with most remaining neighbours come first, of these the best. start : (M + 1,), where the rivals of each
-    triangle, those it competes with, begin in ``rival``. rival : (R,), triangles. beside : (M, 3), the neighbours of
-    each triangle, -1 at a border. living : (M,) bool, triangles that remain, changed in place. wanted : (M,) bool,
-    triangles that may come back. bad : (M,), the larger the worse.
+    Those with most remaining neighbours come first, of these the best. start : (M + 1,), where the triangles that each
+    one overlaps begin in ``rival``. rival : (R,), triangles. beside : (M, 3), the neighbours of each triangle, -1 at a
+    border. living : (M,) bool, triangles that remain, changed in place. wanted : (M,) bool, triangles that may be
+    restored. bad : (M,), badness, the larger the worse.
     """
     queue = [(0, 0.0, 0) for _ in range(0)]
     for f in range(len(living)):
@@ -88,13 +91,13 @@ def _count(beside, living, f):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def closer(middles, inside, owner, normals, corners, radius, usual, gap, reach, same_side, first, last):  # type: ignore[no-untyped-def]
-    """Pairs (P, 2) of triangles of different surfaces that lie over one another or within a gap beside one another.
+    """Pairs (P, 2) of triangles of different surfaces that overlap or are separated by less than a gap.
 
     middles : centroids (M, 3) mm sorted into cubes. inside : (M,) bool, triangles that are not large and have no other
     surface near. owner : (M,), surface of each triangle. normals : (M, 3). corners : (M, 3, 3) mm. radius : (M,) mm,
-    from centroid to farthest corner. usual : mm, radius beyond which a triangle is large. gap : mm, beside. reach :
-    mm, along the normal. same_side : least cosine between the normals of two layers of one surface. first, last :
-    range of the triangles, in the order of the cubes, whose rivals are sought.
+    from centroid to farthest corner. usual : mm, radius beyond which a triangle is large. gap : mm, along the surface.
+    reach : mm, along the normal. same_side : least cosine between the normals of two layers of one surface. first, last
+    : range of the triangles, in the order of the cubes, for which pairs are sought.
     """
     M, widest = len(radius), radius.max()
     nearby, distance = np.empty(M, np.int64), np.empty(M)
@@ -123,7 +126,7 @@ def closer(middles, inside, owner, normals, corners, radius, usual, gap, reach, 
 
 @nb.njit(cache=True, nogil=True)
 def _close(a, b, at_a, at_b, normals, corners, radius, gap, reach, same_side):  # type: ignore[no-untyped-def]
-    """Whether two triangles lie over one another or within ``gap`` beside. at_a, at_b : (3,) mm, their centroids."""
+    """Whether two triangles overlap or are separated by less than ``gap``. at_a, at_b : (3,) mm, their centroids."""
     cosine = normals[a, 0] * normals[b, 0] + normals[a, 1] * normals[b, 1] + normals[a, 2] * normals[b, 2]
     if not cosine > same_side:
         return False
@@ -157,7 +160,7 @@ def _separation(one, two, nx, ny, nz):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def rivals(M, competing):  # type: ignore[no-untyped-def]
-    """Collect for each triangle those it competes with, list after list in one array.
+    """Collect for each triangle those that it overlaps, in lists concatenated to one array.
 
     M : number of triangles. competing : (P, 2), pairs of triangles. Returns where each list begins (M + 1,), and the
     array.
@@ -178,7 +181,7 @@ def rivals(M, competing):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def smooth_over_neighbours(values, known, beside, rounds):  # type: ignore[no-untyped-def]
-    """Average values over neighbouring triangles, in several rounds.
+    """Smooth values on triangles by repeatedly averaging over neighbouring triangles.
 
     values : (M,). known : (M,) bool, triangles whose value counts. beside : (M, 3), the neighbours of each triangle,
     -1 at a border. rounds : their number. Returns (M,), 0 where no value is near.

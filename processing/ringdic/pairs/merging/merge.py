@@ -24,7 +24,7 @@ HEURISTICS: Mapping[str, Mapping[str, float]] = MappingProxyType(
         "combined": MappingProxyType({"correlation": 1.0, "distance": 1.0, "orientation": 1.0, "margin": 1.0}),
     }
 )
-_FEWEST = 12  # triangles of a piece that is kept
+_FEWEST = 12  # triangles of the smallest piece that remains
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class SurfacePart:
     """One of the surfaces to be merged.
 
     vertices : (N, 3) float64, mm, finite. faces : (M, 3) int, normals outwards. correlation : (N,) C_LS, 0 best, NaN
-    for a vertex that was lost at some step: where another surface measured the place, its triangles are removed
+    for a vertex that was lost at some step: where another surface covers the same area, its triangles are removed
     first.
 
     Raises ValueError for arrays of other shapes.
@@ -52,7 +52,7 @@ class SurfacePart:
 
 @dataclass(frozen=True)
 class Seam:
-    """Lengths by which surfaces are joined, in mean edges of the triangles, and areas in their squares.
+    """Parameters of joining surfaces: lengths in units of the triangles' mean edge, and areas in its square.
 
     gap : left between surfaces before they are stitched. bridge : longest edge of a new triangle. layers : greatest
     distance between two layers of one surface. hole : largest hole within a surface that is filled; seam_hole :
@@ -84,8 +84,8 @@ class MergedSurface:
 
     faces : (M, 3) int. pair : (M,) int, the part of all three corners, -1 where a triangle joins parts. vertex :
     (K,) int, vertices that are used, ascending. removed : (R,) int, triangles taken out, numbered one part after the
-    other. added : number of new triangles, the last ones of ``faces``. mismatch : of every two parts that lie over
-    one another.
+    other. added : number of new triangles, the last ones of ``faces``. mismatch : of every two parts that
+    overlap.
     """
 
     faces: Indices
@@ -102,7 +102,7 @@ def merge(
     weights: Mapping[str, float] | None = None,
     seam: Seam = Seam(),
 ) -> MergedSurface:
-    """Merge several surfaces into one that is sound and covers no place twice.
+    """Merge several surfaces into one manifold surface without overlaps.
 
     heuristic : which triangles of an overlap are worst: "correlation", "distance", "orientation" or "combined".
     weights : of the measures, by name, instead of those of the heuristic. seam : lengths by which surfaces are
@@ -142,15 +142,15 @@ def _concatenate(parts: Sequence[SurfacePart]) -> tuple[Mesh, Indices, Floats]:
 
 @dataclass(frozen=True)
 class _Overlap:
-    """Overlap of the parts: which triangles lie over one another, and how bad each is.
+    """Overlap of the parts: which triangles overlap, and the badness of each triangle.
 
-    over : (P, 2), pairs of triangles, the first covered by the second. beside : (M, 3), the neighbours of each
+    over : (P, 2), pairs of triangles, the first covered by the second. neighbours : (M, 3), the neighbours of each
     triangle, -1 at a border. lost : (M,) bool, triangles with a lost corner. bad : (M,), the larger the worse,
     largest where lost.
     """
 
     over: Indices
-    beside: Indices
+    neighbours: Indices
     lost: Mask
     bad: Floats
 
@@ -163,38 +163,38 @@ class _Overlap:
         owner : (M,), part of each triangle. correlation : (M,). weights : of the measures. reach : mm, along the
         normals.
         """
-        covered, lost, beside = cover(mesh, owner, reach), np.isnan(correlation), face_neighbours(mesh.faces)
-        bad = badness(mesh, beside, owner, covered, np.where(lost, 0.0, correlation), weights)
+        covered, lost, neighbours = cover(mesh, owner, reach), np.isnan(correlation), face_neighbours(mesh.faces)
+        bad = badness(mesh, neighbours, owner, covered, np.where(lost, 0.0, correlation), weights)
         bad[lost] += 1 + np.ptp(bad)
-        return cls(np.stack([covered.own, covered.other], axis=1), beside, lost, bad)
+        return cls(np.stack([covered.own, covered.other], axis=1), neighbours, lost, bad)
 
 
 def _without_overlap(mesh: Mesh, owner: Indices, overlap: _Overlap, gap: float, reach: float) -> Mask:
-    """Triangles (M,) that are left when no place is covered twice and a gap remains. gap, reach : mm."""
-    over, beside, lost, bad = overlap.over, overlap.beside, overlap.lost, overlap.bad
+    """Triangles (M,) that remain after overlaps are removed and a gap is cut. gap, reach : mm."""
+    over, neighbours, lost, bad = overlap.over, overlap.neighbours, overlap.lost, overlap.bad
     # First triangles that cover one another's centroids, then those of the few left that overlap or are too close.
     living = np.ones(len(mesh.faces), bool)
     living[over[lost[over[:, 0]] & ~lost[over[:, 1]], 0]] = False
-    living = peel(beside, living, over, bad)
-    living = peel(beside, living, _close(mesh, owner, living, gap, reach), bad)
+    living = peel(neighbours, living, over, bad)
+    living = peel(neighbours, living, _close(mesh, owner, living, gap, reach), bad)
     for _ in range(2):  # where small pieces were dropped, others may come back
         living = _tidy(mesh, living)
         free = ~living & ~lost
         free[over[living[over[:, 1]], 0]] = False
         free[over[living[over[:, 0]], 1]] = False
         close = np.concatenate([over, _close(mesh, owner, living | free, gap, reach)])
-        living = regrow(beside, living, free, close, bad)
+        living = regrow(neighbours, living, free, close, bad)
     return _tidy(mesh, living)
 
 
 def _close(mesh: Mesh, owner: Indices, which: Mask, gap: float, reach: float) -> Indices:
-    """Pairs (P, 2) among the triangles of a mask (M,) that lie over one another or closer than the gap, mm."""
+    """Pairs (P, 2) among the triangles of a mask (M,) that overlap or are separated by less than the gap, mm."""
     at = np.flatnonzero(which)
     return at[close_pairs(Mesh(mesh.vertices, mesh.faces[at]), owner[at], gap, reach)]
 
 
 def _tidy(mesh: Mesh, living: Mask) -> Mask:
-    """Triangles (M,) left without pieces of a few triangles and without fans that touch in a point only."""
+    """Triangles (M,) without small separate pieces and without fans that touch in one point only."""
     at = np.flatnonzero(living)
     while True:
         mesh_part = Mesh(mesh.vertices, mesh.faces[at])

@@ -1,4 +1,4 @@
-"""Distances between two surfaces where both measured the same place (Solav et al. 2018, Fig. 7a)."""
+"""Distances between two surfaces in the area that both measured (Solav et al. 2018, Fig. 7a)."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class Surface(Protocol):
 
 @dataclass(frozen=True)
 class Mismatch:
-    """Distances between two surfaces, by their numbers, where they lie over one another; both ways, mm.
+    """Statistics of the distances (mm) between two overlapping surfaces, given by their numbers; both ways together.
 
-    points : number of vertices compared. mean, std : of the absolute distances, the article's figure. bias : mean of
+    points : number of vertices compared. mean, std : of the absolute distances, as in the article. bias : mean of
     the signed distances, positive where ``second`` lies outside ``first``. rms : of the distances. largest : of
     their absolute values.
     """

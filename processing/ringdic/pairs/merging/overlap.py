@@ -1,6 +1,6 @@
-"""Overlaps of several surfaces, and which of their triangles are removed.
+"""Detection of overlaps between several surfaces, and choice of the triangles to remove.
 
-Two triangles of different surfaces *compete* when they cover the same place, or come closer to one another than the
+Two triangles of different surfaces *compete* when they overlap, or are closer to one another than the
 gap that is to be left. Triangles at the border of their surface are removed, the worst first, until no two compete
 (overlap removal of Solav et al. 2018, for any number of surfaces at once instead of two).
 """
@@ -31,7 +31,7 @@ _SAME_SIDE = 0.2  # least cosine between the normals of two layers of one surfac
 
 @dataclass(frozen=True)
 class Cover:
-    """Triangles that lie under or over the centroid of a triangle of another surface: P ordered pairs.
+    """Pairs of triangles of different surfaces, the one over or under the centroid of the other: P ordered pairs.
 
     own, other : (P,) int, triangles. height : (P,) mm, from the centroid of ``own`` to ``other`` along the normal.
     angle : (P,) rad, between the normals.
@@ -75,10 +75,10 @@ def cover(mesh: Mesh, owner: Indices, reach: float) -> Cover:
 
 
 def close_pairs(mesh: Mesh, owner: Indices, gap: float, reach: float) -> Indices:
-    """Pairs of triangles of different surfaces that lie over one another or closer than a gap beside one another.
+    """Pairs of triangles of different surfaces that overlap or are separated by less than a gap.
 
-    Both are judged along the mean of the two normals. owner : (M,) int, surface of each triangle. gap : mm, beside.
-    reach : mm, greatest distance of two layers along that mean. Returns (P, 2) indices.
+    Both are judged along the mean of the two normals. owner : (M,) int, surface of each triangle. gap : mm, along the
+    surface. reach : mm, greatest distance of two layers along that mean. Returns (P, 2) indices.
     """
     corners = mesh.vertices[mesh.faces]
     centroids, normals, radius = triangle_spheres(corners)
@@ -101,18 +101,18 @@ def close_pairs(mesh: Mesh, owner: Indices, gap: float, reach: float) -> Indices
 
 
 def badness(
-    mesh: Mesh, beside: Indices, owner: Indices, covered: Cover, correlation: Floats, weights: Mapping[str, float]
+    mesh: Mesh, neighbours: Indices, owner: Indices, covered: Cover, correlation: Floats, weights: Mapping[str, float]
 ) -> Floats:
-    """Badness of each triangle: weighted sum of measures, each divided by its median over the overlaps.
+    """Badness of each triangle, by which it is removed from an overlap: weighted sum of measures, each over its median.
 
     The measures are ``correlation``, the coefficient C_LS; ``distance`` to the other surfaces; ``orientation``, the
-    angle to the other surfaces' normals; and ``margin``, how near the triangle lies to the border of its own
-    surface, where the cameras saw it at the steepest angles.
+    angle to the other surfaces' normals; and ``margin``, how near the triangle is to the border of its own
+    surface, where the angles of incidence are largest.
 
     Parameters
     ----------
     mesh : all surfaces as one mesh.
-    beside : (M, 3) indices of the neighbours of each triangle.
+    neighbours : (M, 3) indices of the neighbours of each triangle.
     owner : (M,) int, its surface.
     covered : the overlaps.
     correlation : (M,) C_LS.
@@ -135,7 +135,7 @@ def badness(
     for name, values in measures.items():
         if weights.get(name, 0.0):
             smooth = kernels.smooth_over_neighbours(
-                values, everywhere if name == "correlation" else hidden, beside, _SMOOTHING
+                values, everywhere if name == "correlation" else hidden, neighbours, _SMOOTHING
             )
             median = float(np.median(smooth[hidden])) if hidden.any() else 0.0
             total += weights[name] * smooth / (median or 1.0)
@@ -161,31 +161,31 @@ def _from_border(mesh: Mesh, owner: Indices) -> Floats:
     return distance
 
 
-def peel(beside: Indices, alive: Mask, competing: Indices, bad: Floats) -> Mask:
+def peel(neighbours: Indices, alive: Mask, competing: Indices, bad: Floats) -> Mask:
     """Remove border triangles that compete with remaining ones, the worst first, until no two compete.
 
-    beside : (M, 3) indices of the neighbours of each triangle. alive : (M,) bool, to begin with. competing : (P, 2)
+    neighbours : (M, 3) indices of the neighbours of each triangle. alive : (M,) bool, to begin with. competing : (P, 2)
     indices. bad : (M,), the larger the worse. Returns the triangles that remain, (M,) bool.
     """
     competing = competing[alive[competing].all(axis=1)]
-    start, rival = kernels.rivals(len(beside), competing)
+    start, rival = kernels.rivals(len(neighbours), competing)
     living = alive.copy()
-    kernels.peel_triangles(start, rival, beside, living, bad)
+    kernels.peel_triangles(start, rival, neighbours, living, bad)
     for first, second in competing[living[competing].all(axis=1)].tolist():  # pairs that no border reached
         if living[first] and living[second]:
             living[first if bad[first] > bad[second] else second] = False
     return living
 
 
-def regrow(beside: Indices, alive: Mask, candidate: Mask, competing: Indices, bad: Floats) -> Mask:
-    """Put removed triangles that compete with none of the remaining ones back beside those of their own surface.
+def regrow(neighbours: Indices, alive: Mask, candidate: Mask, competing: Indices, bad: Floats) -> Mask:
+    """Restore removed triangles that compete with none of the remaining ones and adjoin those of their own surface.
 
-    Those with most neighbours come first, of these the best. beside : (M, 3) indices of the neighbours of each
-    triangle. alive : (M,) bool, triangles that remain. candidate : (M,) bool, triangles that may come back.
+    Those with most neighbours come first, of these the best. neighbours : (M, 3) indices of the neighbours of each
+    triangle. alive : (M,) bool, triangles that remain. candidate : (M,) bool, triangles that may be restored.
     competing : (P, 2) indices, among those alive and the candidates. bad : (M,), the larger the worse. Returns the
-    triangles there then, (M,) bool.
+    triangles that then remain, (M,) bool.
     """
-    start, rival = kernels.rivals(len(beside), competing)
+    start, rival = kernels.rivals(len(neighbours), competing)
     living = alive.copy()
-    kernels.regrow_triangles(start, rival, beside, living, candidate & ~alive, bad)
+    kernels.regrow_triangles(start, rival, neighbours, living, candidate & ~alive, bad)
     return living

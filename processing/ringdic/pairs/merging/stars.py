@@ -162,7 +162,7 @@ def _gap(across, at, v, behind, ahead):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _fits(b, c, begin, opening, thinnest):  # type: ignore[no-untyped-def]
-    """Whether the triangle of the origin, b and c (2,) is turned as the surface, not thin, and in the gap."""
+    """Whether the triangle of the origin, b and c (2,) is oriented as the surface, not thin, and in the gap."""
     twice_area = b[0] * c[1] - b[1] * c[0]
     longest = max(b[0] ** 2 + b[1] ** 2, c[0] ** 2 + c[1] ** 2, (b[0] - c[0]) ** 2 + (b[1] - c[1]) ** 2)
     if twice_area <= 0 or twice_area < thinnest * longest:

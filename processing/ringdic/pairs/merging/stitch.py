@@ -1,8 +1,8 @@
-"""Stitching of the gaps between surfaces, with triangles between vertices that are there.
+"""Stitching of the gaps between surfaces, with triangles between existing vertices.
 
 Every border vertex is considered in its own tangent plane: the Delaunay triangles of its neighbourhood that touch it
-are its star. A triangle is accepted when it is in the stars of all three of its corners, lies beside the triangles that
-are there, crosses none of their borders and has no edge longer than the bridge. Where the stars do not agree (four
+are its star. A triangle is accepted when it is in the stars of all three of its corners, overlaps none of the existing
+triangles, crosses none of their borders and has no edge longer than the bridge. Where the stars do not agree (four
 points on a circle, a border that is not Delaunay) the gap is left to :mod:`ringdic.pairs.merging.fill`.
 """
 
@@ -22,10 +22,10 @@ THINNEST = 0.1  # least height of a new triangle over its longest edge: a thinne
 
 
 def stitch(mesh: Mesh, group: Indices, bridge: float) -> Indices:
-    """Join different groups of vertices with triangles across the gaps between them.
+    """Triangles that join different groups of vertices across the gaps between them.
 
     mesh : sound pieces side by side. group : (N,) int, of each vertex; gaps are closed only where groups meet.
-    bridge : mm, longest edge of a new triangle. Returns (K, 3) indices, turned as the surface is.
+    bridge : mm, longest edge of a new triangle. Returns (K, 3) indices, oriented as the surface.
     """
     border = mesh.boundary_edges()
     if not len(border):
@@ -49,7 +49,7 @@ def stitch(mesh: Mesh, group: Indices, bridge: float) -> Indices:
 
 
 def _consistent(candidates: Indices, at: Floats, edges: Indices) -> Indices:
-    """Triangles (K, 3) that fit to the border edges and to one another, those with short edges first."""
+    """Triangles (K, 3) compatible with the border edges and with one another, chosen in order of edge length."""
     corners = at[candidates]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1, initial=0.0)
     half_edges = set(map(tuple, edges.tolist()))
