@@ -1,4 +1,4 @@
-"""Benchmark of the correlation on this machine: one image pair, by stage, subset size, order and threads.
+"""Benchmark of the correlation of one image pair on this machine, by stage, subset size, order and threads.
 
 Absolute times drift with the machine's load and clock: every figure is the best of several runs, and an earlier result
 is compared as a ratio.

@@ -49,7 +49,7 @@ class PointMatches:
     xy : (n, 2) float64, px, positions in the reference image.
     uv : (n, 2) float64, px, displacement: current minus reference position.
     gradient : (n, 2, 2) float64, no unit, derivatives d u_i / d x_j of the displacement.
-    curvature : (n, 2, 3) float64, 1/px, second derivatives of the displacement by xx, xy, yy.
+    curvature : (n, 2, 3) float64, 1/px, second derivatives of the displacement with respect to xx, xy, yy.
     zncc, c_ls : (n,) float64, no unit, zero-mean normalised cross-correlation and c_ls = 2 (1 - zncc).
     iterations : (n,) int64. status : (n,) int64, values of ``Status``.
     sigma : (n, 2) float64, px, standard uncertainty of uv: √2 σ √(H⁻¹), σ the noise of an image and H⁻¹ the inverse of
@@ -180,7 +180,7 @@ def load_kernels() -> None:
 
 
 def _match_automatically(points: Propagation, seconds: dict[str, float]) -> None:
-    """Match the points from start values found in the images, by one method after the other until enough are matched.
+    """Match the points, with start values from one method after the other until enough points are matched.
 
     Each method gives start values at a sample of the points still unmatched. Where most of them lead to matches, the
     method suits the pair: its matches are adopted and propagated at once. The few matches of an unsuitable method may
@@ -283,7 +283,7 @@ def _kernel_parameters(start: Floats, n: int) -> Floats:
 
 
 def as_start_values(parameters: Floats) -> Floats:
-    """Reorder parameters of the kernels to start values.
+    """Reorder the kernels' warp parameters to the layout of start values.
 
     parameters : (n, 12) float64, px and derivatives, u ux uy uxx uxy uyy v vx vy vxx vxy vyy.
     Returns (n, 12), u v ux uy vx vy uxx uxy uyy vxx vxy vyy.

@@ -1,4 +1,4 @@
-"""Compiled separable filters of a box of an image.
+"""Compiled separable filters of a rectangular box of an image.
 
 Beyond its border an image is mirrored at the centre of the border pixel. All sums run over the taps in their order, so
 a pixel's value depends neither on the box nor on the number of threads.
@@ -14,7 +14,7 @@ from ringdic.correlation.lanes import LANES, load, load_one, pointer, ramp, stor
 
 _U = np.uint64
 _L = np.uint64(LANES)
-_BLOCK = 4 * LANES  # columns whose sums are kept in registers at once
+_BLOCK = 4 * LANES  # columns whose sums are in registers at once
 _COLUMNS = 64  # columns that one thread takes at a time: 2000 rows of them are half a megabyte
 
 

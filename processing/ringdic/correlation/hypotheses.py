@@ -134,7 +134,7 @@ def _search(
     separation: float,
     zncc_min: float,
 ) -> BestWarps:
-    """Allocate the results, run the kernel over all points and return what it finds.
+    """Allocate the results, run the kernel over all points and return the best warps.
 
     mask : (h, w) bool, the pixels of ``image`` that count in a box whose upper left corner is at ``corner`` (x, y) px;
     an empty mask lets all count.

@@ -1,4 +1,4 @@
-"""Roofline of the correlation: what one core of the processor can do, and what the kernel asks of it for a point.
+"""Roofline model of the correlation: arithmetic speed and bandwidth of one core, and cost of a point in the kernel.
 
 Measured in time of the process on one core, so that other programs disturb little.
 """
@@ -28,7 +28,7 @@ _BYTES = 4 * 4 + 1  # per pixel: f, its gradient, a coefficient of the current i
 
 @dataclass(frozen=True)
 class Machine:
-    """Speed of one core.
+    """Arithmetic speed and memory bandwidth of one core.
 
     clock : GHz. operations : fused multiply-adds of LANES numbers per second. bandwidth : bytes read from memory per
         second.
@@ -41,7 +41,7 @@ class Machine:
 
 @dataclass(frozen=True)
 class KernelCost:
-    """Cost of one point of a correlation.
+    """Operations and memory traffic of one point of a correlation.
 
     pixels : of the subset. vectors : of LANES pixels that hold them. operations : on vectors. bytes : read from memory.
     """

@@ -1,4 +1,4 @@
-"""Neighbours of the points of a correlation, and what their matches say about one another.
+"""Neighbours of the points of a correlation, with extrapolation between them and tests for outliers.
 
 Matches are extrapolated from point to point by their derivatives: to give start values, to fit affine fields, and to
 find outliers.
@@ -19,7 +19,7 @@ _AROUND = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 _MOST_CELLS = 64  # per point, of a grid that neighbours are read from; those of sparser points come from a k-d tree
 _MIN_DEVIATION = 0.5  # px; smaller deviations from the neighbours are never outliers
 _MAX_SCATTER_RATIO = 8.0  # deviation of an outlier, in standard deviations of all deviations
-_MIN_ISLAND = 4  # points of a group that is kept
+_MIN_ISLAND = 4  # points of the smallest group that remains
 
 
 def point_neighbours(xy: Pixels, step: float) -> Indices:

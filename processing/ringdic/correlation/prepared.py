@@ -24,7 +24,7 @@ _FIT_POINTS = 500  # points at most, of an affine fit to the motion of a region
 
 @dataclass(frozen=True)
 class Reference:
-    """A reference image and a box of it around the region of interest, with what is computed from it when first needed.
+    """A reference image in a box around the region of interest, with gradients and spline computed on first use.
 
     image : (height, width) grey levels of the whole image, in its own type.
     box : x0, y0, x1, y1 px, ends exclusive.
@@ -78,9 +78,9 @@ class Reference:
         return replace(self, image=_transpose(self.image), box=box, mask=mask, _cache=cache)
 
     def get_or_compute(self, key: Hashable, compute: Callable[[], T]) -> T:
-        """The value stored under a key, computed by ``compute`` and stored when first asked for.
+        """The value stored under a key, computed by ``compute`` and stored on first use.
 
-        What depends on the reference alone is thus computed once, however many images are matched to it.
+        Quantities of the reference alone are thus computed once for all images that are matched to it.
         """
         if key not in self._cache:
             self._cache[key] = compute()
@@ -90,7 +90,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class Current:
-    """A current image and a box of it where matches can lie, with what is computed from it when first needed.
+    """A current image in a box where matches can lie, with B-spline coefficients computed on first use.
 
     image : (height, width) grey levels of the whole image, in its own type.
     box : x0, y0, x1, y1 px, ends exclusive. degree : of the B-spline, 3 or 5. precision : float32 or float64.
@@ -142,7 +142,7 @@ class Current:
         return Current(self.image, box, self.degree, self.precision)
 
     def crop_by_affine_fit(self, at: Pixels, to: Pixels, xy: Pixels, radius: int) -> Current:
-        """The current image with its box reduced to where an affine fit of some matches puts all points.
+        """The current image with its box reduced to where an affine fit of some matches predicts all points.
 
         at, to : (k, 2) float64, px, reference and current positions of the matched points.
         xy : (n, 2) float64, px, reference positions of all points. radius : px, of the subset; the margin is three of

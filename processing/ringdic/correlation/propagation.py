@@ -46,7 +46,7 @@ class Propagation:
     region : part of the current image in use; by default chosen from the first start values, and the whole image once a
         point lies outside it.
     filtering : seconds spent so far on filtering the current image.
-    textureless : (n,) bool, points with too little texture; found from the image by default.
+    textureless : (n,) bool, points with too little texture; determined from the image by default.
     independent : each point is refined from its own start value only; no point has neighbours.
 
     Attributes
@@ -114,7 +114,7 @@ class Propagation:
         prefer_neighbour: bool = False,
         fixed_curvature: bool = False,
     ) -> Mask:
-        """Refine points from start values and keep the good matches.
+        """Refine points from start values and store the good matches.
 
         A match is good if it converged, its ZNCC reaches the limit, it lies within a step of its start value and its
         warp is not degenerate.
@@ -206,7 +206,7 @@ class Propagation:
         return self.current.crop_by_affine_fit(at, at + start[known][:, [0, 6]], self.xy, self.settings.radius)
 
     def adopt(self, index: Indices, other: Propagation) -> None:
-        """Take over the good matches of another propagation for points that are not matched here.
+        """Copy the good matches of another propagation for points that are not matched here.
 
         index : (k,) int64, the points here that are the other's points.
         """
@@ -221,7 +221,7 @@ class Propagation:
         self.stale[to] = True
 
     def propagate(self) -> None:
-        """Refine unmatched points in waves until none has a good neighbour that it has not been started from."""
+        """Refine unmatched points in waves from their good neighbours, until all such start values have been tried."""
         levels = [level for level in _LEVELS if level > self.settings.zncc_min] + [-1.0]
         while True:
             index = np.flatnonzero(self._unmatched())
@@ -279,7 +279,7 @@ class Propagation:
             self.reject_outliers()
 
     def reject_outliers(self) -> bool:
-        """Drop matches that contradict their neighbours, until none is left that does. True if any was dropped."""
+        """Reject matches that contradict their neighbours, repeatedly until none does. True if any was dropped."""
         for k in range(5):
             bad = inconsistent_points(self.xy, self.parameters, self.good, self.near, self.deviation, self.stale)
             if not bad.any():

@@ -41,7 +41,7 @@ class SubsetMatches(NamedTuple):
 
 
 class SubsetCache:
-    """What the kernels compute of n subsets of a reference image and reuse for every later current image.
+    """Cached normal matrices of n subsets of a reference image, which every later current image reuses.
 
     values : (n, width_of_subset) float64, in the layout of ``kernels``. known : (n,) bool, rows that are filled.
     """
@@ -54,7 +54,7 @@ class SubsetCache:
 def subset_cache(reference: Reference, xy: Pixels, settings: CorrelationSettings) -> SubsetCache | None:
     """The cache of the subsets about given points, stored with their reference image; None for few points.
 
-    The caches of the last ``_CACHED_SETS`` sets of points are kept. xy : (n, 2) float64, px.
+    The caches of the last ``_CACHED_SETS`` sets of points remain in memory. xy : (n, 2) float64, px.
     """
     if len(xy) < _MIN_CACHED:
         return None
@@ -89,7 +89,7 @@ def refine(
     reference, current : the images.
     xy : (n, 2) float64, px, points of the reference image.
     start : (n, 12) float64, parameters in px and derivatives; points with NaN are left out.
-    prefer_neighbour : a point beside one just matched starts from that match where it agrees with the given start
+    prefer_neighbour : a point next to one just matched starts from that match where it agrees with the given start
         value.
     cache : the reference's subset cache and the row (n,) of each point in it, if there is one.
 

@@ -1,4 +1,4 @@
-"""Settings of the correlation of one pair of images, under the names that the correlation uses inside."""
+"""Settings of the correlation of one pair of images, with names without units."""
 
 from __future__ import annotations
 

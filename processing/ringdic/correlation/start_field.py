@@ -34,7 +34,7 @@ def match_from_lattice(
     start: Floats,
     spacing: int,
 ) -> PointMatches:
-    """Match all points of a grid, starting from the matches of a coarse lattice of them.
+    """Match all points of a grid, with start values interpolated from the matches of a coarse lattice.
 
     Parameters
     ----------

@@ -45,7 +45,7 @@ _OUT = PAD - 4  # px outside the image at which a vector may begin so that its t
 
 @nb.njit(cache=True)
 def template(radius, circle):  # type: ignore[no-untyped-def]
-    """Layout of a subset before the mask cuts it: n vectors in s strips.
+    """Layout of a subset, without the mask, as vectors of pixels: n vectors in s strips.
 
     radius : px. circle : whether it is a circle, else a square. Returns corner (2, n) int64, dx and dy of lane 0 of
     each vector; bits (n,) BITS, the lanes that belong to the subset; strips (s + 1,), the first vector of each strip
@@ -154,7 +154,7 @@ def well_inside(shape, x, y, radius):  # type: ignore[no-untyped-def]
 
 @nb.njit(forceinline=True)
 def centre_level(image, shape, x, y):  # type: ignore[no-untyped-def]
-    """Grey level that f is taken about: that of the pixel at or next to the centre.
+    """Grey level that is subtracted from f: that of the pixel at or next to the centre.
 
     image : flat, of the given shape (h, w). x, y : the centre, px.
     """
@@ -404,7 +404,7 @@ def normal_matrix(sums, mean, terms, H, sum_J, sum_fJ):  # type: ignore[no-untyp
 
 @nb.njit(cache=True, nogil=True)
 def write_cache(cache, size, H, sum_J, sum_fJ, mean_f, norm_f, pixels):  # type: ignore[no-untyped-def]
-    """Write what does not depend on the current image into cache, a row of ``width_of_subset`` numbers.
+    """Write the sums that do not depend on the current image into cache, a row of ``width_of_subset`` numbers.
 
     size : of the normal matrix. H : its Cholesky factor (size, size). sum_J, sum_fJ : (size,). mean_f, norm_f, pixels :
     mean of f, norm of f about it, and number of pixels.

@@ -1,4 +1,7 @@
-"""Notice of kernels being compiled. It happens once on a machine; afterwards they are loaded from a cache on disk."""
+"""Notification of callers when numba kernels have to be compiled.
+
+That happens once on a machine; afterwards they are loaded from a cache on disk.
+"""
 
 from __future__ import annotations
 
@@ -27,14 +30,14 @@ class _Listener(event.Listener):
 
 @contextmanager
 def on_compiling(notify: Callable[[], None]) -> Iterator[None]:
-    """Call ``notify`` once if a kernel is compiled inside; not if all are loaded from the cache."""
+    """Context that calls ``notify`` once when a kernel is compiled in it; not if all are loaded from the cache."""
     with event.install_listener("numba:compile", _Listener(notify)):
         yield
 
 
 @contextmanager
 def compiling_reported(report: Report) -> Iterator[Report]:
-    """Pass reports of progress on, and report by name when kernels begin to be compiled inside.
+    """Context that forwards progress reports, and adds a message when kernels are compiled in it.
 
     report : receives everything. Yields the function for the computation to report to.
     """
