@@ -88,7 +88,7 @@ class Intrinsics:
 
 @dataclass(frozen=True)
 class Camera:
-    """A calibrated camera: projection of the world to undistorted pixels, followed by the lens.
+    """A calibrated camera: projection of world points to undistorted pixels, followed by lens distortion.
 
     id : the camera's name in the rig.
     P : (3, 4) projection of world points (mm) to undistorted pixels, scaled to P[2, 3] = 1 as the DLT gives it.
@@ -161,7 +161,7 @@ class Camera:
 
 
 def signed_degrees(angle: float) -> float:
-    """An angle in degrees brought to the turn -180 ≤ angle < 180."""
+    """Wrap an angle in degrees to the interval -180 ≤ angle < 180."""
     return (angle + 180.0) % 360.0 - 180.0
 
 

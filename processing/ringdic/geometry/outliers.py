@@ -15,7 +15,7 @@ SIGMA_OF_MAD = 1.4826  # standard deviation by median absolute deviation, of a n
 
 
 class LostPoint(IntEnum):
-    """Status of a point that was matched in the images but dropped in space; continues the codes of the correlation."""
+    """Status of a point matched in the images but rejected in space; continues the codes of the correlation."""
 
     RESIDUAL = 16  # the lines of sight miss one another
     SURFACE = 17  # off the surface that its neighbours form

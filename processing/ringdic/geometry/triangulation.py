@@ -77,8 +77,8 @@ class LinearSystem:
     def _summed(self) -> tuple[Floats, Floats, Indices, Mask]:
         """``AᵀA`` (n, 3, 3), ``Aᵀb`` (n, 3), numbers of cameras (n,), and where ``AᵀA`` is proved regular (n,)."""
         n = self.undistorted.shape[1]
-        normal, right, seen = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty(n, np.int64)
-        return normal, right, seen, kernels.normal_equations(self.P, self.undistorted, normal, right, seen)
+        normal, right, views = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty(n, np.int64)
+        return normal, right, views, kernels.normal_equations(self.P, self.undistorted, normal, right, views)
 
     @property
     def normal(self) -> Floats:
@@ -87,11 +87,11 @@ class LinearSystem:
 
     @cached_property
     def solvable(self) -> Mask:
-        """Which points are determined: seen by two cameras at least, with lines of sight that cross. (n,) bool."""
-        normal, _, seen, sure = self._summed
+        """Which points are determined, (n,) bool: visible in at least two cameras, with lines of sight that cross."""
+        normal, _, views, sure = self._summed
         solvable = sure.copy()
         solvable[~sure] = _well_conditioned(normal[~sure])
-        return np.asarray(solvable & (seen >= 2))
+        return np.asarray(solvable & (views >= 2))
 
     @cached_property
     def solution(self) -> Points:

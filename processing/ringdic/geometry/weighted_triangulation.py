@@ -49,7 +49,7 @@ class WeightedPoints:
 
 @dataclass(frozen=True)
 class _View:
-    """The points seen by one camera: their numbers (k,), pixels (k, 2) px and weights 1/σ (k, 2) px⁻¹."""
+    """The points seen by one camera: their indices (k,), pixels (k, 2) px and weights 1/σ (k, 2) px⁻¹."""
 
     camera: Camera
     index: Indices
