@@ -9,7 +9,7 @@ import numba as nb
 
 @nb.njit(cache=True, nogil=True)
 def area_vectors(vertices, faces, out):  # type: ignore[no-untyped-def]
-    """Area vectors of triangles: normal to them, with the length of their areas; out (M, 3) mm² is filled.
+    """Fill out (M, 3) mm² with the area vectors of triangles: normal to them, with the length of their areas.
 
     vertices (N, 3) mm. faces (M, 3) vertex indices.
     """

@@ -71,7 +71,7 @@ class Mesh:
         return np.stack(np.divmod(unique, len(self.vertices)), axis=1), count
 
     def boundary_edges(self) -> Indices:
-        """Edges with one triangle only: vertex indices (K, 2), in the direction in which that triangle runs."""
+        """Edges with one triangle only: vertex indices (K, 2), in the direction of that triangle's half-edge."""
         from ringdic.mesh.adjacency import shared_edges  # compiled: loaded only where needed
 
         half = half_edges(self.faces)

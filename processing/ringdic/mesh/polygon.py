@@ -1,4 +1,4 @@
-"""Triangulation of a polygon in space over its own vertices, the one used wherever a hole of a surface is closed.
+"""Triangulation of a polygon in space over its own vertices, for closing holes of surfaces.
 
 Libraries triangulate plane polygons by clipping ears or insert vertices of their own. Here the outline lies in space,
 some diagonals are not allowed, and thin triangles are to be avoided: of all triangulations the best one is sought.

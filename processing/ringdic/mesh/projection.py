@@ -188,7 +188,7 @@ def line_hits(points: Points, directions: Vectors, corners: Points) -> tuple[Flo
     determinant = np.einsum("ni,ni->n", edge1, across)
     with np.errstate(divide="ignore", invalid="ignore"):
         u = np.einsum("ni,ni->n", points - a, across) / determinant
-        beside = np.cross(points - a, edge1)
-        v = np.einsum("ni,ni->n", directions, beside) / determinant
-        along = np.einsum("ni,ni->n", edge2, beside) / determinant
+        q = np.cross(points - a, edge1)
+        v = np.einsum("ni,ni->n", directions, q) / determinant
+        along = np.einsum("ni,ni->n", edge2, q) / determinant
     return np.stack([1 - u - v, u, v], axis=1), along

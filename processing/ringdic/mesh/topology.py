@@ -22,10 +22,10 @@ _SAMPLES = np.array([[1 / 3, 1 / 3, 1 / 3], [2 / 3, 1 / 6, 1 / 6], [1 / 6, 2 / 3
 
 
 class Kind(Enum):
-    """Kind of a border of a surface: round a hole, round a sheet, or round the end of a tube."""
+    """Kind of a border of a surface: around a hole, around an open surface, or around the end of a tube."""
 
     HOLE = "hole"  # the surface surrounds it
-    RIM = "rim"  # it surrounds a sheet
+    RIM = "rim"  # it surrounds an open surface
     END = "end"  # it closes a tube
 
 
@@ -36,8 +36,8 @@ class Border:
     loop : (n,) vertex indices in the direction in which the triangles run along the line; where two borders touch in a
         vertex, it occurs in both.
     area : mm², size of the vector area that the line encloses (for the end of a tube, its cross-section).
-    turning : integral of the geodesic curvature along the line, in full turns: +1 for the rim of a flat sheet, -1 for a
-        flat hole, 0 for the end of a cylinder, however ragged (theorem of Gauss and Bonnet).
+    turning : integral of the geodesic curvature along the line, in full turns: +1 for the rim of a flat surface, -1 for
+        a flat hole, 0 for the end of a cylinder, however ragged (theorem of Gauss and Bonnet).
     """
 
     loop: Indices
@@ -157,7 +157,7 @@ def is_closed_tube(mesh: Mesh, largest_hole: float = 0.0) -> bool:
 
 
 def doubly_covered(mesh: Mesh, reach: float) -> Floats:
-    """Share of each triangle that has another layer of the surface above or below it, (M,), tested at four places.
+    """Share of each triangle that has another layer of the surface above or below it, (M,), tested at four points.
 
     reach : mm, largest distance of another layer along the normal. A layer of opposite orientation is the other side
     of the body and does not count.
