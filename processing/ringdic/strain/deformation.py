@@ -25,7 +25,7 @@ class Deformation:
     """Deformation of M triangles between two configurations; NaN where a corner is lost or a triangle has no area.
 
     The leading axes ``...`` are those of the current positions, such as steps. Lengths are in mm, stretches and strains
-    have no unit. Strains e and those derived from E and e are computed when they are asked for; other families of
+    have no unit. Strains e and those derived from E and e are computed on request; other families of
     strain follow from the stretches and directions by :mod:`ringdic.strain.families`.
 
     F : (..., M, 3, 3) deformation gradient.

@@ -41,7 +41,7 @@ def _reciprocal(D, R):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def fill_directors(vertices, faces, D, area):  # type: ignore[no-untyped-def]
-    """Directors D (S, M, 3, 3) and areas (S, M) mm² of triangles are filled; eq. 12 of Solav et al. 2018.
+    """Fill the directors D (S, M, 3, 3) and areas (S, M) mm² of triangles (Solav et al. 2018, eq. 12).
 
     vertices (S, N, 3) mm. faces (M, 3) vertex indices. area : the array of the areas.
     """
@@ -63,7 +63,7 @@ def fill_directors(vertices, faces, D, area):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def fill_isotropy(vertices, faces, out):  # type: ignore[no-untyped-def]
-    """Isotropy of the shape of triangles, 1 equilateral … 0 degenerate; out (S, M) is filled.
+    """Fill out (S, M) with the isotropy of the shape of triangles, 1 equilateral … 0 degenerate.
 
     vertices (S, N, 3) mm. faces (M, 3) vertex indices.
     """
@@ -104,7 +104,7 @@ def _smaller_axis(half, E12, radius):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def fill_deformation(D, d, F, E, scalars, directions):  # type: ignore[no-untyped-def]
-    """Deformation gradient, Green-Lagrange strain and its in-plane principal values (Solav et al. 2018, eq. 13-16).
+    """Fill deformation gradient, Green-Lagrange strain and its principal values in the plane (Solav et al., eq. 13-16).
 
     D (M, 3, 3), d (S M, 3, 3): reference and current directors. Filled: F and E (S M, 3, 3); scalars (5, S M): λ1, λ2,
     J, E1, E2; directions (4, S M, 3): first and second principal direction in the reference, then in the current
@@ -233,11 +233,12 @@ def stretch_variance(slopes, gain, sigma, alike, faces, variance):  # type: igno
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def fill_stretch_slopes(D, F, directions, stretches, current, before):  # type: ignore[no-untyped-def]
-    """Derivatives of the principal stretches λ1 and λ2 by the positions of the triangles' corners, mm⁻¹.
+    """Fill the derivatives of the principal stretches λ1, λ2 with respect to the triangles' corner positions, mm⁻¹.
 
     D (M, 3, 3) reference directors, F (M, 3, 3) deformation gradients, directions (2, M, 3) principal directions in the
-    reference, stretches (2, M). Filled: current and before (2, M, 3, 3), derivatives by the current and by the
-    reference corners, axes stretch, triangle, corner, component; before is left out if its second axis has length 0.
+    reference, stretches (2, M). Filled: current and before (2, M, 3, 3), derivatives with respect to the
+    current and the reference corners, axes stretch, triangle, corner, component; before is left out if its second axis
+    has length 0.
     """
     R = np.empty((3, 3))
     wanted = before.shape[1] > 0

@@ -139,7 +139,7 @@ def strain_window(mesh: Mesh, width: float) -> StrainWindow:
 
 @dataclass(frozen=True)
 class Gauge:
-    """Length of the virtual strain gauge: over how many mm of the surface one strain value averages.
+    """Virtual strain gauge: the length of surface, mm, over which one strain value averages.
 
     width : of the strain window, mm, 0 for a single triangle. step : median spacing of the points, mm. subset : width
     of a subset, mm.
