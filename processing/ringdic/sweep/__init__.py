@@ -1,1 +1,1 @@
-"""Depth sweep between two calibrated cameras: the region that both see, and start values of its matches."""
+"""Depth sweep between two calibrated cameras, for the region that both see and the start values of its matches."""

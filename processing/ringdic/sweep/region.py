@@ -51,7 +51,7 @@ def coherent_depths(radius: Floats, candidates: Mask, tolerance: float, min_posi
     candidates : (rows, columns) bool, positions with an unambiguous match.
     tolerance : mm, largest difference from the median radius of the candidates among the 8 neighbours, of which there
         must be at least three.
-    min_positions : size of a connected group that is kept; 0 keeps the largest group alone.
+    min_positions : smallest size of a connected group that remains; 0 leaves only the largest group.
 
     Returns
     -------

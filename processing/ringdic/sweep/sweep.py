@@ -1,4 +1,4 @@
-"""Depth sweep between two cameras: a lattice of image positions matched over a row of proxy cylinders.
+"""Depth sweep between two cameras: a lattice of image positions matched over a series of proxy cylinders.
 
 Nothing is known of the shape but that it lies within reach of a cylinder about the target's axis. A match is accepted
 where its ZNCC is high, no other depth matches nearly as well, and the neighbours lie at a similar depth. Most of an
@@ -62,7 +62,7 @@ class DepthSweep:
 
 
 def search_radii(cameras: tuple[Camera, Camera], search: DepthSearch) -> Floats:
-    """Radii of the sweep's cylinders, so close that the match moves by about 1.5 px from one to the next.
+    """Radii of the sweep's cylinders, spaced so that the match moves by about 1.5 px from one to the next.
 
     Returns (K,) float64, mm, ascending.
     """
@@ -107,7 +107,7 @@ def sweep_depths(
     settings: CorrelationSettings,
     min_positions: int = 0,
 ) -> DepthSweep:
-    """Find the surface that two cameras share, by a sweep of proxy cylinders from the first camera's image.
+    """Search for the surface that two cameras share, by a sweep of proxy cylinders from the first camera's image.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def sweep_depths(
         contrast are rejected.
     radii : (K,) float64, mm, of the cylinders, ascending.
     search, settings : of the sweep and of the correlation; the lattice's spacing is a multiple of the grid step.
-    min_positions : size of a connected piece of surface that is kept; 0 keeps the largest piece alone.
+    min_positions : smallest size of a connected piece of surface that remains; 0 leaves only the largest piece.
     """
     first, _ = cameras
     points = image_lattice(first.size, lattice_spacing(settings, SWEEP_SPACING), settings.radius + 2)
