@@ -1,4 +1,4 @@
-"""Measuring on results: time series of places, extensometers, sections, regions, a study of the strain window.
+"""Measurements on results: time series at material points, extensometers, sections, regions, strain window study.
 
 =================  ==========================================================================================
 ``place``          a material place on the reference surface: a triangle and where in it

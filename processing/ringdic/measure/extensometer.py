@@ -1,4 +1,4 @@
-"""A virtual extensometer: the length between two material places, along the surface and straight."""
+"""A virtual extensometer: the length between two material points, along the surface and straight."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _UNITS = dict.fromkeys(("along_surface", "straight"), "mm")
 
 
 def extensometer(results: EvaluatedResults, start: Place, end: Place) -> Table:
-    """Length between two places at every step, in mm, and engineering strain ``L / L0 - 1``; one row a step.
+    """Length between two material points at every step, mm, and engineering strain ``L / L0 - 1``; one row per step.
 
     ``along_surface`` is the length of the material line that was the shortest path in the reference; ``straight`` is
     the chord. L0 is the length at the step with which each step is compared. Raises ComputationError if the places lie

@@ -1,4 +1,4 @@
-"""The shortest path along the surface between two places, followed as a material line.
+"""The shortest path along the surface between two material points, followed as a material line.
 
 The path crosses edges. A first guess comes from Dijkstra's algorithm over points set on the edges (Lanthier et al.
 2001), a few on every edge of a wide corridor, then more in a narrower one. The triangles it passes, unfolded into a
@@ -57,7 +57,7 @@ class SurfacePath:
 
 
 def shortest_path(mesh: Mesh, start: Place, end: Place) -> SurfacePath:
-    """The shortest path along the reference surface between two places.
+    """The shortest path along the reference surface between two material points.
 
     Raises ComputationError if the places lie on parts of the surface that do not touch.
     """
@@ -146,12 +146,12 @@ class _Strip:
         fan = self._other_side(vertex, at[0], at[-1])
         if fan is None:
             return False
-        kept = self._portals, self._shares, self._held_at, self._length
+        before = self._portals, self._shares, self._held_at, self._length
         self._portals = _without_returns([*self._portals[: at[0]], *fan, *self._portals[at[-1] + 1 :]])
         self._pull()
-        if self._length < kept[3] * (1 - 1e-12):
+        if self._length < before[3] * (1 - 1e-12):
             return True
-        self._portals, self._shares, self._held_at, self._length = kept
+        self._portals, self._shares, self._held_at, self._length = before
         return False
 
     def _other_side(self, vertex: int, first: int, last: int) -> list[tuple[int, int]] | None:
@@ -294,10 +294,10 @@ def _crossing(left: Floats, right: Floats, a: Floats, b: Floats) -> float:
 
 def _without_returns(portals: list[tuple[int, int]]) -> list[tuple[int, int]]:
     """Portals without pairs that are crossed and immediately crossed back."""
-    kept: list[tuple[int, int]] = []
+    remaining: list[tuple[int, int]] = []
     for portal in portals:
-        if kept and kept[-1] == portal:
-            kept.pop()
+        if remaining and remaining[-1] == portal:
+            remaining.pop()
         else:
-            kept.append(portal)
-    return kept
+            remaining.append(portal)
+    return remaining

@@ -1,4 +1,4 @@
-"""Material places on the reference surface: a triangle and barycentric weights in it."""
+"""Material points of the surface, each given by a triangle and barycentric weights in it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ringdic.mesh.mesh import Mesh
 
 @dataclass(frozen=True)
 class Place:
-    """A material place in triangle ``face`` with barycentric ``weights`` (3,), which sum to 1. label : its name."""
+    """A material point in triangle ``face`` with barycentric ``weights`` (3,), which sum to 1. label : its name."""
 
     face: int
     weights: tuple[float, float, float]
@@ -27,18 +27,18 @@ class Place:
             raise ValueError(f"weights {self.weights} are not those of a place in a triangle")
 
     def at(self, values: Floats, faces: Indices) -> Floats:
-        """Values interpolated at the place, in their unit; NaN where a corner with weight is NaN.
+        """Values interpolated at the point, in their unit; NaN where a corner with weight is NaN.
 
         values : (N,) or (N, k) of the vertices. faces : (M, 3).
         """
         corners = faces[self.face]
         weights = np.array(self.weights)
-        held = weights > 0
-        return np.asarray(np.tensordot(weights[held], values[corners[held]], axes=1))
+        used = weights > 0
+        return np.asarray(np.tensordot(weights[used], values[corners[used]], axes=1))
 
 
 def nearest_place(mesh: Mesh, position: Sequence[float], within: float = 5.0) -> Place:
-    """The place of the surface nearest to a position (3,) mm in space.
+    """The point of the surface nearest to a position (3,) mm in space.
 
     Raises InputError if the surface is farther than ``within`` mm; the sentence names its nearest point.
     """
@@ -53,22 +53,22 @@ def nearest_place(mesh: Mesh, position: Sequence[float], within: float = 5.0) ->
     nearest, _ = tree.query(xyz)
     # The centroid of the nearest triangle cannot be farther than the nearest centroid and the largest triangle.
     near = whole[tree.query_ball_point(xyz, nearest + size)]
-    found = closest_point(mesh.vertices[mesh.faces[near]], np.broadcast_to(xyz, (len(near), 3)))
-    distance = np.linalg.norm(found - xyz, axis=1)
+    closest = closest_point(mesh.vertices[mesh.faces[near]], np.broadcast_to(xyz, (len(near), 3)))
+    distance = np.linalg.norm(closest - xyz, axis=1)
     best = int(distance.argmin())
     if distance[best] > within:
         raise InputError(
             f"{label} mm is {distance[best]:.1f} mm away from the surface; the nearest place on it is "
-            f"({', '.join(f'{c:.1f}' for c in found[best])}) mm"
+            f"({', '.join(f'{c:.1f}' for c in closest[best])}) mm"
         )
-    weights = points_to_barycentric(mesh.vertices[mesh.faces[near[best : best + 1]]], found[best : best + 1])[0]
+    weights = points_to_barycentric(mesh.vertices[mesh.faces[near[best : best + 1]]], closest[best : best + 1])[0]
     weights = np.clip(weights, 0.0, 1.0)
     a, b, c = (float(w) for w in weights / weights.sum())
     return Place(int(near[best]), (a, b, c), label)
 
 
 def place_of_vertex(mesh: Mesh, vertex: int) -> Place:
-    """The place of a vertex, by its index from 0. Raises InputError if there is none, or it belongs to no triangle."""
+    """The material point at a vertex, by index from 0. Raises InputError if there is none or it is in no triangle."""
     if not 0 <= vertex < len(mesh.vertices):
         raise InputError(f"no point {vertex}; there are {len(mesh.vertices)}, from 0")
     face, corner = np.nonzero(mesh.faces == vertex)
@@ -80,7 +80,7 @@ def place_of_vertex(mesh: Mesh, vertex: int) -> Place:
 
 
 def place_of_face(mesh: Mesh, face: int) -> Place:
-    """The place of a triangle's centroid, by the triangle's index from 0. Raises InputError if there is none."""
+    """The material point at the centroid of a triangle, by index from 0. Raises InputError if there is none."""
     if not 0 <= face < len(mesh.faces):
         raise InputError(f"no face {face}; there are {len(mesh.faces)}, from 0")
     third = 1.0 / 3.0

@@ -51,7 +51,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Ball:
-    """A sphere: what lies within ``radius`` mm of a centre in mm."""
+    """A sphere of ``radius`` mm about a centre in mm."""
 
     centre: tuple[float, float, float]
     radius: float
@@ -87,7 +87,7 @@ class AngularPatch:
 
 @dataclass(frozen=True)
 class Listed:
-    """Triangles by their indices from 0."""
+    """Triangles chosen by their indices from 0."""
 
     indices: tuple[int, ...]
 
@@ -102,13 +102,13 @@ class Listed:
 
 
 def region_statistics(results: EvaluatedResults, region: Region, fields: Sequence[str] = ()) -> Table:
-    """Statistics of fields over a region, one row a field and step.
+    """Statistics of fields over a region, one row per field and step.
 
     Fields of triangles are taken over the triangles of the region, fields of points over the corners of these.
 
     ``mean``, ``std`` and ``rms`` are weighted by the area in the reference (a point has a third of its triangles in the
     region); ``min``, ``p5``, ``median``, ``p95``, ``max`` count triangles or points alike; ``measured`` and ``lost``
-    are numbers of them. Raises InputError for a region without triangles or a field there is not.
+    are numbers of them. Raises InputError for a region without triangles or an unknown field.
     """
     entries = [results.field(name) for name in fields] if fields else list(results.fields)
     mesh = results.results.mesh
@@ -121,9 +121,9 @@ def region_statistics(results: EvaluatedResults, region: Region, fields: Sequenc
     for entry in entries:
         for step, name in enumerate(results.steps):
             weight = weights[entry.location]
-            held = weight > 0
-            found = statistics(results.step(step).scalar(entry)[held], weight[held])
-            rows.append({"field": entry.name, "unit": entry.unit, "step": step, "capture": name, **found})
+            inside_region = weight > 0
+            figures = statistics(results.step(step).scalar(entry)[inside_region], weight[inside_region])
+            rows.append({"field": entry.name, "unit": entry.unit, "step": step, "capture": name, **figures})
     note = f"{int(inside.sum())} triangles, {areas.sum():.2f} mm² in the reference"
     return Table.of_rows(rows, {}, [note])
 
@@ -140,13 +140,13 @@ def statistics(values: Floats, weights: Floats) -> dict[str, float | int]:
         return {**dict.fromkeys(names, float("nan")), "measured": 0, "lost": lost}
     v, w = values[known], weights[known] / weights[known].sum()
     mean = float(w @ v)
-    found = (
+    figures = (
         mean,
         float(np.sqrt(w @ (v - mean) ** 2)),
         float(np.sqrt(w @ v**2)),
         *np.percentile(v, [0, 5, 50, 95, 100]),
     )
-    return {**dict(zip(names, map(float, found), strict=True)), "measured": len(v), "lost": lost}
+    return {**dict(zip(names, map(float, figures), strict=True)), "measured": len(v), "lost": lost}
 
 
 def _shares(mesh: Mesh, areas: Floats) -> Floats:

@@ -66,31 +66,31 @@ class Crossings:
 
 
 def section(results: EvaluatedResults, cut: Cut, fields: Sequence[str] = ()) -> Table:
-    """Fields along a section: one row a crossed triangle and step.
+    """Fields along a section, one row per crossed triangle and step.
 
     A row holds the number of the line, the arc length in the reference, the position and the fields. fields : names;
     all fields unless given. Raises InputError for an unknown field or a cut that misses the surface.
     """
     entries: list[Field] = [results.field(name) for name in fields] if fields else list(results.fields)
-    found = crossings(results.results.mesh, cut)
-    reference = found.at(results.results.vertices_ref)
+    segments = crossings(results.results.mesh, cut)
+    reference = segments.at(results.results.vertices_ref)
     rows: list[dict[str, Any]] = []
     for step, name in enumerate(results.steps):
-        arrays, now = results.step(step), found.at(results.positions(step))
+        arrays, now = results.step(step), segments.at(results.positions(step))
         columns = {
-            entry.name: found.at(values) if entry.location == "point" else values[found.faces]
+            entry.name: segments.at(values) if entry.location == "point" else values[segments.faces]
             for entry in entries
             for values in [arrays.scalar(entry)]
         }
-        for k in range(len(found.faces)):
-            row: dict[str, Any] = {"line": int(found.line[k]), "step": step, "capture": name, "s": found.along[k]}
+        for k in range(len(segments.faces)):
+            row: dict[str, Any] = {"line": int(segments.line[k]), "step": step, "capture": name, "s": segments.along[k]}
             row |= {f"{axis}_reference": reference[k, i] for i, axis in enumerate("xyz")}
             row |= {axis: now[k, i] for i, axis in enumerate("xyz")}
             rows.append(row | {entry: values[k] for entry, values in columns.items()})
     lengths = ("s", "x", "y", "z", "x_reference", "y_reference", "z_reference")
     units = {**dict.fromkeys(lengths, "mm"), **{entry.name: entry.unit for entry in entries}}
-    lines = int(found.line.max()) + 1
-    return Table.of_rows(rows, units, [f"{len(found.faces)} triangles crossed on {lines} line{'s' * (lines > 1)}"])
+    lines = int(segments.line.max()) + 1
+    return Table.of_rows(rows, units, [f"{len(segments.faces)} triangles crossed on {lines} line{'s' * (lines > 1)}"])
 
 
 def crossings(mesh: Mesh, cut: Cut) -> Crossings:

@@ -1,4 +1,4 @@
-"""Time series of fields at material places."""
+"""Time series of fields at material points."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ringdic.results.evaluation import EvaluatedResults
 
 
 def time_series(results: EvaluatedResults, places: Sequence[Place], fields: Sequence[str] = ()) -> Table:
-    """Position and fields of places at every step; one row a place and step.
+    """Position and fields of material points at every step; one row per point and step.
 
     Fields of points are interpolated at the place, fields of triangles are those of its triangle. fields : names; all
     fields unless given. Raises InputError for an unknown field.

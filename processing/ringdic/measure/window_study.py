@@ -1,4 +1,4 @@
-"""Study of the strain window: strain and its scatter by window width, without correlating again."""
+"""Study of the strain window: strain and its scatter as functions of the window's width."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ringdic.strain.window import Gauge, StrainWindow, strain_window
 
 
 def window_study(results: Results, widths: Sequence[float], previous: bool = False) -> Table:
-    """Strain figures for several widths of the strain window; one row a width and step. Width 0 is the triangle alone.
+    """Strain and its scatter for several widths of the strain window, 0 for triangles alone; a row per width and step.
 
     ``gauge`` is the length of the virtual strain gauge, mm; ``points`` the median number of points in a window.
     ``E1_p5`` and ``E2_p95`` show how much of a strain peak is left; ``E_magnitude_median`` and ``E_magnitude_p95`` the
@@ -31,11 +31,11 @@ def window_study(results: Results, widths: Sequence[float], previous: bool = Fal
     rows: list[dict[str, Any]] = []
     for width in widths:
         window = strain_window(results.mesh, width) if width > 0 else None
-        held = gauge(results, width)
+        strain_gauge = gauge(results, width)
         for step, name in enumerate(results.steps):
-            found = results.deformation(step, previous=previous, window=window)
-            row: dict[str, Any] = {"window": width, "gauge": held.length, "points": _points(window)}
-            rows.append({**row, "step": step, "capture": name, **_figures(found)})
+            deformation = results.deformation(step, previous=previous, window=window)
+            row: dict[str, Any] = {"window": width, "gauge": strain_gauge.length, "points": _points(window)}
+            rows.append({**row, "step": step, "capture": name, **_figures(deformation)})
     return Table.of_rows(rows, {"window": "mm", "gauge": "mm"})
 
 
@@ -59,16 +59,16 @@ def _points(window: StrainWindow | None) -> float:
     return 3.0 if window is None else float(np.median(window.points))
 
 
-def _figures(found: Deformation) -> dict[str, float]:
+def _figures(deformation: Deformation) -> dict[str, float]:
     quantiles = {
-        "lambda1_median": (found.lambda1, 50), "lambda2_median": (found.lambda2, 50),
-        "E1_p5": (found.E1, 5), "E2_p95": (found.E2, 95),
-        "E_magnitude_median": (found.E_magnitude, 50), "E_magnitude_p95": (found.E_magnitude, 95),
+        "lambda1_median": (deformation.lambda1, 50), "lambda2_median": (deformation.lambda2, 50),
+        "E1_p5": (deformation.E1, 5), "E2_p95": (deformation.E2, 95),
+        "E_magnitude_median": (deformation.E_magnitude, 50), "E_magnitude_p95": (deformation.E_magnitude, 95),
     }  # fmt: skip
     figures = {name: _percentile(values, q) for name, (values, q) in quantiles.items()}
-    known = np.isfinite(found.J)
+    known = np.isfinite(deformation.J)
     spread = {f"lambda{k}_std": float(np.std(v[known])) if known.any() else float("nan")
-              for k, v in ((1, found.lambda1), (2, found.lambda2))}  # fmt: skip
+              for k, v in ((1, deformation.lambda1), (2, deformation.lambda2))}  # fmt: skip
     return {**figures, **spread, "measured": int(known.sum())}
 
 
