@@ -25,7 +25,7 @@ _INSIDE = (219, 222, 227)
 def overlay_frames(
     results: EvaluatedResults, session: Session, camera_id: str, scale: Scale, side: int = 720, opacity: float = 0.65
 ) -> Iterator[Picture]:
-    """Frames of an animation, one a step: a camera's photograph with the field over it, colour bar and step name.
+    """Frames of an animation, one per step: a camera's photograph with the field over it, colour bar and step name.
 
     side : px, longest side of a frame. opacity : of the colours, 0 to 1. Frames are (height, width, 3) sRGB.
     """
@@ -35,7 +35,7 @@ def overlay_frames(
 
 
 def surface_frames(results: EvaluatedResults, scale: Scale, azimuth: float, side: int = 720) -> Iterator[Picture]:
-    """Frames of an animation, one a step: the coloured surface seen from an azimuth (rad).
+    """Frames of an animation, one per step: the coloured surface seen from an azimuth (rad).
 
     The surface is drawn where it stood, or freed of its rigid motion if the evaluation removes it. side : px, height of
     a frame. Frames are (height, width, 3) sRGB. Raises ComputationError if no step has a measured triangle.

@@ -52,7 +52,7 @@ def photograph(session: Session, capture_id: str, camera_id: str) -> Image:
 
 
 def camera_of(results: EvaluatedResults, camera_id: str) -> Camera:
-    """The calibrated camera of this id. Raises InputError if the run has none."""
+    """The calibrated camera of an id. Raises InputError if the run has none."""
     for camera in results.results.cameras:
         if camera.id == camera_id:
             return camera

@@ -22,9 +22,9 @@ def paint(corners: Floats, depth: Floats, shape: tuple[int, int]) -> FaceImage:
     image = np.full(height * width, -1, dtype=np.int32)
     low, high = np.ceil(corners.min(axis=1)), np.floor(corners.max(axis=1))
     with np.errstate(invalid="ignore"):
-        seen = (high[:, 0] >= 0) & (high[:, 1] >= 0) & (low[:, 0] <= width - 1) & (low[:, 1] <= height - 1)
-        seen &= (high >= low).all(axis=1) & np.isfinite(depth)
-    order = np.flatnonzero(seen)
+        visible = (high[:, 0] >= 0) & (high[:, 1] >= 0) & (low[:, 0] <= width - 1) & (low[:, 1] <= height - 1)
+        visible &= (high >= low).all(axis=1) & np.isfinite(depth)
+    order = np.flatnonzero(visible)
     order = order[np.argsort(-depth[order], kind="stable")]
     first = np.clip(low[order], 0, (width - 1, height - 1)).astype(np.int64)
     last = np.clip(high[order], 0, (width - 1, height - 1)).astype(np.int64)
