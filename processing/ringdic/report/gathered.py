@@ -19,7 +19,7 @@ from ringdic.results.ranges import Ranges, even_limits
 
 @dataclass(frozen=True)
 class Gathered:
-    """Fields of a run over its steps.
+    """Ranges, statistics and values of a run's fields over its steps.
 
     steps : names. shown : indices of the steps that get maps. scales : by field, with limits for all steps.
     faces : by field and shown step, values on the triangles (M,) in the unit of the field. values : by field and shown
@@ -40,25 +40,25 @@ def gather(
     shown: Sequence[int],
     progress: Callable[[float], None] = lambda _: None,
 ) -> Gathered:
-    """Gather those of the named fields that the run has. shown : steps whose values are kept for maps."""
+    """Evaluate the named fields, where the run has them, at every step. shown : steps whose values maps need."""
     fields = [entry for name in names for entry in results.fields if entry.name == name]
     ranges = Ranges(fields)
     weights = _weights(results)
     faces: dict[tuple[str, int], NDArray[np.float32]] = {}
     values: dict[tuple[str, int], NDArray[np.float32]] = {}
-    found: dict[tuple[str, int], dict[str, Any]] = {}
+    figures: dict[tuple[str, int], dict[str, Any]] = {}
     for step in range(len(results.steps)):
         arrays = results.step(step)
         ranges.add(arrays)
         for entry in fields:
             scalar = arrays.scalar(entry)
-            found[entry.name, step] = statistics(scalar, weights[entry.location])
+            figures[entry.name, step] = statistics(scalar, weights[entry.location])
             if step in shown:
                 values[entry.name, step] = scalar[np.isfinite(scalar)].astype(np.float32)
                 faces[entry.name, step] = on_faces(results, entry, scalar, step).astype(np.float32)
         progress((step + 1) / len(results.steps))
     scales = {entry.name: _scale(entry, row) for entry, row in zip(fields, ranges.table(), strict=True)}
-    return Gathered(results.steps, tuple(shown), scales, faces, values, found)
+    return Gathered(results.steps, tuple(shown), scales, faces, values, figures)
 
 
 def _scale(entry: Field, row: dict[str, Any]) -> Scale:

@@ -1,4 +1,4 @@
-"""Measured facts of cameras and pattern: image size, scale, distance, exposure, speckle size, noise."""
+"""Measured properties of cameras and pattern: image size, scale, distance, exposure, speckle size, noise."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SIDE = 1200  # px, of the part of an image that is looked at
 
 @dataclass(frozen=True)
 class CameraFacts:
-    """Facts of one camera at the reference step, over the points that it sees under a small angle; None where unknown.
+    """Properties of one camera at the reference step, over the points that it sees squarely; None where unknown.
 
     size : (width, height) px. stand_off : mm, median distance of the points. scale : px a mm across the line of sight.
     field : (width, height) mm that the image shows at that distance. focal : px. speckle : px, see ``speckle_size``.
@@ -50,7 +50,7 @@ class CameraFacts:
 
 
 def camera_facts(session: Session, results: Results) -> tuple[CameraFacts, ...]:
-    """Facts of every calibrated camera; reads its reference image and its images at rest."""
+    """Measure the properties of every calibrated camera, from its reference image and its images at rest."""
     captures = {capture.id: capture for capture in session.captures}
     reference = captures.get(results.steps[0])
     at_rest = session.of_kind("static")
@@ -63,7 +63,7 @@ def _facts(
     camera: Camera, mesh: Mesh, normals: Floats, reference: Capture | None, at_rest: tuple[Capture, ...]
 ) -> CameraFacts:
     lens = camera.intrinsics
-    found: dict[str, object] = {"focal": None if lens is None else float(np.sqrt(lens.K[0, 0] * lens.K[1, 1]))}
+    values: dict[str, object] = {"focal": None if lens is None else float(np.sqrt(lens.K[0, 0] * lens.K[1, 1]))}
     with np.errstate(invalid="ignore"):
         xyz = mesh.vertices[camera.incidence_cosine(mesh.vertices, normals) > _SQUARELY]
     px, slope = camera.project_with_jacobian(xyz)
@@ -71,17 +71,17 @@ def _facts(
     px, slope, xyz = px[shown], slope[shown], xyz[shown]
     if len(px) >= _FEWEST:
         scale = float(np.median(np.sqrt(np.prod(np.linalg.svd(slope, compute_uv=False), axis=1))))
-        found |= {
+        values |= {
             "stand_off": float(np.median(np.linalg.norm(xyz - camera.centre, axis=1))),
             "scale": scale,
             "field": (camera.size[0] / scale, camera.size[1] / scale),
         }
     record = None if reference is None else reference.record.cameras.get(camera.id)
     if record is not None:
-        found |= {"exposure": record.exposure_us, "gain": record.metadata.get("AnalogueGain")}
+        values |= {"exposure": record.exposure_us, "gain": record.metadata.get("AnalogueGain")}
     if reference is not None and camera.id in reference.images and len(px) >= _FEWEST:
-        found |= _of_images(camera, px, reference, at_rest)
-    return CameraFacts(camera.id, camera.size, **found)  # type: ignore[arg-type]
+        values |= _of_images(camera, px, reference, at_rest)
+    return CameraFacts(camera.id, camera.size, **values)  # type: ignore[arg-type]
 
 
 def _of_images(

@@ -33,14 +33,14 @@ def noise_rows(results: Results, gathered: Gathered) -> dict[str, str]:
         }
     stated = _stated(gathered)
     how = "median of the stated standard deviation; no capture at rest"
-    found = {}
+    rows = {}
     for name, title in (("sigma_displacement", "Displacement noise floor"), ("sigma_E2", "Strain noise floor")):
         if name in stated:
             unit = " mm" if name == "sigma_displacement" else ""
-            found[title] = f"{figure(stated[name]['median'], 3)}{unit} ({how})"
+            rows[title] = f"{figure(stated[name]['median'], 3)}{unit} ({how})"
         else:
-            found[title] = "not measured: no capture at rest, and this way of evaluation states none"
-    return found
+            rows[title] = "not measured: no capture at rest, and this way of evaluation states none"
+    return rows
 
 
 def noise(document: Document, results: Results, gathered: Gathered) -> None:

@@ -1,4 +1,4 @@
-"""The report's drawings: maps, courses over the steps, histograms."""
+"""The report's plots: maps, time courses, histograms."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class StepViews:
 
 
 def maps(gathered: Gathered, scale: Scale, shown: Sequence[StepViews]) -> Figure:
-    """Maps of one field: a row a step with its unrolled map and the body from its sides, one colour scale for all."""
+    """Maps of one field: one row per step with the unrolled map and views of the body, all with one colour scale."""
     views = [(step.unrolled, *(view for _, view in step.sides)) for step in shown]
     widths = [max(1.0, 2.9 * min(view.aspect, 2.0)) for view in views[0]]
     drawn = Figure(figsize=(sum(widths) + 1.6, 3.2 * len(shown) + 0.5), layout="constrained")

@@ -41,10 +41,10 @@ def write_report(
     run: int | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Path:
-    """Write the report of a run; the path of its HTML file.
+    """Write the report of a run and return the path of its HTML file.
 
-    session_path : the session's folder. out : the HTML file, by default ``report.html`` beside the results. run : its
-    number, the newest unless given. progress : is told the share done.
+    session_path : the session's folder. out : the HTML file, by default ``report.html`` in the run's folder. run : its
+    number, the newest unless given. progress : called with the share done.
     Raises InputError where there is no run, or nothing can be written to ``out``.
     """
     results_path = newest_results(session_path, run)
@@ -164,10 +164,10 @@ def shown_steps(count: int) -> list[int]:
 
 
 def _views(results: EvaluatedResults, steps: Sequence[int]) -> list[plots.StepViews]:
-    """The views of the steps shown. Maps are drawn over the reference, so that a material place stays where it is."""
+    """Views of the steps shown. Maps are drawn over the reference, so that material points keep their positions."""
     reference = unrolled(results.results.mesh)
     front = mean_azimuth(results.results.mesh)
-    made = []
+    views = []
     for step in steps:
         mesh = Mesh(results.positions(step), results.results.faces)
         sides: list[tuple[str, View]] = []
@@ -175,9 +175,9 @@ def _views(results: EvaluatedResults, steps: Sequence[int]) -> list[plots.StepVi
             view = from_side(mesh, azimuth)
             if not sides or view.outside_share > _WORTHWHILE:
                 sides.append((f"from {np.degrees(azimuth) % 360:.0f}°", view))
-        made.append(plots.StepViews(step, results.steps[step], reference, sides))
-    fewest = min(len(step.sides) for step in made)
-    return [plots.StepViews(each.step, each.name, each.unrolled, each.sides[:fewest]) for each in made]
+        views.append(plots.StepViews(step, results.steps[step], reference, sides))
+    fewest = min(len(step.sides) for step in views)
+    return [plots.StepViews(each.step, each.name, each.unrolled, each.sides[:fewest]) for each in views]
 
 
 def _how_to_read(results: EvaluatedResults, steps: Sequence[int]) -> str:
