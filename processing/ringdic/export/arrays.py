@@ -13,13 +13,13 @@ _SCALARS = ("lambda1", "lambda2", "J")
 
 
 def export_npz(results: EvaluatedResults, out: Path) -> None:
-    """Write the arrays of `arrays` into one npz file."""
+    """Write all results into one npz file, with the arrays of :func:`arrays`."""
     with Path(out).open("wb") as file:  # given a name, savez would append a suffix to it
         np.savez(file, **arrays(results))
 
 
 def arrays(results: EvaluatedResults) -> dict[str, Any]:
-    """The arrays of the npz by name, in full precision, for F steps of N points and M triangles.
+    """All results as arrays by name, in full precision, for F steps of N points and M triangles.
 
     ``vertices_ref`` (N, 3) and ``vertices`` (F, N, 3) mm, world frame; ``faces`` (M, 3); ``lambda1``, ``lambda2`` and
     ``J`` (F, M); ``E`` (F, M, 3, 3), Cartesian Green-Lagrange; ``correlation`` (F, N), C_LS; ``sigma_xyz`` (F, N, 3)
@@ -31,20 +31,20 @@ def arrays(results: EvaluatedResults) -> dict[str, Any]:
     source = results.results
     F, M = len(source.steps), len(source.faces)
     prefixes = ("", "window_") if results.window is not None else ("",)
-    found: dict[str, Any] = {prefix + name: np.empty((F, M)) for prefix in prefixes for name in _SCALARS}
-    found |= {f"{prefix}E": np.empty((F, M, 3, 3)) for prefix in prefixes}
+    deformation: dict[str, Any] = {prefix + name: np.empty((F, M)) for prefix in prefixes for name in _SCALARS}
+    deformation |= {f"{prefix}E": np.empty((F, M, 3, 3)) for prefix in prefixes}
     for step in range(F):
         fields = results.step(step)
         for prefix in prefixes:
             for name in _SCALARS:
-                found[prefix + name][step] = fields.face[prefix + name]
-            found[f"{prefix}E"][step] = square(fields.face[f"{prefix}E_tensor"])
+                deformation[prefix + name][step] = fields.face[prefix + name]
+            deformation[f"{prefix}E"][step] = square(fields.face[f"{prefix}E_tensor"])
     by_cameras = {} if source.sigma_calibration is None else {"sigma_calibration": source.sigma_calibration}
     return {
         "vertices_ref": source.vertices_ref,
         "vertices": np.stack([results.positions(step) for step in range(F)]),
         "faces": source.faces,
-        **found,
+        **deformation,
         "correlation": source.correlation,
         "sigma_xyz": source.sigma_xyz,
         **by_cameras,

@@ -112,21 +112,23 @@ def _deform(results: EvaluatedResults, rigid_motion_removed: bool, window: Strai
     return {name: _cells([step[name] for step in steps]) for name in steps[0]}
 
 
-def _named(found: Deformation) -> dict[str, NDArray[np.float32]]:
+def _named(deformation: Deformation) -> dict[str, NDArray[np.float32]]:
     """Deformation of one step by MultiDIC's field names: tensors (3, 3, M), vectors (M, 3), scalars (M, 1)."""
-    C = np.einsum("mki,mkj->mij", found.F, found.F)
-    tensors = {"Fmat": found.F, "Cmat": C, "Emat": found.E, "emat": found.e}
+    C = np.einsum("mki,mkj->mij", deformation.F, deformation.F)
+    tensors = {"Fmat": deformation.F, "Cmat": C, "Emat": deformation.E, "emat": deformation.e}
     vectors = {
-        "d3": found.normal_current,
-        "Epc1vec": found.direction1_reference, "Epc2vec": found.direction2_reference,
-        "Epc1vecCur": found.direction1_current, "Epc2vecCur": found.direction2_current,
-        "epc1vec": found.direction1_current, "epc2vec": found.direction2_current,
+        "d3": deformation.normal_current,
+        "Epc1vec": deformation.direction1_reference, "Epc2vec": deformation.direction2_reference,
+        "Epc1vecCur": deformation.direction1_current, "Epc2vecCur": deformation.direction2_current,
+        "epc1vec": deformation.direction1_current, "epc2vec": deformation.direction2_current,
     }  # fmt: skip
     scalars = {
-        "Lamda1": found.lambda1, "Lamda2": found.lambda2, "J": found.J, "Emgn": found.E_magnitude,
-        "emgn": found.e_magnitude, "Epc1": found.E1, "Epc2": found.E2, "epc1": found.e1, "epc2": found.e2,
-        "EShearMax": found.E_shear, "eShearMax": found.e_shear, "Eeq": found.E_equivalent, "eeq": found.e_equivalent,
-        "Area": np.where(np.isfinite(found.J), found.area, np.nan),
+        "Lamda1": deformation.lambda1, "Lamda2": deformation.lambda2, "J": deformation.J,
+        "Emgn": deformation.E_magnitude, "emgn": deformation.e_magnitude,
+        "Epc1": deformation.E1, "Epc2": deformation.E2, "epc1": deformation.e1, "epc2": deformation.e2,
+        "EShearMax": deformation.E_shear, "eShearMax": deformation.e_shear,
+        "Eeq": deformation.E_equivalent, "eeq": deformation.e_equivalent,
+        "Area": np.where(np.isfinite(deformation.J), deformation.area, np.nan),
     }  # fmt: skip
     named = {
         **{name: np.moveaxis(values, 0, -1) for name, values in tensors.items()},
@@ -138,10 +140,10 @@ def _named(found: Deformation) -> dict[str, NDArray[np.float32]]:
 
 def _floats_a_face() -> int:
     one = np.ones((1, 3, 3))
-    found = dict.fromkeys(Deformation.__dataclass_fields__, one[:, 0, 0])
-    found |= {name: one[:, 0] for name in found if name.startswith("direction")}
-    found |= dict.fromkeys(("F", "E", "directors_reference", "directors_current"), one)
-    return sum(values.size for values in _named(Deformation(**found)).values())
+    parts = dict.fromkeys(Deformation.__dataclass_fields__, one[:, 0, 0])
+    parts |= {name: one[:, 0] for name in parts if name.startswith("direction")}
+    parts |= dict.fromkeys(("F", "E", "directors_reference", "directors_current"), one)
+    return sum(values.size for values in _named(Deformation(**parts)).values())
 
 
 def _before(results: EvaluatedResults, step: int) -> Floats:
@@ -156,12 +158,12 @@ def _motion(results: EvaluatedResults, step: int) -> RigidMotion:
 
 
 def _camera_number(name: str, order: dict[str, int]) -> int:
-    """Number of a camera as MultiDIC names cameras; for a name that is no number, its place in the ring, from 1."""
+    """Number of a camera as MultiDIC names cameras; for a name that is no number, its position in the ring, from 1."""
     return int(name) if name.isascii() and name.isdigit() else order.get(name, 0)
 
 
 def column(values: Floats) -> Floats:
-    """Scalars ``values`` (n,) of any unit as a column (n, 1), as MATLAB keeps vectors."""
+    """Scalars ``values`` (n,) of any unit as a column (n, 1), MATLAB's form of a vector."""
     return np.asarray(values, dtype=float).reshape(-1, 1)
 
 

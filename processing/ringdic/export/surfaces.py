@@ -29,12 +29,12 @@ def export_ply(results: EvaluatedResults, out: Path, colour: str = DEFAULT_COLOU
     paint = _Paint(results, colour)
     for step, name in enumerate(results.steps):
         fields = results.step(step)
-        mesh, kept, whole = results.measured(step)
-        solid = _solid(mesh.vertices, mesh.faces, paint.vertices(fields)[kept])
+        mesh, indices, whole = results.measured(step)
+        solid = _solid(mesh.vertices, mesh.faces, paint.vertices(fields)[indices])
         for entry in results.fields:
             values = fields.scalar(entry).astype(np.float32)
             if entry.location == "point":
-                solid.vertex_attributes[entry.name] = values[kept]
+                solid.vertex_attributes[entry.name] = values[indices]
             else:
                 solid.face_attributes[entry.name] = values[whole]
         solid.export(out / f"{name}.ply", file_type="ply")
@@ -47,8 +47,8 @@ def export_glb(results: EvaluatedResults, out: Path, colour: str = DEFAULT_COLOU
     """
     paint = _Paint(results, colour)
     for step, name in enumerate(results.steps):
-        mesh, kept, _ = results.measured(step)
-        solid = _solid(mesh.vertices @ _GLTF_FROM_WORLD.T, mesh.faces, paint.vertices(results.step(step))[kept])
+        mesh, indices, _ = results.measured(step)
+        solid = _solid(mesh.vertices @ _GLTF_FROM_WORLD.T, mesh.faces, paint.vertices(results.step(step))[indices])
         solid.export(out / f"{name}.glb", file_type="glb")
 
 
