@@ -369,8 +369,8 @@ def _nearest(key: str, known: Sequence[str]) -> str:
 
 def _fields(model: type | None) -> dict[str, FieldInfo]:
     """The fields of a pydantic model or dataclass; none of anything else."""
-    found: dict[str, FieldInfo] = getattr(model, "model_fields", None) or getattr(model, "__pydantic_fields__", {})
-    return found
+    fields: dict[str, FieldInfo] = getattr(model, "model_fields", None) or getattr(model, "__pydantic_fields__", {})
+    return fields
 
 
 def _inner(model: type, name: str) -> type | None:
