@@ -66,7 +66,7 @@ def choose_cache_folder() -> None:
 
 
 def _cache_folder() -> Path:
-    """The folder below which each state of the sources has its own: as the user chose it, or as the system has it."""
+    """Parent of all cache folders: the environment's ``NUMBA_CACHE_DIR`` or a folder in the user's cache directory."""
     chosen = os.environ.get(_VARIABLE)
     if chosen:
         path = Path(chosen).absolute()
@@ -95,7 +95,7 @@ def _temporary_folder() -> Path:
 
 
 def _use(folder: Path) -> None:
-    """Make the folder where it is missing and hold it as in use until this process ends. OSError: not writable."""
+    """Create the folder if missing, and mark it as in use until this process ends; OSError where it is not writable."""
     is_new = not folder.is_dir()
     while True:
         folder.mkdir(parents=True, exist_ok=True)

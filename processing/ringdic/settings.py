@@ -274,7 +274,7 @@ def _toml(value: Any) -> str:
     return f'"{value}"' if isinstance(value, str) else repr(value)
 
 
-# What a model refuses, as sentences ---------------------------------------------------------------
+# Messages of validation errors -------------------------------------------------------------------
 
 #: Where in a file a fault lies: names of tables and keys, and numbers of entries in lists.
 Location = tuple[int | str, ...]

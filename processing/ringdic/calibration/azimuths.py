@@ -25,7 +25,7 @@ from ringdic.session.rig import RigCamera, Target
 
 log = logging.getLogger(__name__)
 
-#: Deviation of a camera from its azimuth on the rotated target from which it stands elsewhere; rotation of the target
+#: Least deviation of a camera's azimuth, after the target's rotation, that is an error; least rotation of the target
 #: that is reported to the operator. Degrees.
 _ELSEWHERE, _TURNED = 8.0, 5.0
 
@@ -170,5 +170,5 @@ def _elsewhere(id_: str, with_target: dict[str, AzimuthCandidates], off: dict[st
 
 
 def _middle(angles: list[float]) -> float:
-    """The one of some angles from which the sum of distances to the others is least, degrees."""
+    """Median of angles, degrees: the one with the least sum of distances to the others."""
     return min(angles, key=lambda a: sum(abs(signed_degrees(a - b)) for b in angles))

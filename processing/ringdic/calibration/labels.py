@@ -39,8 +39,8 @@ _FEWEST = 3
 def column_labels(image: NDArray[np.generic], dots: DotObservations, target: Target, *, below: bool = False) -> Labels:
     """Rectified images of the number printed above each column of the target that the camera sees well.
 
-    image : (height, width) grey, the image in which the dots were found. below : True takes what is printed below the
-    lowest row instead of above the highest.
+    image : (height, width) grey, the image in which the dots were detected. below : True takes what is printed below
+    the lowest row instead of above the highest.
 
     Returns for each column an image (rows, columns) in parts of the paper's grey level, (0, 0) at the upper left.
     """

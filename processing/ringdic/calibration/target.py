@@ -201,7 +201,7 @@ def possible_azimuths(dots: Dots, target: Target, rotation_deg: float = 0.0) -> 
         residual = float(np.mean(np.linalg.norm(dlt.residuals(L, xyz, upright.px[spots]), axis=1)))
         if np.hypot(camera.centre[0], camera.centre[1]) > target.radius_mm:
             candidates.append((residual, camera.azimuth_deg % 360.0))
-    # A numbering with the seam at a wrong place displaces a column, which leaves large residuals.
+    # A numbering with the seam at a wrong position displaces a column, which leaves large residuals.
     best = min(candidates, default=(0.0, 0.0))[0]
     if best > 0.25 * float(np.median(upright.height[spots])):
         return np.zeros(0)
@@ -215,7 +215,7 @@ def _is_closed(target: Target) -> bool:
 
 
 def _upright_undistorted(dots: Dots, intrinsics: Intrinsics | None, rotation_deg: float) -> tuple[Dots, Dots]:
-    """Dots that the lens can show, as in the image; and these dots undistorted, if the lens is known, and upright."""
+    """Dots in the lens model's valid range, in the image; and these dots upright and, if possible, undistorted."""
     if intrinsics is None:
         return dots, _upright(dots, rotation_deg)
     px = intrinsics.to_undistorted(dots.px)

@@ -125,7 +125,7 @@ def correlate_command(
 def export_command(
     session: Session,
     format_: Annotated[str, typer.Option("--format", help="npz, vtkhdf, vtp, mat, csv, ply or glb.")] = "npz",
-    out: Annotated[Path | None, typer.Option(help="Where to; beside the results unless given.")] = None,
+    out: Annotated[Path | None, typer.Option(help="File or folder to write; in the run's folder unless given.")] = None,
     reference: Reference = "first",
     without_rigid_motion: WithoutRigidMotion = False,
     window: Window = None,

@@ -26,7 +26,7 @@ Camera = Annotated[str | None, typer.Option(help="Camera whose photographs are u
 
 def report_command(
     session: Session,
-    out: Annotated[Path | None, typer.Option(help="HTML file; report.html beside the results unless given.")] = None,
+    out: Annotated[Path | None, typer.Option(help="HTML file; report.html in the run's folder unless given.")] = None,
     run: Run = None,
     as_json: AsJson = False,
 ) -> None:
@@ -46,7 +46,7 @@ def overlay_command(
     limits: Limits = None,
     opacity: Opacity = 0.65,
     out: Annotated[Path, typer.Option(help="Folder for the pictures, one PNG a camera.")] = Path("."),
-    bar: Annotated[bool, typer.Option(help="The colour bar beside each picture.")] = True,
+    bar: Annotated[bool, typer.Option(help="Whether to add the colour bar.")] = True,
     run: Run = None,
     reference: Reference = "first",
     without_rigid_motion: WithoutRigidMotion = False,

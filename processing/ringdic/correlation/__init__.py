@@ -14,7 +14,7 @@ matches them. The room knows images, masks and points only: no camera, no calibr
 ``refinement``     inverse-compositional Gauss-Newton of many points, by the compiled ``kernels``
 ``kernels``        the iteration of one subset, on ``subset``, ``interpolation``, ``warps`` and ``lanes``
 ``spline``         B-spline coefficients and gradients of an image, by the compiled ``filters``
-``bench``          speed of the correlation on this machine, beside what ``machine`` measures of its processor
+``bench``          speed of the correlation on this machine, against the limits of its processor by ``machine``
 ``command``        the correlation of two image files
 """
 

@@ -96,9 +96,9 @@ def correlate_points(
     reference, current : the images, prepared with the same settings.
     xy : (n, 2) float64, px, whole or fractional, inside the reference's mask.
     start : (n, 6) float64, start values u v ux uy vx vy (u, v in px), or (n, 12) with the second derivatives uxx uxy
-        uyy vxx vxy vyy (1/px) after them, which first order holds as given; NaN where unknown. None to find start
-        values in the images.
-    prefer_neighbour : a point beside one just matched starts from that match instead, where the two agree: for start
+        uyy vxx vxy vyy (1/px) after them, which are fixed at first order; NaN where unknown. None to search for
+        start values in the images.
+    prefer_neighbour : a point next to one just matched starts from that match instead, where the two agree: for start
         values that are less certain than a neighbour's match.
     threads : number of threads; all cores by default. The results do not depend on it.
     progress : called with the numbers of matched and of all points after every wave.
@@ -113,7 +113,7 @@ def correlate_points(
     with on_threads(threads):
         load_kernels()
         began = time.perf_counter()
-        assert reference.gradient  # computed when first asked for
+        assert reference.gradient  # computed on first use
         seconds = {"prepare": time.perf_counter() - began, "start": 0.0, "refine": 0.0}
         points = Propagation(reference, current, xy, settings, progress)
         if start is None:
@@ -152,7 +152,7 @@ def correlate_independently(
 
 
 def _check_points(reference: Reference, current: Current, xy: Pixels, settings: CorrelationSettings) -> Pixels:
-    """The points (n, 2) px as the kernels take them.
+    """The points as a contiguous array (n, 2) px, after a check of points, images and settings.
 
     Raises InputError where they or the images do not fit the settings.
     """

@@ -187,7 +187,7 @@ _q66, _q76, _q67, _q77 = _make_sum(_row6, 6), _make_sum(_row7, 6), _make_sum(_ro
 def _wide(c, p, stride, tx, sx, qx, ty, sy, qy, rows, quintic, g):  # type: ignore[no-untyped-def]
     """Interpolate pixels that lie within 32 coefficients of a row, taps picked by permutation, into LANES numbers at g.
 
-    rows : how many rows of coefficients the pixels reach over, beside those of the taps.
+    rows : how many rows of coefficients the pixels reach over, besides those of the taps.
     """
     e = ramp(c)
     x, y = e * (e * qx + sx) + tx + e, e * (e * qy + sy) + ty

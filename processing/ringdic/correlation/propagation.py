@@ -2,8 +2,8 @@
 
 A wave refines, in parallel, all unmatched points that have a reliable neighbour. Each starts from its neighbour with
 the highest ZNCC, whose displacement and derivatives are extrapolated to it. Neighbours below a level of ZNCC are used
-only when no point is left beside better ones, so that poor matches are no bridge where there is a better way. The
-result depends on the input alone, not on the number of threads or on timing.
+only when no unmatched point has a better neighbour, so that matches do not propagate through poor ones unless they
+must. The result depends on the input alone, not on the number of threads or on timing.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class Propagation:
         index : (k,) int64, of the points.
         start : (k, 12) float64, parameters in px and derivatives.
         zncc_min : limit of the ZNCC; that of the settings by default.
-        prefer_neighbour : a point beside one just matched starts from that match where it agrees with the given start
+        prefer_neighbour : a point next to one just matched starts from that match where it agrees with the given start
             value.
         fixed_curvature : keep the second derivatives as given and refine the affine parameters alone.
 
@@ -192,7 +192,7 @@ class Propagation:
         They are computed when first asked for; start (k, 12) decides whether those of the transposed image are needed.
         """
         began = time.perf_counter()
-        assert (part.transpose if steep_along_rows(start) else part).coef.size  # computed when first asked for
+        assert (part.transpose if steep_along_rows(start) else part).coef.size  # computed on first use
         self.filtering += time.perf_counter() - began
 
     def _initial_region(self, start: Floats, index: Indices) -> Current:
@@ -245,18 +245,18 @@ class Propagation:
                 self.refine_from(index[part], start[part])
 
     def retry_from_fit(self) -> None:
-        """Refine unmatched points again, from an affine fit of the good matches around them, and propagate from there.
+        """Refine unmatched points from an affine fit of the good matches around each, and propagate from them.
 
-        Points that failed so before are left out while the same neighbours as then are good.
+        Points that failed in this way before are left out unless their good neighbours have changed.
         """
         for _ in range(2):
             index = np.flatnonzero(self._unmatched())
-            beside = self._good_neighbours(index)
-            new = (beside > 0) & (beside != self.fit_sources[index])
-            index, beside = index[new], beside[new]
+            sources = self._good_neighbours(index)
+            new = (sources > 0) & (sources != self.fit_sources[index])
+            index, sources = index[new], sources[new]
             if not len(index):
                 return
-            self.fit_sources[index] = beside
+            self.fit_sources[index] = sources
             start = local_affine_fit(self.xy, self.parameters, self.good, self.near, index)
             usable = np.isfinite(start).all(axis=1)
             if not usable.any() or not self.refine_from(index[usable], start[usable]).any():

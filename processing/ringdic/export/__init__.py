@@ -66,7 +66,7 @@ def export(
     format : str
         One of `FORMATS`.
     out : Path, optional
-        File to write, or folder for formats with one file a step; beside the results unless given.
+        File to write, or folder for formats with one file per step; in the run's folder unless given.
     evaluation : Evaluation
         How fields are computed from positions: reference, rigid motion, strain window, strain family.
     colour : str, optional

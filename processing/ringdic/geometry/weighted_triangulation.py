@@ -64,7 +64,7 @@ def triangulate_weighted(cameras: Sequence[Camera], px: Pixels, sigma: Pixels) -
     ----------
     cameras : the C cameras, C ≥ 2.
     px, sigma : (C, n, 2) image pixels as they are in the images (distorted) and their standard deviations, px. A
-        camera in which either is not finite takes no part in the point.
+        camera in which either is not finite is not used for the point.
 
     Raises
     ------

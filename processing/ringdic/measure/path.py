@@ -21,7 +21,7 @@ from ringdic.measure.place import Place
 from ringdic.mesh.geodesic import DETOUR, step_graph
 from ringdic.mesh.mesh import Mesh
 
-#: Points on an edge in the searches, and how much longer than the shortest a way of the one before may be.
+#: Points on an edge in the searches, and greatest ratio of the previous search's path length to the shortest.
 _SEARCHES = ((3, DETOUR), (9, 1.03))
 _MOST_TURNS = 2000
 
@@ -214,25 +214,25 @@ class _Strip:
         a, b = self._portals[0]
         plane = {a: np.zeros(2), b: np.array([float(np.linalg.norm(V[b] - V[a])), 0.0])}
         start = self._start.at(V, self._mesh.faces)
-        first = _beside(V[a], V[b], start, plane[a], plane[b], -1.0)  # below the first portal: right is b
+        first = _unfold_point(V[a], V[b], start, plane[a], plane[b], -1.0)  # below the first portal: right is b
         ends = [(a, b)]
         spots = [(plane[a], plane[b])]
         for portal in self._portals[1:]:
             (la, rb) = ends[-1]
             (new,) = {*portal} - {la, rb}
             pl, pr = spots[-1]
-            at = _beside(V[la], V[rb], V[new], pl, pr, 1.0)
+            at = _unfold_point(V[la], V[rb], V[new], pl, pr, 1.0)
             ends.append((la, new) if la in portal else (new, rb))
             spots.append((pl, at) if la in portal else (at, pr))
         la, rb = ends[-1]
         end = self._end.at(V, self._mesh.faces)
-        last = _beside(V[la], V[rb], end, *spots[-1], 1.0)
+        last = _unfold_point(V[la], V[rb], end, *spots[-1], 1.0)
         left, right = (np.array([spot[side] for spot in spots]) for side in (0, 1))
         return left, right, ends, first, last
 
 
-def _beside(a: Floats, b: Floats, c: Floats, at_a: Floats, at_b: Floats, side: float) -> Floats:
-    """Position in the plane of the point c of space, by its distances from a and b, on one side of the line a to b.
+def _unfold_point(a: Floats, b: Floats, c: Floats, at_a: Floats, at_b: Floats, side: float) -> Floats:
+    """Unfold the point c into the plane: its position by its distances from a and b, on one side of the line a to b.
 
     a, b, c : (3,). at_a, at_b : (2,), positions of a and b in the plane.
     """
@@ -255,7 +255,7 @@ def _funnel(left: Floats, right: Floats, first: Floats, last: Floats) -> list[tu
         if _turn(apex, hi, new_hi) >= 0:  # the right side closes in
             if np.array_equal(apex, hi) or _turn(apex, lo, new_hi) < 0:
                 hi, at_hi = new_hi, k
-            else:  # and crosses the left: the way turns there
+            else:  # and crosses the left: the path turns there
                 corners.append((lo, at_lo, 0))
                 apex, k = lo, at_lo
                 hi, at_hi = apex, k

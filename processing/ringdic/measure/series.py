@@ -31,7 +31,7 @@ def time_series(results: EvaluatedResults, places: Sequence[Place], fields: Sequ
             for entry in entries:
                 here = values[entry.name]
                 row[entry.name] = float(place.at(here, faces) if entry.location == "point" else here[place.face])
-            rows.insert((number + 1) * (step + 1) - 1, row)  # the steps of a place follow one another
+            rows.insert((number + 1) * (step + 1) - 1, row)  # all steps of a point in succession
     units = {"x": "mm", "y": "mm", "z": "mm", **{entry.name: entry.unit for entry in entries}}
     return Table.of_rows(rows, units, _notes(results, places))
 

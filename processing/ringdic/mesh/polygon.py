@@ -17,8 +17,8 @@ def triangulate_polygon(
     """Triangulate a polygon over its own vertices with the smallest sum of squared edge lengths.
 
     Only triangulations are considered whose triangles all face the normal, none of them thinner than ``thinnest``, and
-    whose diagonals are no longer than ``longest`` and not barred. The best of them is found by dynamic programming in
-    O(n³) (Klincsek 1980).
+    whose diagonals are no longer than ``longest`` and not barred. The best of them is determined by dynamic programming
+    in O(n³) (Klincsek 1980).
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from ringdic.mesh.adjacency import fan_numbers, piece_numbers, twins, vertices_o
 from ringdic.mesh.mesh import Mesh, half_edges
 from ringdic.mesh.projection import line_hits
 
-#: Barycentric coordinates at which a triangle is tested for a second layer: its centroid and one place to each corner.
+#: Barycentric coordinates at which a triangle is tested for a second layer: its centroid and a point near each corner.
 _SAMPLES = np.array([[1 / 3, 1 / 3, 1 / 3], [2 / 3, 1 / 6, 1 / 6], [1 / 6, 2 / 3, 1 / 6], [1 / 6, 1 / 6, 2 / 3]])
 
 

@@ -20,10 +20,10 @@ from ringdic.uncertainty.matches import match_uncertainty
 from ringdic.uncertainty.noise import camera_noise
 from ringdic.uncertainty.texture import Texture
 
-#: Cameras as they stood at a step, from their pixels and standard deviations (C, n, 2) px at that step.
+#: Function of a step, pixels and standard deviations (C, n, 2) px; returns the cameras at that step.
 PoseRefinement = Callable[[int, Pixels, Pixels], Sequence[Camera]]
 
-_LEAST_SIGMA = 1e-3  # px, of the best of matches
+_LEAST_SIGMA = 1e-3  # px, lower limit of a match's standard deviation
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 _RETRIES = 3
 _EVERY = 2  # columns, and rows, from one node of the first pass to the next on a dense lattice
 _IN_PIECE = 20  # fewest nodes within reach of a piece
-_PIECE = 6  # fewest connected positions of a sweep that are believed: an obstacle may divide the surface
+_PIECE = 6  # fewest connected positions of a sweep that are accepted: an obstacle may divide the surface
 _FEW = 1e-3  # share of the nodes that another retry must gain
 _REFERENCES = 3  # cameras that a node is matched from, one after the other, before it is given up
 

@@ -36,8 +36,8 @@ from ringdic.multiview.tracked_points import TrackedPoints, robust_quadratics
 _LOOSE = 5e-3  # px, tolerance of the first of two passes
 _PATIENCE = 10  # iterations of the first of two passes
 _MARGIN = 32.0  # px about the subsets in which a current image is filtered
-_ENOUGH = 0.5  # share of the start values that must hold, lest the images be searched for others
-_SPARE = 0.05  # share of the knots that may be lost without being sought again
+_ENOUGH = 0.5  # least share of valid start values; with fewer, the images are searched for others
+_SPARE = 0.05  # share of the knots that may be lost before they are searched for again
 _LEAST_EXCESS = 0.1  # of a second-order subset's variance, beyond that of the same subset of first order
 _OVERLAP = 1.2  # subsets share pixels: a mean of several is this much less certain than of independent ones
 _BIASED = 4.0  # Σ(b/σ)² of a bias below which it may be noise, of 2 numbers

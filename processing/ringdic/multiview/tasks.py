@@ -165,7 +165,7 @@ def track_task(
         return None if path is None else step_image(path, camera)
 
     reference = image(0)
-    assert reference is not None  # cameras without a reference image take no part
+    assert reference is not None  # cameras without a reference image are not used
     mask_image = None if mask is None else read_mask(mask, camera.size[::-1])
     track, state = track_block(reference, image, steps, x0, mask_image, correlation, options, state)
     arrays = {f"{_TRACK}{name}": values for name, values in track.arrays().items()}
@@ -174,5 +174,5 @@ def track_task(
 
 
 def _part(kind: type[T], arrays: Mapping[str, NDArray[Any]], prefix: str) -> T:
-    """Dataclass whose arrays are stored under names with a prefix."""
+    """Rebuild a dataclass from its arrays, stored under names with a prefix."""
     return kind(**{name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)})

@@ -22,7 +22,7 @@ _APART = 0.8  # subset radii, side of the squares with one knot each
 _REACH = 3.0  # subset radii about a knot, of the neighbours that its curvature and bias are computed from
 _SCATTERS = 8.0  # standard deviations from the neighbours' quadratic beyond which a point contradicts it
 _LEAST_OFF = 0.1  # px, least distance that is a contradiction
-_STRICTER = (4.0, 1.0)  # times the limit: the most distant knots are left out first, lest they draw the fit away
+_STRICTER = (4.0, 1.0)  # times the limit: the most distant knots are rejected first, so that they do not bias the fit
 _UNLIKE = 3.0  # times the usual mean square difference that noise alone, which stays below 2, does not reach
 
 

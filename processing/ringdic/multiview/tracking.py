@@ -32,7 +32,7 @@ from ringdic.multiview.tracked_points import TrackedPoints, tracked_points
 
 log = logging.getLogger(__name__)
 
-_AGREE = 0.5  # px, greatest distance between a point by way of another image and from the reference itself
+_AGREE = 0.5  # px, greatest distance between a point matched via another image and directly from the reference
 _ASKED = 2  # images of earlier steps from which the points lost at a step are sought
 _FEW = 2e-3  # share of the points that must be lost for another image to be filtered
 _CHANGED = 0.5  # share of matched points below which the image has changed and is searched for start values
@@ -317,7 +317,7 @@ class _CameraTracker:
         if not accepted.any():
             return matches
         composed = self._compose(lost[accepted], since.part(accepted))
-        # Perhaps only the start value was missing: a match from the reference itself is better, as no errors add up.
+        # Perhaps only the start value was missing: a match from the reference itself accumulates no errors.
         points = self._tracked_points(self.reference, self.x0[lost[accepted]])
         direct = self._match(self.reference, current, points, composed.warp, search=False)
         agree = direct.good & ~(direct.mean_square > limit[accepted])

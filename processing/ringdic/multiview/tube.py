@@ -96,7 +96,7 @@ def _fillings(nodes: _Nodes, faces: Indices) -> Indices:
     """Triangles (k, 3) that fill the small holes of the surface of some triangles (M, 3)."""
     edges = nodes.mesh(faces).boundary_edges()
     holes, size = _holes(nodes)
-    lost_node = _beside(nodes, edges)
+    lost_node = _adjacent_lost_node(nodes, edges)
     hole = np.where(lost_node[:, 1] >= 0, holes[lost_node[:, 0], np.maximum(lost_node[:, 1], 0)], -1)
     fillings = [np.empty((0, 3), np.int64)]
     small = np.flatnonzero((size <= _MOST_NODES)[np.maximum(hole, 0)] & (hole >= 0))
@@ -146,7 +146,7 @@ def _holes(nodes: _Nodes) -> tuple[Indices, Indices]:
     return np.where(flat, label, -1).reshape(columns, rows), size
 
 
-def _beside(nodes: _Nodes, edges: Indices) -> Indices:
+def _adjacent_lost_node(nodes: _Nodes, edges: Indices) -> Indices:
     """Lost node (k, 2), column and row, in the cell on the open side of each border edge (k, 2); row -1 for none."""
     index = nodes.index
     columns, rows = index.shape

@@ -30,8 +30,8 @@ def overlay_frames(
     side : px, longest side of a frame. opacity : of the colours, 0 to 1. Frames are (height, width, 3) sRGB.
     """
     for step, name in enumerate(results.steps):
-        laid = overlay(results, camera_id, photograph(session, name, camera_id), scale, step, opacity)
-        yield _framed(no_larger(laid, side), scale, f"{step}: {name}, camera {camera_id}")
+        picture = overlay(results, camera_id, photograph(session, name, camera_id), scale, step, opacity)
+        yield _framed(no_larger(picture, side), scale, f"{step}: {name}, camera {camera_id}")
 
 
 def surface_frames(results: EvaluatedResults, scale: Scale, azimuth: float, side: int = 720) -> Iterator[Picture]:

@@ -199,5 +199,5 @@ class ResultsWriter:
 
 
 def _stored(arrays: dict[str, Floats]) -> dict[str, NDArray[np.float32]]:
-    """Those of the arrays that the file holds, in single precision."""
+    """Arrays that are stored in the file, in single precision."""
     return {name: values.astype(np.float32) for name, values in arrays.items() if name in STEP_ARRAYS}

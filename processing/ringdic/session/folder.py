@@ -214,7 +214,7 @@ def _require_session(path: Path) -> None:
 
 
 def _captures(folder: Path) -> Iterator[Capture]:
-    """The captures in a folder, in no order. SessionError where an image that a record names is not there."""
+    """The captures in a folder, unordered. SessionError where an image that a record names is not there."""
     if not folder.is_dir():
         return
     for path in folder.iterdir():

@@ -14,7 +14,7 @@ from ringdic.errors import InputError
 CaptureKind = Literal["board", "target", "specimen", "static"]
 
 #: board: views of the checkerboard. target: the calibration object. specimen: the reference, then the steps.
-#: static: the specimen at rest beside the reference, from which the noise is measured.
+#: static: the specimen at rest, unchanged since the reference, from which the noise is measured.
 CAPTURE_KINDS: tuple[CaptureKind, ...] = get_args(CaptureKind)
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")

@@ -46,7 +46,7 @@ def kabsch(source: Points, destination: Points, weights: Floats | None = None) -
 
     Parameters
     ----------
-    source, destination : (n, 3) mm; a point that is NaN in either takes no part.
+    source, destination : (n, 3) mm; a point that is NaN in either is ignored.
     weights : (n,) without unit, or None for equal weights.
 
     Raises

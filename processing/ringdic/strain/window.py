@@ -99,7 +99,7 @@ class StrainWindow:
             )
 
     def _moments(self, whole: Mask, X: Points) -> tuple[Floats, Points, Floats]:
-        """Number (M,), mean (M, 3) mm and sum of central second moments (M, 3, 3) mm² of each window's whole points.
+        """Number (M,), mean (M, 3) mm and sum of central second moments (M, 3, 3) mm² of each window's measured points.
 
         whole : (N,). X : (N, 3) mm, 0 where not whole.
         """

@@ -20,7 +20,7 @@ from ringdic.geometry.camera import Camera
 from ringdic.sweep.proxies import cylinder_intersections, stereo_hypotheses, sweep_radii
 from ringdic.sweep.region import ImageLattice, coherent_depths, contrast, image_lattice
 
-# Bare skin beside the speckled surface can match too, but has less contrast than this share of the median.
+# Bare skin next to the speckled surface can match too, but has less contrast than this share of the median.
 _LEAST_CONTRAST = 0.3
 _BEYOND = 3.0  # mm beyond the radii of accepted positions nearby; a position farther off would be rejected
 _TOLERANCE = 2.0  # mm, largest difference between a position's radius and the median of its neighbours'

@@ -12,7 +12,7 @@ from ringdic.mesh.polygon import triangulate_polygon
 from ringdic.mesh.topology import Border, Kind, borders
 
 _LONGEST = 150  # vertices of a border whose hole may be filled
-_THIN = 0.1  # height over longest edge of triangles that are laid only where there is no other way
+_THIN = 0.1  # height over longest edge of triangles that are used only where there is no other way
 _FACING = 0.5  # least cosine between a hole's own normal and those of the surface round it
 
 
