@@ -9,7 +9,7 @@ from __future__ import annotations
 
 
 class RingdicError(Exception):
-    """A failure with a sentence for the operator: what, which file or camera, what to do."""
+    """Base class of errors whose message tells the operator what is wrong, in which file or camera, and what to do."""
 
     exit_code = 1
 

@@ -30,7 +30,7 @@ def correlate_files(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Match one image file in another and write ``points.npz``; returns what ``ringdic correlate --json`` prints.
+    """Match one image file in another and write ``points.npz``; returns the summary of ``ringdic correlate --json``.
 
     Parameters
     ----------

@@ -310,7 +310,7 @@ def _result(points: Propagation, seconds: dict[str, float]) -> PointMatches:
 
 
 def usable_threads(count: int | None) -> int:
-    """Number of threads that a correlation uses when ``count`` are asked for; all cores for None."""
+    """Number of threads that a correlation uses for a requested ``count``, at most the cores; all cores for None."""
     cores = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     return min(count, cores) if count else cores
 

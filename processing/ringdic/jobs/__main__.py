@@ -26,7 +26,7 @@ from ringdic.settings import load_settings
 
 
 def main() -> int:
-    """Read the command line, do what it asks for and return the exit code."""
+    """Read the command line, run the job that it names and return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m ringdic.jobs", description="Process a session folder.")
     choice = parser.add_mutually_exclusive_group(required=True)
     choice.add_argument("session", type=Path, nargs="?")

@@ -235,7 +235,7 @@ class StepFields:
 
 @dataclass(frozen=True)
 class StepQuality:
-    """Correlation and standard deviations of the points and triangles at one step; None for what is not known.
+    """Correlation and standard deviations of the points and triangles at one step; None where unknown.
 
     correlation : (N,) C_LS. sigma_xyz, sigma_displacement : (N, 3) mm, and sigma_lambda : (M, 2), of λ1 and λ2, all due
     to image noise. chi2 : (N,) χ² a degree of freedom. sigma_calibration, sigma_displacement_calibration :
