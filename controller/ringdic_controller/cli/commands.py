@@ -63,7 +63,7 @@ def validate_command(
     images_only: Annotated[bool, typer.Option("--images-only", help="Render the images and stop.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """The paper's experiments on the virtual rig, beside the paper's figures."""
+    """Repeat the paper's experiments on the virtual rig and compare with the paper's figures."""
     from ringdic_controller.studies.validate import run_validation
 
     findings = run_validation(out, scale=scale, quick=quick, only=only or (), images_only=images_only)

@@ -46,7 +46,10 @@ class Damage:
     bars: tuple[Bar, ...] = ()
 
     def arrays(self) -> tuple[Floats, Floats, Floats]:
-        """Arrays for the renderer, mm: patches (k, 4) arc, z, half axes; lamps (m, 3); bars (b, 7) start, end, radius."""
+        """Arrays for the renderer, mm.
+
+        Patches (k, 4): arc, z, half axes. Lamps (m, 3). Bars (b, 7): start, end, radius.
+        """
         patches = [
             (each.theta % (2 * np.pi) * RADIUS, each.z, each.half_arc, each.half_height) for each in self.patches
         ]
