@@ -38,13 +38,13 @@ def begin_capture(new: NewCapture, desk: TheDesk) -> dict[str, Any]:
 
 @router.get("/rounds/{round_id}", response_model=Round, summary="State of a capture round")
 def read_round(round_id: str, desk: TheDesk) -> dict[str, Any]:
-    """One capture round: ``state`` is arming, open, closed or refused; ``capture_id`` is null before the record exists."""
+    """One capture round: ``state`` is arming, open, closed or refused; ``capture_id`` is null until it opens."""
     return asdict(desk.rounds.get(round_id))
 
 
 @router.get("/sessions/{session}/captures", summary="The capture records of a session, in order")
 def list_captures(session: str, desk: TheDesk) -> list[dict[str, Any]]:
-    """Capture records of a session; for each camera status, reason, SHA-256, size, measured time, exposure, metadata."""
+    """Capture records with, for each camera, status, reason, SHA-256, size, measured time, exposure, metadata."""
     desk.sessions.summary(session)
     return desk.catalogue.captures(session)
 

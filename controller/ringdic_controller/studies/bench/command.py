@@ -35,7 +35,7 @@ def bench_command(
     compare: Annotated[Path | None, typer.Option(help="An earlier result (JSON) to compare with.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
 ) -> None:
-    """How fast the correlation is on this machine, and, where asked for, a whole job, captures and live steps."""
+    """Measure how fast the correlation is on this machine and, if asked for, a whole job, captures and live steps."""
     from ringdic.correlation.bench import bench_correlation, read_result
 
     before = read_result(compare) if compare is not None else None
@@ -67,9 +67,9 @@ def bench_command(
 
 
 def compared(new: dict[str, Any], old: dict[str, Any]) -> list[dict[str, Any]]:
-    """A row for each run that both results hold, with the part it belongs to; a ratio above 1 is better.
+    """Ratios to an earlier result, a row for each run that both results have; a ratio above 1 is better.
 
-    InputError if they have no part in common.
+    Each row names its part of the benchmark. Raises InputError if they have no part in common.
     """
     from ringdic.correlation.bench import ratios
 
