@@ -189,12 +189,12 @@ def _process(session: Path, settings: Sequence[str]) -> dict[str, Any]:
             errors.seek(0)
             raise ComputationError(f"{session}: the job failed: {outcome.get('error') or errors.read()[-500:]}")
     results = session / "results" / outcome["run"]
-    kept = sum(path.stat().st_size for path in (session / "work").glob("*.npz"))
+    matches_size = sum(path.stat().st_size for path in (session / "work").glob("*.npz"))
     size = (results / "results.h5").stat().st_size
     shutil.rmtree(results)
     return {
         "wall": time.monotonic() - began, **used, "seconds": stages,
-        "faces": outcome["summary"].get("faces"), "kept_mb": kept / _MB, "results_mb": size / _MB,
+        "faces": outcome["summary"].get("faces"), "kept_mb": matches_size / _MB, "results_mb": size / _MB,
     }  # fmt: skip
 
 

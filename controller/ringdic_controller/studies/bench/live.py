@@ -149,10 +149,10 @@ def _steps(client: Client, count: int, interval: float) -> tuple[list[dict[str, 
     return list(shown.values()), taken
 
 
-def _keep_calibration(session: Path, kept: Path) -> None:
-    (kept / "calibration").mkdir(parents=True, exist_ok=True)
+def _keep_calibration(session: Path, folder: Path) -> None:
+    (folder / "calibration").mkdir(parents=True, exist_ok=True)
     for file in (session / "calibration").glob("*.json"):
-        (kept / "calibration" / file.name).write_bytes(file.read_bytes())
+        (folder / "calibration" / file.name).write_bytes(file.read_bytes())
 
 
 def _processing_seconds(pid: int) -> float | None:

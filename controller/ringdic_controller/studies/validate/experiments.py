@@ -133,7 +133,7 @@ class Validation:
         for way, settings in self.ways.items():
             began = self.clock()
             rings[way] = calibrate_rig(session, settings.calibration, self._step(f"calibrate, {way}"))
-            self._took(f"calibration, {way}", began)
+            self._add_seconds(f"calibration, {way}", began)
         return rings
 
     def _uncorrected(self) -> CalibratedRig:
@@ -149,7 +149,7 @@ class Validation:
             if run is None:
                 began = self.clock()
                 run = process_session(session, settings, self._renamed(f"{name}, {way}"))
-                self._took(f"{name}, {way}", began)
+                self._add_seconds(f"{name}, {way}", began)
             findings[way] = read_results(run / "results.h5")
         return findings
 
@@ -177,7 +177,7 @@ class Validation:
         rendered = sum(not self.image_cache.path(shot).is_file() for shot in shots)
         self.image_cache.render_missing(shots, lambda done: self.report(Progress("render", done, name)))
         if rendered:
-            self._took(f"render {name}, {rendered} images", began)
+            self._add_seconds(f"render {name}, {rendered} images", began)
 
     def _step(self, stage: str) -> Callable[[float, str], None]:
         return lambda done, message: self.report(Progress(stage, done, message))
@@ -189,7 +189,7 @@ class Validation:
 
         return report
 
-    def _took(self, what: str, began: float) -> None:
+    def _add_seconds(self, what: str, began: float) -> None:
         self.seconds[what] = round(self.seconds.get(what, 0.0) + self.clock() - began, 1)
 
 

@@ -58,8 +58,8 @@ class LimbRun:
 def figure_9(runs: Mapping[str, LimbRun], scenes: Sequence[Specimen], cameras: Sequence[VirtualCamera]) -> Findings:
     """Coverage, shape, displacement, stretches and topology of the limb (Fig. 9)."""
     grid = SurfaceGrid.of(scenes[0])
-    seen, _ = grid.views(cameras)
-    two = grid.area * (seen.sum(axis=0) >= 2)
+    visible, _ = grid.views(cameras)
+    two = grid.area * (visible.sum(axis=0) >= 2)
     covered = {way: float(100 * two[run.covered(grid, 0)].sum() / two.sum()) for way, run in runs.items()}
     distance = {way: _rms(run.errors.distance) for way, run in runs.items()}
     wrong = {way: float(run.wrong) for way, run in runs.items()}
