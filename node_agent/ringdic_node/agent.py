@@ -54,7 +54,7 @@ class ArmAsked:
 
 @dataclass(frozen=True)
 class CameraLocked:
-    """The camera holds the settings of an arming; `reply` names them by their hash and answers all who asked."""
+    """The camera is locked to the settings that were asked for; `reply` is the answer to all who asked."""
 
     reply: ArmReply
 

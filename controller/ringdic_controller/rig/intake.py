@@ -162,7 +162,7 @@ class Intake:
         return record.state == "closed"
 
     def note_failure(self, failure: Failure) -> None:
-        """Record why a node says it took no image, in place of the general reason in a closed capture's record."""
+        """Replace the general reason of a failed camera in a closed capture's record by the one that its node gives."""
         capture = self._archive.capture(failure.key.session, failure.key.capture_id)
         if capture is None:
             return
