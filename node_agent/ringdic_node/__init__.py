@@ -1,1 +1,1 @@
-"""The agent on every camera node: armed, triggered, it captures a still and delivers it without loss."""
+"""The program on every camera node: triggered by the controller, it captures a still and delivers it without loss."""

@@ -1,4 +1,4 @@
-"""The node's state machine: an event comes in, actions go out. No input or output happens here.
+"""The node's state machine: each event that it is given yields the actions to perform. It does no input or output.
 
 States and what moves them (anything not listed leaves the state alone)::
 
@@ -14,8 +14,8 @@ States and what moves them (anything not listed leaves the state alone)::
     capturing   FrameLost                   idle        Report(failure); the camera must be locked anew
 
 Laws: a capture is taken at most once, however often its trigger arrives. A spooled image is published
-again and again, ever less often, until an acknowledgement with its own hash arrives; only then is it freed.
-An image that the controller declares unknown is kept but not published any more.
+again and again, each time after a longer wait, until an acknowledgement with its own hash arrives; only then is it
+freed. An image that the controller declares unknown stays in the spool and is not published any more.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ REMEMBERED = 200  # failures and answers kept for repeated questions
 
 @dataclass(frozen=True)
 class ArmAsked:
-    """The controller asks this node to lock its camera. question : number to answer by."""
+    """The controller asks this node to lock its camera. question : number of the query, which the answer names."""
 
     message: Arm
     question: int
@@ -54,7 +54,7 @@ class ArmAsked:
 
 @dataclass(frozen=True)
 class CameraLocked:
-    """The camera holds the settings with this hash; `reply` is what to tell whoever asked."""
+    """The camera is locked to the settings that were asked for; `reply` is the answer to all who asked."""
 
     reply: ArmReply
 
@@ -69,7 +69,7 @@ class CameraRefused:
 
 @dataclass(frozen=True)
 class Triggered:
-    """A trigger has arrived. question : number to answer by."""
+    """A trigger has arrived. question : number of the query, which the answer names."""
 
     message: Trigger
     question: int
@@ -77,7 +77,7 @@ class Triggered:
 
 @dataclass(frozen=True)
 class FrameSpooled:
-    """The frame of the capture under way lies in the spool, safe against a power cut."""
+    """The frame of the capture under way is in the spool, safe against a power cut."""
 
     manifest: Manifest
 
@@ -92,7 +92,7 @@ class FrameLost:
 
 @dataclass(frozen=True)
 class Sent:
-    """A publication has left, or failed to leave; neither says that it arrived."""
+    """An image has been handed to the network, or that failed; neither tells whether it arrived."""
 
     key: CaptureKey
 
@@ -106,14 +106,14 @@ class Acknowledged:
 
 @dataclass(frozen=True)
 class InventoryAsked:
-    """The controller asks what this node holds. question : number to answer by."""
+    """The controller asks what this node holds. question : number of the query, which the answer names."""
 
     question: int
 
 
 @dataclass(frozen=True)
 class FetchAsked:
-    """The controller asks for the image of one capture. question : number to answer by."""
+    """The controller asks for the image of one capture. question : number of the query, which the answer names."""
 
     key: CaptureKey
     question: int
@@ -144,7 +144,7 @@ Event = (
 
 @dataclass(frozen=True)
 class LockCamera:
-    """Lock the camera to these settings; the event CameraLocked or CameraRefused tells the outcome."""
+    """Lock the camera to these settings; the event CameraLocked or CameraRefused follows."""
 
     settings: dict[str, Any]
     settings_hash: str
@@ -166,7 +166,7 @@ class Publish:
 
 @dataclass(frozen=True)
 class Free:
-    """Remove the image from the spool and leave a tombstone."""
+    """Remove a delivered image from the spool; a small file (tombstone) remembers that it was delivered."""
 
     key: CaptureKey
     sha256: str
@@ -174,7 +174,7 @@ class Free:
 
 @dataclass(frozen=True)
 class Report:
-    """Tell the controller about a capture without an image."""
+    """Tell the controller that there is no image of a capture, and why."""
 
     failure: Failure
 
@@ -208,7 +208,7 @@ Action = LockCamera | TakeFrame | Publish | Free | Report | Answer | AnswerImage
 
 @dataclass
 class _Parcel:
-    """A spooled image on its way: when it is due again and after how long a wait."""
+    """A spooled image to deliver: when it is published next and the wait after that, ns of the monotonic clock."""
 
     manifest: Manifest
     due_ns: int
@@ -218,14 +218,14 @@ class _Parcel:
 
 
 class Agent:
-    """One node's decisions.
+    """Decides what a node does on each event: when it locks, captures, publishes and frees.
 
     Parameters
     ----------
     node : str
         This node's id.
     spooled, freed
-        What the spool held when the process started: images to deliver and tombstones.
+        What the spool held when the process started: images to deliver, and captures delivered before.
     now : Instant
         The moment of the start; the spooled images are due at once.
     resend_after_ns, resend_at_most_ns : int
@@ -274,7 +274,7 @@ class Agent:
         return len(self._parcels)
 
     def handle(self, event: Event, now: Instant) -> list[Action]:
-        """Take one event; return what to do, in order."""
+        """Take one event at the moment ``now``; return the actions to perform, in order."""
         match event:
             case ArmAsked():
                 return self._arm(event)
@@ -300,7 +300,7 @@ class Agent:
                 return self._due(now)
 
     def inventory(self) -> Inventory:
-        """What this node holds, as it tells the controller."""
+        """The answer to an inventory query: images in the spool, failures, the capture under way."""
         return Inventory(
             node=self.node,
             manifests=tuple(parcel.manifest for parcel in self._parcels.values()),

@@ -1,4 +1,4 @@
-"""The command ``ringdic-node``: serve, check the installation, or shoot one still.
+"""The command ``ringdic-node``: run the node's service, check the installation, or capture one still.
 
 Exit codes: 0 done, 2 bad input, 3 the machine cannot do it, 1 a bug.
 """
@@ -24,7 +24,7 @@ SECOND = 1_000_000_000
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return its exit code."""
+    """Run ``ringdic-node`` with its command-line arguments; return the exit code."""
     options = _parser().parse_args(arguments)
     logging.basicConfig(
         level=logging.DEBUG if options.verbose else logging.INFO,
@@ -55,7 +55,7 @@ def _parser() -> argparse.ArgumentParser:
     shared.add_argument("--verbose", action="store_true", help="log every detail")
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("run", parents=[shared], help="serve until SIGTERM")
-    commands.add_parser("check", parents=[shared], help="tell whether camera, clock, spool and controller are there")
+    commands.add_parser("check", parents=[shared], help="check camera, clock, spool and controller")
     shoot = commands.add_parser("shoot", parents=[shared], help="capture one still into a file, without a controller")
     shoot.add_argument("--out", type=Path, required=True, help="the PGM file to write; it must not exist")
     return parser
@@ -87,9 +87,9 @@ def _check(config: NodeConfig) -> int:
         ("spool", _probe_spool),
         ("controller", _probe_controller),
     ):
-        found, text = probe(config)
-        sound = sound and found
-        sys.stdout.write(f"{'ok  ' if found else 'FAIL'} {name:<11} {text}\n")
+        passed, text = probe(config)
+        sound = sound and passed
+        sys.stdout.write(f"{'ok  ' if passed else 'FAIL'} {name:<11} {text}\n")
     return 0 if sound else 3
 
 
@@ -97,8 +97,8 @@ def _probe_camera(config: NodeConfig) -> tuple[bool, str]:
     try:
         camera = make_camera(config, SystemClock())
         try:
-            held = camera.lock({})
-            return True, f"{config.camera}, {camera.versions()}, sync {held.sync}"
+            lock = camera.lock({})
+            return True, f"{config.camera}, {camera.versions()}, sync {lock.sync}"
         finally:
             camera.close()
     except CameraError as error:
@@ -127,7 +127,7 @@ def _probe_controller(config: NodeConfig) -> tuple[bool, str]:
     def ignore(*_: object) -> None:
         pass
 
-    # Under a name of its own, so that a running service is not taken for two.
+    # With an id of its own, since the controller would take it for the running service.
     with NodeLink(Keys(config.rig), "check", config.controller, ignore, ignore) as link:
         deadline = time.monotonic() + 3.0
         while time.monotonic() < deadline:

@@ -1,4 +1,4 @@
-"""Wall and monotonic time as an object, so that a test can hold the clock."""
+"""Wall and monotonic time as an object, in whose place a test can put a clock of its own."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import Protocol
 
 @dataclass(frozen=True)
 class Instant:
-    """One moment on both clocks. Wall time is compared between machines, monotonic time measures waits."""
+    """One moment on both clocks, ns. Wall time is compared between machines, monotonic time measures waits."""
 
     wall_ns: int
     monotonic_ns: int
 
 
 class Clock(Protocol):
-    """Tells the moment and waits."""
+    """A clock that gives the present moment and waits."""
 
     def now(self) -> Instant:
         """The present moment on both clocks."""
@@ -28,7 +28,7 @@ class Clock(Protocol):
 
 
 class SystemClock:
-    """The machine's clocks."""
+    """The clocks of this machine."""
 
     def now(self) -> Instant:
         """The present moment on the machine's clocks."""
@@ -40,13 +40,13 @@ class SystemClock:
 
 
 def sleep_until(clock: Clock, wall_ns: int) -> None:
-    """Return when the wall clock has reached `wall_ns`; in short waits, so a stepped clock cannot hang it."""
-    while (left := wall_ns - clock.now().wall_ns) > 0:
-        clock.sleep(min(left / 1e9, 0.05))
+    """Wait until the wall clock has reached `wall_ns`; in short waits, so that a clock that is set meanwhile counts."""
+    while (remaining := wall_ns - clock.now().wall_ns) > 0:
+        clock.sleep(min(remaining / 1e9, 0.05))
 
 
 def clock_offset() -> tuple[float, float] | None:
-    """Offset of this machine's clock from its server and the bound of its error, ms; None without chrony."""
+    """Offset of this machine's clock from its time server and the bound of its error, ms, from chrony; else None."""
     command = shutil.which("chronyc")
     if command is None:
         return None

@@ -1,4 +1,4 @@
-"""The node's configuration file, checked when read.
+"""The node's configuration file (TOML) and the camera that it names.
 
 ::
 
@@ -12,7 +12,7 @@
     size = [3280, 2464]
     sync = "client"
 
-A relative spool folder is relative to the configuration file, and so is the image of a playback.
+Relative paths of the spool and of a playback image are taken from the folder of the configuration file.
 """
 
 from __future__ import annotations
@@ -56,7 +56,12 @@ _CAMERA_KEYS: dict[str, dict[str, type | tuple[type, ...]]] = {
 
 @dataclass(frozen=True)
 class NodeConfig:
-    """Everything a node needs to know before it starts. Waits in seconds."""
+    """Configuration of a node.
+
+    rig, id : names of the rig and of this camera. controller : Zenoh endpoint. camera : kind of camera, with
+    ``camera_settings``. spool_reserve_mb : MiB of the disk that images leave free. resend_s, status_s : seconds until
+    an unacknowledged image is sent again, and between two status messages.
+    """
 
     rig: str
     id: str
@@ -89,7 +94,7 @@ class NodeConfig:
 
 
 def read_node_config(path: Path) -> NodeConfig:
-    """The configuration in the TOML file `path`; raises ConfigError."""
+    """Read and check the configuration in the TOML file `path`; raises ConfigError."""
     path = Path(path)
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -135,7 +140,7 @@ def _parse(table: dict[str, Any], folder: Path) -> NodeConfig:
 
 
 def make_camera(config: NodeConfig, clock: Clock) -> NodeCamera:
-    """The camera that the configuration names; imported only here, so that a node loads no other."""
+    """Build the camera that the configuration names; only its module is imported. Raises CameraError."""
     settings = dict(config.camera_settings)
     if config.camera == "pattern":
         from ringdic_node.cameras.pattern import PatternCamera

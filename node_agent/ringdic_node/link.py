@@ -1,7 +1,7 @@
 """The node's only contact with Zenoh: keys, queries, publications, priorities.
 
 The session is a peer without a listener that connects to the controller by itself, whenever it appears.
-Queries are not answered here: each becomes an event with a number, answered later by that number.
+A query that arrives gets a number and is passed on; it is answered later by that number.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class NodeLink:
     Parameters
     ----------
     on_query : callable (verb, payload, question)
-        Called from Zenoh's threads; must only enqueue. `question` is the number to answer by.
+        Called from Zenoh's threads; must only enqueue. `question` is the number of the query, for `answer`.
     on_ack : callable (payload)
-        Likewise, for acknowledgements.
+        Called from Zenoh's threads with an acknowledgement; must only enqueue.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class NodeLink:
 
     def __enter__(self) -> NodeLink:
         self._session = zenoh.open(node_config(self._controller))
-        # Queryables first, the token last: whoever sees the node alive can talk to it.
+        # Queryables first, the liveliness token last: a node that is seen alive answers.
         self._queryables = [
             self._session.declare_queryable(self._keys.node(self._node, verb), self._receiver(verb)) for verb in VERBS
         ]
@@ -87,7 +87,7 @@ class NodeLink:
         return bool(self._session.info.routers_zid())
 
     def answer(self, question: int, payload: bytes, manifest: Manifest | None = None) -> None:
-        """Answer a query with bytes; an image brings its manifest as the attachment."""
+        """Answer a query with bytes; the manifest of an image goes with them as the attachment."""
         query = self._take(question)
         if query is None:
             return
@@ -100,7 +100,7 @@ class NodeLink:
             query.drop()
 
     def decline(self, question: int, reason: str) -> None:
-        """Answer a query with an error: silence would look like a dead node."""
+        """Answer a query with an error, since no answer would look like a dead node."""
         query = self._take(question)
         if query is None:
             return
@@ -129,7 +129,7 @@ class NodeLink:
             log.warning("the image of %s could not be sent: %s", manifest.key, error)
 
     def publish_status(self, message: Message) -> None:
-        """Send a status or a failure; it may be lost, the inventory tells it again."""
+        """Send a status or a failure; the network may drop it, and the next inventory repeats it."""
         try:
             self._session.put(
                 self._keys.node(self._node, "status"),
@@ -142,7 +142,7 @@ class NodeLink:
 
 
 def node_config(controller: str) -> zenoh.Config:
-    """Zenoh's configuration of a node: a peer that only connects, and retries for ever."""
+    """Zenoh's configuration of a node: a peer that connects to the controller and retries without end."""
     config = zenoh.Config()
     parameters = f"{RETRY};{SMALL_BUFFER}" if controller.startswith("tcp/") else RETRY
     settings = {

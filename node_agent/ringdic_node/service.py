@@ -1,4 +1,4 @@
-"""The node's shell: it performs what the agent decides, on a camera, a spool and a link.
+"""The node's service: it performs what the state machine `Agent` decides, on a camera, a spool and a link.
 
 Three threads: the main loop feeds the agent one event at a time; one thread uses the camera and the disk;
 one thread sends images, because sending blocks while the network is busy.
@@ -43,11 +43,11 @@ PREVIEW_WIDTH = 480
 
 
 class ServiceError(RuntimeError):
-    """The node cannot go on; the text tells why. Its supervisor should start it anew."""
+    """The node cannot go on; the text says why. systemd, or whatever started it, should start it again."""
 
 
 class NodeService:
-    """One node: agent, camera, spool and link joined."""
+    """A running node: its state machine joined with camera, spool and link."""
 
     def __init__(self, config: NodeConfig, camera: NodeCamera, spool: Spool, clock: Clock) -> None:
         self.config = config
@@ -93,7 +93,7 @@ class NodeService:
         self._camera.close()
 
     def _loop(self, workers: list[threading.Thread]) -> None:
-        told: tuple[object, ...] = ()
+        published_state: tuple[object, ...] = ()
         next_status = 0
         while not self._stop.is_set():
             try:
@@ -107,8 +107,8 @@ class NodeService:
                 event()
             now = self._clock.now().monotonic_ns
             state = (self._agent.state, self._agent.spooled)
-            if state != told or now >= next_status:
-                told, next_status = state, now + round(self.config.status_s * 1e9)
+            if state != published_state or now >= next_status:
+                published_state, next_status = state, now + round(self.config.status_s * 1e9)
                 self._link.publish_status(self._status())
             for worker in workers:
                 if not worker.is_alive():
@@ -126,7 +126,7 @@ class NodeService:
             clock_offset_ms=self._offset[0] if self._offset else None,
         )
 
-    # What comes in, from Zenoh's threads: decode and enqueue, no more
+    # Called from Zenoh's threads: decode and enqueue only
 
     def _receive(self, verb: str, payload: bytes, question: int) -> None:
         try:
@@ -157,7 +157,7 @@ class NodeService:
         except WireError as error:
             log.warning("an acknowledgement breaks the contract: %s", error)
 
-    # What goes out
+    # Actions of the state machine
 
     def _perform(self, action: steps.Action) -> None:
         match action:
@@ -196,7 +196,7 @@ class NodeService:
 
     def _lock(self, work: steps.LockCamera) -> steps.Event:
         try:
-            held = self._camera.lock(work.settings)
+            lock = self._camera.lock(work.settings)
         except CameraError as error:
             return steps.CameraRefused(work.settings_hash, str(error))
         self._offset = clock_offset()
@@ -205,12 +205,12 @@ class NodeService:
                 node=self.config.id,
                 armed=True,
                 settings_hash=work.settings_hash,
-                locked=held.metadata,
-                sync=held.sync,
+                locked=lock.metadata,
+                sync=lock.sync,
                 clock_offset_ms=self._offset[0] if self._offset else None,
                 clock_error_ms=self._offset[1] if self._offset else None,
-                frame_time_ns=held.frame_time_ns,
-                frame_period_ns=held.frame_period_ns,
+                frame_time_ns=lock.frame_time_ns,
+                frame_period_ns=lock.frame_period_ns,
                 spool_free=self._spool.free,
                 versions=self._versions,
             )
@@ -249,7 +249,7 @@ class NodeService:
 
 
 def make_manifest(node: str, trigger: Trigger, frame: Frame, parts: tuple[bytes, bytes]) -> Manifest:
-    """The manifest of a frame written as `parts`."""
+    """The manifest of a frame of this node. parts : the bytes of its file, header and pixels."""
     sha256, length = image_digest(parts)
     return Manifest(
         node=node,
@@ -266,7 +266,7 @@ def make_manifest(node: str, trigger: Trigger, frame: Frame, parts: tuple[bytes,
 
 
 def preview_image(frame: Frame) -> npt.NDArray[np.uint8]:
-    """Every n-th pixel of a frame, for the preview: (height, width) 8-bit grey levels, at most `PREVIEW_WIDTH` wide."""
+    """A small picture of a frame: every n-th pixel, (height, width) 8-bit grey levels, at most `PREVIEW_WIDTH` wide."""
     stride = -(-frame.width // PREVIEW_WIDTH)
     small = frame.pixels[::stride, ::stride]
     shift = 8 if small.dtype == np.uint16 else 0
@@ -274,10 +274,10 @@ def preview_image(frame: Frame) -> npt.NDArray[np.uint8]:
 
 
 def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
+    versions = {"python": platform.python_version()}
     for package in ("ringdic", "eclipse-zenoh"):
         try:
-            found[package] = version(package)
+            versions[package] = version(package)
         except PackageNotFoundError:
-            found[package] = "not installed as a package"
-    return found
+            versions[package] = "not installed as a package"
+    return versions

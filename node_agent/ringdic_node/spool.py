@@ -5,7 +5,7 @@
     SPOOL/<session>~<capture>~<moment>.pgm    the image, complete before its manifest exists
     SPOOL/<session>~<capture>~<moment>.json   its manifest: the commit point
     SPOOL/<session>~<capture>~<moment>.freed  tombstone: delivered and acknowledged, holds the hash
-    SPOOL/.partial-…                          being written; swept at the next start
+    SPOOL/.partial-…                          being written; removed at the next start
     SPOOL/.claim                              locked by the process that uses the spool
 
 Every file is written aside, flushed to the disk and renamed, so a power cut leaves either the whole image with
@@ -35,18 +35,20 @@ TOMBSTONES_KEPT = 2000
 
 
 class SpoolError(OSError):
-    """The spool cannot take or give an image; the text tells why."""
+    """The spool cannot store or read an image; the text says why."""
 
 
 class Spool:
-    """Images in one folder, safe against power cuts. Methods may be called from several threads.
+    """A folder of images that wait for their acknowledgement, safe against power cuts.
+
+    Methods may be called from several threads.
 
     Parameters
     ----------
     folder : Path
-        Made if absent.
+        Created if it does not exist.
     reserve : int
-        Bytes of free disk below which no further image is taken.
+        Bytes of free disk below which no further image is stored.
     """
 
     def __init__(self, folder: Path, *, reserve: int = 64 << 20) -> None:
@@ -56,9 +58,9 @@ class Spool:
         self._claim: IO[bytes] | None = None
 
     def claim(self) -> None:
-        """Take the spool for this process alone, until it ends, and sweep up what a power cut left half-written.
+        """Reserve the spool for this process until it ends, and remove files that a power cut left half-written.
 
-        Raises SpoolError if another process has it: two nodes on one spool would sweep each other's images.
+        Raises SpoolError if another process has it: two nodes on one spool would remove each other's images.
         """
         if fcntl is not None:
             self._claim = open(self.folder / ".claim", "ab")  # noqa: SIM115 - held open as long as the process lives
@@ -70,13 +72,13 @@ class Spool:
         self._sweep()
 
     def release(self) -> None:
-        """Give the spool up."""
+        """End the reservation that `claim` made."""
         if self._claim is not None:
             self._claim.close()
 
     def _sweep(self) -> None:
-        for left in self.folder.glob(".partial-*"):
-            left.unlink(missing_ok=True)
+        for partial in self.folder.glob(".partial-*"):
+            partial.unlink(missing_ok=True)
         for image in self.folder.glob("*.pgm"):
             if not image.with_suffix(".json").exists():
                 log.warning("spool: %s was never committed and is removed", image.name)
@@ -87,12 +89,12 @@ class Spool:
 
     @property
     def free(self) -> int:
-        """Bytes that images may still take."""
+        """Bytes that further images may take on this disk."""
         return max(shutil.disk_usage(self.folder).free - self.reserve, 0)
 
     def manifests(self) -> list[Manifest]:
         """Manifests of the images held, oldest moment first. A damaged pair is set aside as ``.damaged``."""
-        found = []
+        manifests_held = []
         for path in self.folder.glob("*.json"):
             try:
                 manifest = decode_as(Manifest, path.read_bytes())
@@ -103,11 +105,11 @@ class Spool:
                 log.error("spool: %s is damaged and set aside: %s", path.name, error)
                 path.rename(path.with_suffix(".damaged"))
                 continue
-            found.append(manifest)
-        return sorted(found, key=lambda manifest: manifest.key.fire_at_ns)
+            manifests_held.append(manifest)
+        return sorted(manifests_held, key=lambda manifest: manifest.key.fire_at_ns)
 
     def tombstones(self) -> list[CaptureKey]:
-        """Captures that were delivered and freed."""
+        """Keys of the captures whose images were delivered and freed."""
         keys = []
         for path in self.folder.glob("*.freed"):
             session, capture_id, moment = path.stem.split("~")
@@ -115,7 +117,7 @@ class Spool:
         return keys
 
     def store(self, manifest: Manifest, parts: Sequence[bytes | memoryview]) -> None:
-        """Make the image durable; when this returns, a power cut cannot lose it.
+        """Write an image and its manifest durably: after the return a power cut cannot lose them.
 
         Raises
         ------
@@ -135,7 +137,7 @@ class Spool:
         _flush_folder(self.folder)
 
     def read(self, key: CaptureKey) -> bytes:
-        """The image's bytes; raises SpoolError if it is not held."""
+        """The bytes of a capture's image file; raises SpoolError if the spool does not hold it."""
         path = self.folder / f"{key.stem}.pgm"
         try:
             return path.read_bytes()
@@ -143,9 +145,9 @@ class Spool:
             raise SpoolError(f"the image of {key} cannot be read from the spool: {error}") from error
 
     def remove(self, key: CaptureKey, sha256: str) -> bool:
-        """Free an acknowledged image if `sha256` is its own hash; tell whether it was freed.
+        """Remove an acknowledged image if `sha256` is its own hash; returns whether it was removed.
 
-        The tombstone comes first, so a crash in between cannot make the capture look untaken.
+        The tombstone is written first: after a crash in between the capture is still known as delivered.
         """
         manifest_path = self.folder / f"{key.stem}.json"
         try:
@@ -175,7 +177,7 @@ class Spool:
 
 
 def image_digest(parts: Sequence[bytes | memoryview]) -> tuple[str, int]:
-    """SHA-256 in hexadecimal and length of the joined parts."""
+    """SHA-256 in hexadecimal, and length in bytes, of parts joined in order."""
     sha, length = hashlib.sha256(), 0
     for part in parts:
         sha.update(part)

@@ -1,6 +1,6 @@
 """The contract between node and controller: key expressions, messages, encoding.
 
-Both sides import this file and nothing else of each other. Standard library only.
+It is the only module of the node that the controller imports for its link. Standard library only.
 
 Keys
 ----
@@ -28,8 +28,8 @@ from typing import Any, ClassVar
 
 SCHEMA = 1
 
-# The kinds of capture and the rule of names are those of `ringdic.session.names`, written here once more: a node has
-# no package `ringdic`. A test holds the two together.
+# The kinds of capture and the rule of names are those of `ringdic.session.names`, repeated here because a node has
+# no package `ringdic`. A test compares the two.
 CAPTURE_KINDS = ("board", "target", "specimen", "static")
 NODE_STATES = ("idle", "arming", "armed", "capturing")
 TRIGGER_VERDICTS = ("accepted", "late", "not armed")
@@ -38,7 +38,7 @@ ACK_VERDICTS = ("archived", "unknown")
 MAX_MESSAGE = 64 << 20
 IMAGE_LIMIT = MAX_MESSAGE - (1 << 20)  # bytes; a larger message is dropped by its receiver without a word
 
-# Zenoh's configuration where both sides must agree or profit alike. Shared memory drops messages silently and
+# Zenoh's configuration that both sides share. Shared memory drops messages silently and
 # is slower for images; waiting on a frozen receiver must end before the lease does, or images vanish unnoticed.
 NETWORK: dict[str, object] = {
     "scouting/multicast/enabled": False,
@@ -91,7 +91,7 @@ class Keys:
 
 @dataclass(frozen=True, order=True)
 class CaptureKey:
-    """What makes a capture unique: the planned moment tells apart two sessions of the same name."""
+    """Identity of a capture: session, id and planned moment, ns; the moment distinguishes sessions of the same name."""
 
     session: str
     capture_id: str
@@ -107,7 +107,7 @@ class CaptureKey:
 
     @property
     def stem(self) -> str:
-        """A file name without extension; ``~`` cannot occur in a name."""
+        """File name of the capture without its suffix; the parts are joined by ``~``, which no name contains."""
         return f"{self.session}~{self.capture_id}~{self.fire_at_ns}"
 
 
@@ -136,14 +136,14 @@ def _require_table(what: str, value: object) -> None:
 
 
 class _Message:
-    """A message has a class variable `TYPE` and is a frozen dataclass."""
+    """Base of all messages: frozen dataclasses whose class variable `TYPE` names them in the JSON."""
 
     TYPE: ClassVar[str]
 
 
 @dataclass(frozen=True)
 class Arm(_Message):
-    """Lock the camera for a session. `settings_hash` is sha256 of the canonical JSON of `settings`."""
+    """Request to lock the camera for a session. `settings_hash` is sha256 of the canonical JSON of `settings`."""
 
     TYPE: ClassVar[str] = "arm"
     session: str
@@ -163,7 +163,11 @@ class Arm(_Message):
 
 @dataclass(frozen=True)
 class ArmReply(_Message):
-    """What the node locked. `frame_time_ns` and `frame_period_ns` describe its frame grid, if it has one."""
+    """Answer to `Arm`: whether the camera is locked, and to what.
+
+    `frame_time_ns` and `frame_period_ns` are the time of one frame and the period, ns, of a sensor that takes frames
+    continuously.
+    """
 
     TYPE: ClassVar[str] = "arm-reply"
     node: str
@@ -185,12 +189,15 @@ class ArmReply(_Message):
         _require_table("locked", self.locked)
         _require_table("versions", self.versions)
         if not self.armed and not self.reason:
-            raise WireError("an ArmReply that is not armed must tell the reason")
+            raise WireError("an ArmReply that is not armed must give the reason")
 
 
 @dataclass(frozen=True)
 class Trigger(_Message):
-    """Keep the frame nearest to `key.fire_at_ns`. `scene` counts the captures of this kind, for simulated rigs."""
+    """Request to keep the frame nearest to `key.fire_at_ns`.
+
+    `scene` counts the captures of this kind, for simulated rigs.
+    """
 
     TYPE: ClassVar[str] = "trigger"
     key: CaptureKey
@@ -204,7 +211,7 @@ class Trigger(_Message):
 
 @dataclass(frozen=True)
 class TriggerReply(_Message):
-    """Whether the node will capture: accepted, late (the moment had passed when the trigger came) or not armed."""
+    """Answer to `Trigger`: accepted, late (the moment had passed when it came) or not armed."""
 
     TYPE: ClassVar[str] = "trigger-reply"
     node: str
@@ -219,7 +226,10 @@ class TriggerReply(_Message):
 
 @dataclass(frozen=True)
 class Manifest(_Message):
-    """The truth about one image file. `time_ns` is the measured wall-clock time of the frame."""
+    """Description of one image file: capture, checksum, size, time, metadata.
+
+    `time_ns` is the measured wall-clock time of the frame.
+    """
 
     TYPE: ClassVar[str] = "manifest"
     node: str
@@ -250,7 +260,7 @@ class Manifest(_Message):
 
 @dataclass(frozen=True)
 class Failure(_Message):
-    """A capture that this node was triggered for and has no image of."""
+    """Report of a capture that the node was triggered for and has no image of, with the reason."""
 
     TYPE: ClassVar[str] = "failure"
     node: str
@@ -260,12 +270,12 @@ class Failure(_Message):
     def __post_init__(self) -> None:
         valid_name("node", self.node)
         if not self.reason:
-            raise WireError("a Failure must tell the reason")
+            raise WireError("a Failure must give the reason")
 
 
 @dataclass(frozen=True)
 class Inventory(_Message):
-    """What the node holds: images in its spool, failures it remembers, the capture under way."""
+    """List of what a node holds: images in its spool, failures it remembers, the capture under way."""
 
     TYPE: ClassVar[str] = "inventory"
     node: str
@@ -279,7 +289,7 @@ class Inventory(_Message):
 
 @dataclass(frozen=True)
 class Fetch(_Message):
-    """Send the image of this capture as the answer."""
+    """Request to answer with the image of this capture."""
 
     TYPE: ClassVar[str] = "fetch"
     key: CaptureKey
@@ -287,7 +297,11 @@ class Fetch(_Message):
 
 @dataclass(frozen=True)
 class Ack(_Message):
-    """``archived``: the image with this hash is safe, free it. ``unknown``: no such capture here, stop sending."""
+    """Acknowledgement of an image by the controller.
+
+    ``archived``: the image with this hash is safe, and the node frees it. ``unknown``: the archive has no such capture,
+    and the node stops sending.
+    """
 
     TYPE: ClassVar[str] = "ack"
     node: str
@@ -330,7 +344,7 @@ _TYPES: dict[str, type[Any]] = {
     cls.TYPE: cls
     for cls in (Arm, ArmReply, Trigger, TriggerReply, Manifest, Failure, Inventory, Fetch, Ack, NodeStatus)
 }
-# What a field holds, where JSON alone does not say: nested records and sequences of them.
+# Fields that hold nested records or sequences of them, which JSON alone does not tell from tables.
 _NESTED: dict[tuple[str, str], type[Any]] = {
     ("trigger", "key"): CaptureKey,
     ("trigger-reply", "key"): CaptureKey,

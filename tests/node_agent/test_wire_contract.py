@@ -162,4 +162,4 @@ def test_a_name_is_one_in_messages_where_it_is_one_in_a_session(name):
         except refusal as error:
             return str(error)
 
-    assert verdict(valid_name, WireError) == verdict(session_names.valid_name, InputError)
+    assert verdict(valid_name, WireError) == verdict(session_names.checked_name, InputError)

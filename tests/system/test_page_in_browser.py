@@ -341,7 +341,7 @@ def test_a_dead_node_is_seen_named_and_can_be_left_out(page: Page, station: Stat
     expect(page.locator("#session-select")).to_have_value("without-03", timeout=WAIT)
     station.kill_node("03")
     try:
-        expect(page.locator("[data-node='03']")).to_contain_text("not there", timeout=WAIT)
+        expect(page.locator("[data-node='03']")).to_contain_text("not connected", timeout=WAIT)
         expect(page.locator("#capture-board")).to_be_disabled()
         expect(page.locator("#capture-status")).to_contain_text("Camera 03")
         page.check("#override")
@@ -353,7 +353,7 @@ def test_a_dead_node_is_seen_named_and_can_be_left_out(page: Page, station: Stat
         expect(capture.locator(".camera.failed small")).not_to_be_empty()
     finally:
         station.start_node("03")
-    expect(page.locator("[data-node='03']")).not_to_contain_text("not there", timeout=WAIT)
+    expect(page.locator("[data-node='03']")).not_to_contain_text("not connected", timeout=WAIT)
 
 
 def test_a_name_that_is_taken_is_told_and_the_page_fits_a_narrow_window(page: Page, station: Station) -> None:

@@ -102,7 +102,7 @@ class Catalogue:
             return [dict(row) | self._counts(row["name"]) for row in rows.fetchall()]
 
     def session(self, name: str) -> dict[str, Any]:
-        """The dictionary of one session, with the keys that `sessions` lists."""
+        """One session as a dictionary, with the keys that `sessions` lists."""
         for session in self.sessions():
             if session["name"] == name:
                 return session
@@ -123,7 +123,7 @@ class Catalogue:
             return [json.loads(row["record"]) for row in self._db.execute(query, (name,))]
 
     def capture(self, name: str, capture_id: str) -> dict[str, Any]:
-        """One capture record."""
+        """The record of one capture."""
         query = "select record from captures where session = ? and id = ?"
         with self._lock:
             row = self._db.execute(query, (name, capture_id)).fetchone()
@@ -141,7 +141,10 @@ class Catalogue:
             ]
 
     def live_steps(self, name: str) -> tuple[Path, ...]:
-        """Result folders of the newest steps that were processed at once, oldest first; none for an unknown session."""
+        """Result folders of a session's newest live steps, oldest first; none for an unknown session.
+
+        A live step is a specimen capture that was processed alone as soon as it was archived.
+        """
         try:
             return live_results(self.path(name))
         except KeyError:

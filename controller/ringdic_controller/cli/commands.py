@@ -29,11 +29,13 @@ def demo_command(
     cameras: Annotated[int, typer.Option(min=6, max=30, help="Cameras; neighbours must share a view.")] = 12,
     scale: Annotated[float, typer.Option(min=0.1, max=1.0, help="Size of the images; 1 is 2464 x 3280 px.")] = 0.25,
     steps: Annotated[int, typer.Option(min=1, max=20, help="Deformed steps after the reference.")] = 3,
-    no_serve: Annotated[bool, typer.Option("--no-serve", help="End after the table.")] = False,
+    no_serve: Annotated[
+        bool, typer.Option("--no-serve", help="End after the table, without keeping the page up.")
+    ] = False,
     out: Annotated[Path, typer.Option(help="Folder for everything the demo writes.")] = Path("ringdic-demo"),
     as_json: AsJson = False,
 ) -> None:
-    """Capture, process and show a simulated rig: every node a process, every image over Zenoh."""
+    """Capture with a simulated rig, process and show the results: each node is a process, images go over Zenoh."""
     _need_controller()
     from ringdic_controller.studies.demo import run_demo
 
@@ -63,7 +65,7 @@ def validate_command(
     images_only: Annotated[bool, typer.Option("--images-only", help="Render the images and stop.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """The paper's experiments on the virtual rig, beside the paper's figures."""
+    """Repeat the paper's experiments on the virtual rig and compare with the paper's figures."""
     from ringdic_controller.studies.validate import run_validation
 
     findings = run_validation(out, scale=scale, quick=quick, only=only or (), images_only=images_only)
@@ -72,6 +74,6 @@ def validate_command(
 
 
 def _need_controller() -> None:
-    """Fail at once, rather than in a child process, where the packages of the extra ``controller`` are missing."""
+    """Fail at once, and not only in a child process, if packages of the extra ``controller`` are missing."""
     for package in ("fastapi", "uvicorn"):
         import_module(package)

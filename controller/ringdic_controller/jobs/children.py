@@ -48,7 +48,7 @@ class Warmth:
 
 
 class Work(Protocol):
-    """An order in progress."""
+    """An order that a child process is working on."""
 
     def lines(self) -> Iterator[str]:
         """Lines that the child prints about the order, until the order ends."""
@@ -64,7 +64,10 @@ class Work(Protocol):
 
 
 class Processing(Protocol):
-    """Serves one order at a time. ``on_change`` is called, from any thread, when the warmth has changed."""
+    """Carries out processing orders in child processes, one order at a time.
+
+    ``on_change`` is called, from any thread, when the warmth has changed.
+    """
 
     on_change: Callable[[], None]
 
@@ -87,7 +90,10 @@ class Processing(Protocol):
 
 
 class ChildPerJob:
-    """Processing with a new child for every order; ``command`` gives its command line from the session's folder."""
+    """Processing with a new child process for every order.
+
+    command : gives the child's command line from the session's folder.
+    """
 
     live = False
     warmth = Warmth("cold")
@@ -108,7 +114,7 @@ class ChildPerJob:
 
 
 class WarmChild:
-    """Processing by one child that loads the kernels once and caches what it has read between orders.
+    """Processing by one child process that stays: it loads the kernels once and caches what it has read.
 
     A child that ends, by itself or because its order is cancelled, is replaced at once. One that ends before it was
     ready is replaced only for the next order.
@@ -133,7 +139,7 @@ class WarmChild:
 
     @property
     def warmth(self) -> Warmth:
-        """How ready the child is; cold before the first."""
+        """How ready the child is; cold before there is one."""
         child = self._child
         return Warmth("cold") if child is None else child.warmth
 

@@ -119,7 +119,7 @@ class Jobs:
 
     @property
     def processing(self) -> Processing:
-        """What runs the jobs."""
+        """The child processes that run the jobs."""
         return self._processing
 
     def list(self) -> list[Job]:
@@ -155,8 +155,8 @@ class Jobs:
     ) -> Job:
         """Queue a job and return it.
 
-        The job supersedes a queued automatic job of this session that also is of a step, or also of the whole
-        session. A step's finished job is deleted when the session's next step is queued.
+        A step's job supersedes queued automatic jobs of steps of this session, and a job of the whole session
+        supersedes those of the whole session. A step's finished job is deleted when the session's next step is queued.
 
         Parameters
         ----------

@@ -140,7 +140,7 @@ class SendArm:
 
 @dataclass(frozen=True)
 class OpenCapture:
-    """Create the capture's record and answer with CaptureOpened; `unarmed` says, by camera, why it takes no part."""
+    """Create the capture's record; CaptureOpened follows. unarmed : by camera, why it takes no part."""
 
     fire_at_ns: int
     unarmed: dict[str, str]
@@ -178,7 +178,7 @@ class NoteOutcome:
 
 @dataclass(frozen=True)
 class RefuseRound:
-    """End the round without a capture; `reasons` says, by camera, why it is not armed."""
+    """End the round without a capture. reasons : by camera, why it is not armed."""
 
     reasons: dict[str, str]
 

@@ -89,7 +89,7 @@ class Intake:
             return self._waiting_bytes + size <= self._limit
 
     def holds(self, manifest: Manifest) -> bool:
-        """Whether the image waits in the queue already: it came again, or was pulled while it was being pushed."""
+        """Whether the image waits in the queue already, because it was sent twice, or pulled while it was pushed."""
         with self._lock:
             return _image(manifest) in self._waiting
 
@@ -162,7 +162,7 @@ class Intake:
         return record.state == "closed"
 
     def note_failure(self, failure: Failure) -> None:
-        """Record why a node says it took no image, in place of the general reason in a closed capture's record."""
+        """Replace the general reason of a failed camera in a closed capture's record by the one that its node gives."""
         capture = self._archive.capture(failure.key.session, failure.key.capture_id)
         if capture is None:
             return
@@ -176,7 +176,7 @@ class Intake:
 
 
 def description_of(manifest: Manifest) -> ImageDescription:
-    """What a node tells of an image, as the session's record keeps it."""
+    """The part of a node's manifest that the session's record keeps: checksum, size, time, exposure, metadata."""
     return ImageDescription(
         manifest.sha256,
         manifest.width,

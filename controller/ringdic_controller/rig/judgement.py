@@ -10,7 +10,7 @@ from ringdic_node.wire import Manifest
 
 @dataclass(frozen=True)
 class Judgement:
-    """Decision about an image: ``verdict`` archive, repeat (it is archived), unknown (no such capture) or corrupt."""
+    """Decision about an image: ``verdict`` archive, repeat (archived before), unknown (no such capture) or corrupt."""
 
     verdict: str
     reason: str = ""

@@ -1,4 +1,4 @@
-"""Loop that performs a capture round: the state machine decides; this asks nodes, writes the record and reports."""
+"""Loop that performs a capture round: it does what the state machine decides, with nodes, record and events."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HEARTBEAT = 0.02
 
 
 class CaptureRefusedError(ComputationError):
-    """No camera was fired, because cameras are not armed; ``reasons`` says why, by camera."""
+    """No image was taken, because cameras are not armed. reasons : by camera, why it is not armed."""
 
     def __init__(self, reasons: dict[str, str]) -> None:
         self.reasons = reasons
@@ -32,7 +32,7 @@ class CaptureRefusedError(ComputationError):
 
 
 class NodeQueries(Protocol):
-    """Questions to the nodes that a round needs: `ringdic_controller.rig.link.RigLink` puts them."""
+    """What a round asks of the nodes; `ringdic_controller.rig.link.RigLink` does it over the network."""
 
     def ask(
         self, camera: str, question: Arm | Trigger | None, on_answer: Callable[[Any], None], timeout: float

@@ -24,7 +24,7 @@ _NO_PAGE = (
 
 
 def create_app(desk: Desk, static: Path = STATIC) -> FastAPI:
-    """The application that serves a desk and the bundled page.
+    """Create the web application that serves a desk over HTTP, and the bundled page.
 
     Parameters
     ----------
@@ -38,11 +38,11 @@ def create_app(desk: Desk, static: Path = STATIC) -> FastAPI:
         version="1",
         description="Captures, sessions, processing jobs and results of a ring of cameras. "
         "Everything the page can do, a script can do.",
-        docs_url=None,  # their viewers are loaded from another host; the running system needs none
+        docs_url=None,  # the viewers of both would be loaded from another host, and the running system needs no network
         redoc_url=None,
     )
     app.state.desk = desk
-    api = APIRouter(prefix="/api/v1", responses={404: {"description": "Not there"}, 409: {"description": "Refused"}})
+    api = APIRouter(prefix="/api/v1", responses={404: {"description": "Not found"}, 409: {"description": "Refused"}})
     for resource in (rig, sessions, captures, jobs, results, live_step, events):
         api.include_router(resource.router)
     app.include_router(api)
@@ -52,7 +52,7 @@ def create_app(desk: Desk, static: Path = STATIC) -> FastAPI:
 
 
 def _answer_errors(app: FastAPI) -> None:
-    """Answer every failure that a client can mend with a status and one sentence."""
+    """Answer every error that a client can correct with a status and one sentence."""
 
     def answer(status: int, sentence: str) -> JSONResponse:
         return JSONResponse({"detail": sentence}, status)

@@ -5,7 +5,7 @@
     archive = "archive"              # folder of the sessions; relative to this file
     rig = "rig.toml"                 # the rig whose nodes are expected; without it the controller only shows
     settings = "settings.toml"       # settings of the processing
-    live = true                      # each step of the specimen is processed at once, and shown
+    live = true                      # each step is processed as soon as it is archived, and shown
 
     [http]
     host = "127.0.0.1"               # the page has no password: another address opens it to that network
@@ -55,9 +55,9 @@ Endpoint = Annotated[str, AfterValidator(_tcp_endpoint)]
 class ControllerConfig:
     """Configuration of the controller.
 
-    archive : folder of the sessions. rig : the rig file; None where the controller only shows. settings : file of the
-    processing's settings. live : whether each step is processed at once. host, port : of the page. endpoint : where
-    the nodes connect.
+    archive : folder of the sessions. rig : the rig file; None for a controller that only shows sessions. settings :
+    settings file of the processing. live : whether each step is processed as soon as it is archived. host, port : of
+    the page. endpoint : where the nodes connect.
     """
 
     archive: Path = Path("ringdic-archive")

@@ -1,4 +1,4 @@
-"""The operator's desk: the parts that answer everything asked of the controller, joined, without HTTP.
+"""The operator's desk: all that the controller does for an operator, joined in one object, without HTTP.
 
 Locks. Each part has at most one, private to it, and they are taken in two storeys only::
 
@@ -87,7 +87,7 @@ class Desk:
         self._watcher.start()
 
     def connect(self, archive: SessionArchive | None, nodes: CameraNodes | None) -> None:
-        """Use this archive and these nodes from now on."""
+        """Add the archive's writer and the nodes, so that sessions can be created and captured."""
         self.sessions.archive, self.roster.nodes = archive, nodes
         if nodes is not None:
             self.jobs.processing.warm()
@@ -100,7 +100,7 @@ class Desk:
         self._watcher.join(5)
 
     def create_session(self, name: str | None = None) -> dict[str, Any]:
-        """Create a session, named by the time if no name is given, and select it; its summary.
+        """Create a session, named by the time if no name is given, and select it; returns its summary.
 
         Raises RefusedError if the name is taken, the controller has no rig or a capture is under way; InputError if
         the name is unusable.
@@ -109,7 +109,7 @@ class Desk:
         return self.select_session(self.sessions.create(name))
 
     def select_session(self, name: str) -> dict[str, Any]:
-        """Send captures to this session from now on; its summary.
+        """Send captures to this session from now on; returns its summary.
 
         Raises NotFoundError if there is no such session, RefusedError while a capture is under way in another.
         """

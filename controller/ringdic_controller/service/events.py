@@ -46,7 +46,7 @@ class EventStream:
             follower.offer(event)
 
     async def follow(self) -> AsyncIterator[Event]:
-        """The snapshot, then events as they come, without end."""
+        """Names and contents of the events for one follower: a snapshot first, then each event, without end."""
         follower = _Follower(asyncio.get_running_loop())
         with self._lock:
             self._followers.add(follower)

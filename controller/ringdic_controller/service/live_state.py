@@ -21,7 +21,7 @@ _SHOWN_JOBS = 20
 
 
 class LiveState:
-    """Reads the state of all parts and publishes it to whoever follows `events`.
+    """Reads the state of all parts and publishes it to the followers of `events`.
 
     Every event holds the state as it is when the event is published, never the state that somebody read before: so
     several threads may announce changes at a time, and no older state is published after a newer one.
@@ -83,7 +83,7 @@ class LiveState:
         self._publish("round", lambda: asdict(self._rounds.get(round_id)))
 
     def publish_capture(self, session: str, capture_id: str) -> None:
-        """Publish a capture's record, read from its folder; nothing if there is no folder yet."""
+        """Publish a capture's record, read from its folder; do nothing if there is no folder yet."""
 
         def read() -> dict[str, Any] | None:
             record = self._catalogue.refresh_capture(session, capture_id)
@@ -92,7 +92,7 @@ class LiveState:
         self._publish("capture", read)
 
     def publish_job(self, job: Job) -> None:
-        """Publish a job, and before it the results that it has written; to be called in the order of the changes."""
+        """Publish a job and, before it, the results that it has written. Must be called in the order of the changes."""
         if job.state == "done" and job.step is not None:
             self._publish("newest", lambda: self._sessions.newest_step(job.session) or {})
         elif job.state == "done":

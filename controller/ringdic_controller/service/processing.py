@@ -1,4 +1,4 @@
-"""Processing of sessions: by itself after a capture of the specimen, and when the operator asks for it."""
+"""Processing of sessions: automatic after a capture of the specimen, or when the operator asks for it."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class SessionProcessing:
     jobs
         The queue.
     live
-        Whether each specimen capture is also processed alone, at once, where the processing can do that.
+        Whether each specimen capture is also processed alone as soon as it is archived, if the processing can do that.
     quiet
-        Seconds without a capture after which the whole session is processed, if its steps are processed at once.
+        Seconds without a capture after which the whole session is processed, if steps are processed alone.
     """
 
     def __init__(self, sessions: Sessions, catalogue: Catalogue, jobs: Jobs, live: bool, quiet: float) -> None:
@@ -44,9 +44,9 @@ class SessionProcessing:
         return self._jobs.submit(session, self._catalogue.path(session), reason="asked for")
 
     def submit_step(self, session: str, capture_id: str) -> None:
-        """Queue what follows a specimen capture: its step alone, at once, and the whole session, when none follows.
+        """Queue the processing that follows a specimen capture: of its step at once, of the session after a pause.
 
-        The reference capture is processed alone, too: all that the steps are compared with is then computed and cached.
+        The reference capture is processed alone, too, so that what the later steps are compared with is cached.
         """
         path, after = self._catalogue.path(session), 0.0
         if self._live and not self._uncalibrated(session):

@@ -1,4 +1,4 @@
-"""Why a request is not carried out: one sentence for the operator, and nothing has changed."""
+"""Errors for requests that are refused: each has one sentence for the operator, and nothing was changed."""
 
 
 class RefusedError(Exception):

@@ -83,7 +83,7 @@ class Rounds:
             return self._running()
 
     def refusal(self) -> str | None:
-        """Why a capture would be refused now, in a sentence; None if it would not."""
+        """One sentence that says why no capture can begin now; None if one can."""
         if self._roster.nodes is None or self._roster.rig is None:
             return "The controller runs without a rig: it shows sessions but cannot capture."
         if self.running() is not None:
@@ -111,8 +111,11 @@ class Rounds:
             raise RefusedError(refusal)
         missing = self._roster.missing()
         if missing and not override:
-            verb = "is" if len(missing) == 1 else "are"
-            raise RefusedError(f"Camera {', '.join(missing)} {verb} not there; start the node, or capture without it.")
+            raise RefusedError(
+                f"Camera {missing[0]} is not connected; start its node, or capture without it."
+                if len(missing) == 1
+                else f"Cameras {', '.join(missing)} are not connected; start their nodes, or capture without them."
+            )
         session = self._sessions.current()
         assert session is not None
         with self._lock:

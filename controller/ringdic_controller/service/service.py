@@ -34,7 +34,7 @@ SHUTDOWN_LIMIT = 2  # seconds; an open event stream would keep the server alive 
 def open_desk(
     config: ControllerConfig, processing: Command | Processing | None = None, timing: Timing | None = None
 ) -> Iterator[Desk]:
-    """Open the desk with all it needs: archive, jobs and, if the configuration names a rig, the link to its nodes.
+    """Open the desk with archive, jobs and, if the configuration names a rig, the link to its nodes.
 
     Parameters
     ----------
@@ -106,9 +106,9 @@ def free_endpoint(config: ControllerConfig) -> ControllerConfig:
 
 @contextmanager
 def _ended_by_signal(server: uvicorn.Server) -> Iterator[None]:
-    """Let SIGINT and SIGTERM end the server and nothing more, so that what was opened is closed in order.
+    """Let SIGINT and SIGTERM end only the server, so that archive, jobs and link are then closed in order.
 
-    The server raises the signals that it caught again when it has ended; they must not end the process then.
+    When it has ended, the server raises the signals again that it caught; they must not end the process then.
     """
     if current_thread() is not main_thread():
         yield

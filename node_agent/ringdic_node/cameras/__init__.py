@@ -1,1 +1,1 @@
-"""Cameras behind one small protocol: the Pi's, the simulated rig's, and a plain test pattern."""
+"""Cameras with one small protocol: the Pi's, the simulated rig's, a test pattern, and images from files."""

@@ -1,4 +1,4 @@
-"""What every camera of a node can do, and what a frame is.
+"""The protocol of a node's cameras, and the frames that they deliver.
 
 A camera is locked to settings before it captures, so that all frames of a session have the same exposure.
 """
@@ -16,12 +16,15 @@ SETTINGS = ("exposure_us", "gain", "colour_gains", "period_us", "tolerance_us")
 
 
 class CameraError(RuntimeError):
-    """The camera cannot do what was asked; the text tells what and why."""
+    """The camera cannot do what was asked; the text says what and why."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """Which frame is wanted: the one nearest to `fire_at_ns`; kind and scene steer a simulated rig."""
+    """A request for the frame nearest to the moment `fire_at_ns`, ns since the Unix epoch.
+
+    kind : of the capture. scene : number of captures of this kind before. Simulated cameras choose their scene by both.
+    """
 
     fire_at_ns: int
     kind: str
@@ -30,7 +33,11 @@ class Shot:
 
 @dataclass(frozen=True)
 class Lock:
-    """What the camera holds after locking: metadata of its frames, sync state, frame grid if it runs freely."""
+    """State of a camera whose exposure and gains are locked.
+
+    metadata : of its frames. sync : state of the sensors' synchronisation. frame_time_ns, frame_period_ns : time of one
+    frame, and the period, ns, of a sensor that takes frames continuously; None for a camera that exposes on demand.
+    """
 
     metadata: dict[str, Any] = field(default_factory=dict)
     sync: str = "none"
@@ -40,7 +47,7 @@ class Lock:
 
 @dataclass(frozen=True)
 class Frame:
-    """One image.
+    """One image of one camera, with its measured time.
 
     Attributes
     ----------
@@ -84,7 +91,10 @@ class NodeCamera(Protocol):
     """A source of frames. Used from one thread."""
 
     def lock(self, settings: Mapping[str, Any]) -> Lock:
-        """Hold these settings; return when consecutive frames show them. Raises CameraError."""
+        """Set exposure, gains and frame period and hold them; return when consecutive frames show them.
+
+        settings : values by the names in `SETTINGS`. Raises CameraError.
+        """
         ...
 
     def capture(self, shot: Shot) -> Frame:
@@ -92,7 +102,7 @@ class NodeCamera(Protocol):
         ...
 
     def versions(self) -> dict[str, str]:
-        """Names and versions of what the camera runs on."""
+        """Model of the camera and versions of its software, by name."""
         ...
 
     def close(self) -> None:
@@ -100,7 +110,7 @@ class NodeCamera(Protocol):
 
 
 def check_settings(settings: Mapping[str, Any]) -> None:
-    """Refuse settings that no camera knows, by name."""
+    """Raise CameraError for a setting whose name is unknown or whose value is impossible."""
     for name, value in settings.items():
         if name not in SETTINGS:
             raise CameraError(f"unknown camera setting '{name}'; known are {', '.join(SETTINGS)}")

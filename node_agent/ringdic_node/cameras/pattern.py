@@ -14,7 +14,7 @@ from ringdic_node.clock import Clock, sleep_until
 
 
 class PatternCamera:
-    """Every pixel follows from camera, kind, scene and position, so a receiver can recompute the image.
+    """A camera whose images are computed from camera id, kind and scene, so that a receiver can compute them too.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class PatternCamera:
         self._random = np.random.default_rng([seed, zlib.crc32(camera.encode())])
 
     def lock(self, settings: Mapping[str, Any]) -> Lock:
-        """Check the settings and take them; the pattern does not depend on them."""
+        """Check the settings and note the exposure; the pattern does not depend on them."""
         check_settings(settings)
         self._exposure_us = float(settings.get("exposure_us", self._exposure_us))
         return Lock(metadata=dict(settings), sync="simulated")
@@ -59,11 +59,11 @@ class PatternCamera:
         return Frame(pattern(self.camera, shot.kind, shot.scene, *self._size), time_ns, self._exposure_us)
 
     def versions(self) -> dict[str, str]:
-        """Names and versions of what the images come from."""
+        """Name of this kind of camera."""
         return {"camera": "pattern"}
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing: this camera holds nothing open."""
 
 
 def pattern(camera: str, kind: str, scene: int, width: int, height: int) -> npt.NDArray[np.uint8]:

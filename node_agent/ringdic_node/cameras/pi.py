@@ -1,4 +1,4 @@
-"""The Raspberry Pi camera through picamera2, the only place that knows it.
+"""The Raspberry Pi camera through picamera2; no other module imports picamera2.
 
 The sensor runs freely in one still configuration for the whole session. Every completed request passes a
 callback, which keeps the one whose measured time is nearest to the moment asked for: waiting until the moment
@@ -54,9 +54,9 @@ class PiCamera:
     sync : str
         ``off``, ``server`` or ``client`` of libcamera's software synchronisation.
     tuning : str
-        A tuning file, for instance with a multicast group of the rig's own; empty: the module's own file.
+        A libcamera tuning file, for instance with a multicast group of the rig's own; empty: the module's default.
     period_us : float
-        Frame period unless the settings say otherwise; below the mode's highest rate.
+        Frame period unless the settings say otherwise; it must not be shorter than the sensor mode allows.
     settle_frames : int
         Consecutive frames that must show the locked values before the camera counts as locked.
     """
@@ -111,7 +111,7 @@ class PiCamera:
         self._camera.configure(configuration)
         self._camera.pre_callback = self._receive
 
-    # Called by picamera2 for every completed request, under the camera's lock: keep or drop, no more
+    # picamera2 calls `_receive` for every completed request, under the camera's lock: keep or drop it, no more
 
     def _receive(self, request: Any) -> None:
         metadata = request.get_metadata()
@@ -145,14 +145,17 @@ class PiCamera:
     # The camera's protocol
 
     def lock(self, settings: Mapping[str, Any]) -> Lock:
-        """Set and hold exposure, gains and frame period; see `Camera.lock`. Values not given are frozen as found."""
+        """Set and hold exposure, gains and frame period, as `NodeCamera.lock` describes.
+
+        Values that are not given are found by the automatics and then held.
+        """
         check_settings(settings)
         self._period_us = float(settings.get("period_us", self._period_us))
         self._wanted = self._controls(settings)
         if not self._camera.started:
             self._start()
         metadata = self._hold()
-        # What the automatics had found becomes the fixed value, and must be seen in the frames like any other.
+        # The values that the automatics found become fixed ones, and the frames must show them like any other.
         frozen = {name: metadata[name] for name in FROZEN if name not in self._wanted and name in metadata}
         if frozen:
             self._wanted.update(frozen, AwbEnable=False)
@@ -208,7 +211,7 @@ class PiCamera:
         return controls
 
     def capture(self, shot: Shot) -> Frame:
-        """The frame nearest to the moment; see `Camera.capture`."""
+        """The frame nearest to the shot's moment, as `NodeCamera.capture` describes; restarts a stream that stopped."""
         period_s = self._period_us / 1e6
         wait = max((shot.fire_at_ns - self._clock.now().wall_ns) / 1e9, 0.0) + FRAMES_AFTER * period_s + 1.0
         with self._frames:
@@ -250,7 +253,7 @@ class PiCamera:
             raise CameraError(f"the camera cannot be restarted: {error}") from error
 
     def versions(self) -> dict[str, str]:
-        """Versions of picamera2, of libcamera and of the sensor as far as they are known."""
+        """Model of the sensor and version of picamera2."""
         model = self._camera.camera_properties.get("Model", "unknown")
         return {"camera": f"pi {model}", "picamera2": self._version}
 
@@ -261,7 +264,10 @@ class PiCamera:
 
 
 def frame_time(metadata: Mapping[str, Any], clock: Clock) -> int:
-    """Wall-clock time of a frame, ns: the stamp of libcamera, or the sensor's on the boot clock carried over."""
+    """Wall-clock time of a frame, ns since the Unix epoch, from libcamera's metadata.
+
+    Without ``FrameWallClock`` it is ``SensorTimestamp``, on the boot clock, plus the present offset of the two clocks.
+    """
     stamp = metadata.get("FrameWallClock")
     if stamp:
         return int(stamp)
@@ -270,7 +276,7 @@ def frame_time(metadata: Mapping[str, Any], clock: Clock) -> int:
 
 
 def recorded(metadata: Mapping[str, Any]) -> dict[str, Any]:
-    """The metadata worth archiving, in a form that JSON can hold."""
+    """The part of a frame's metadata that is archived (`RECORDED`), as JSON values."""
     return {name: _plain(metadata[name]) for name in RECORDED if name in metadata}
 
 

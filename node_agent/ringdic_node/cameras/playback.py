@@ -1,4 +1,4 @@
-"""A camera that delivers images from files: real bytes at full size, and nothing to compute."""
+"""A camera that delivers images from files: images of full size without a sensor or a renderer."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _HEADER = re.compile(rb"P5\s+(\d+)\s+(\d+)\s+(\d+)\s")
 
 
 class PlaybackCamera:
-    """Every frame is the image of the file, read once; or each capture has a file of its own.
+    """A camera whose frames are one image file, or a file for each capture.
 
     Parameters
     ----------
     image : str
-        A binary PGM file (P5, no comments), 8 or 16 bit. Raises CameraError if it is none. With ``{kind}`` and
-        ``{scene}`` in its name, the capture's kind and how many of that kind came before it are put in their places.
+        A binary PGM file (P5, no comments), 8 or 16 bit; CameraError is raised for any other. ``{kind}`` and
+        ``{scene}`` in its name are replaced by the capture's kind and by the number of captures of that kind before.
     """
 
     def __init__(self, clock: Clock, *, image: str = "") -> None:
@@ -32,12 +32,12 @@ class PlaybackCamera:
         self._pixels = None if "{" in image else read_pgm(Path(image))
 
     def lock(self, settings: Mapping[str, Any]) -> Lock:
-        """Check the settings and take them; the files are as they are."""
+        """Check the settings; they do not change the images."""
         check_settings(settings)
         return Lock(metadata=dict(settings), sync="simulated")
 
     def capture(self, shot: Shot) -> Frame:
-        """The next file of this kind, at the moment of the shot. Raises CameraError when there is none."""
+        """The image for this shot, returned at its moment. Raises CameraError if its file cannot be read."""
         pixels = self._pixels
         if pixels is None:
             pixels = read_pgm(Path(self._image.replace("{kind}", shot.kind).replace("{scene}", str(shot.scene))))
@@ -45,15 +45,15 @@ class PlaybackCamera:
         return Frame(pixels, shot.fire_at_ns)
 
     def versions(self) -> dict[str, str]:
-        """Names and versions of what the images come from."""
+        """Name of this kind of camera."""
         return {"camera": "playback"}
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing: this camera holds nothing open."""
 
 
 def read_pgm(path: Path) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
-    """The pixels (height, width) of a binary PGM file without comments. Raises CameraError."""
+    """Grey levels (height, width) of a binary PGM file without comments. Raises CameraError."""
     try:
         content = path.read_bytes()
     except OSError as error:

@@ -1,7 +1,7 @@
 """A camera of the simulated rig: it renders what the real one would see at the planned moment.
 
-A node shows itself to the controller only after its camera is built, and the camera warms its renderer up first:
-whoever is alive renders at full speed.
+Building the camera compiles or loads its renderer. A node appears to the controller only after its camera is built, so
+a node that is alive renders at full speed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ringdic_node.clock import Clock, sleep_until
 
 
 class VirtualNodeCamera:
-    """One camera of the rig with the paper's geometry. Importing the renderer needs the extra `virtual`.
+    """One camera of the simulated ring of the paper. Needs the extra ``virtual``, which has the renderer's packages.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class VirtualNodeCamera:
     specimen : str
         ``limb`` or ``cylinder``.
     jitter_us, offset_us : float
-        Standard deviation of a frame's time, and of this camera's constant delay, about the moment; µs.
+        Standard deviations of each frame's time and of this camera's constant delay, about the planned moment, µs.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class VirtualNodeCamera:
         self._exposure_us = 5000.0
 
     def lock(self, settings: Mapping[str, Any]) -> Lock:
-        """Check the settings; they decide when the frame of a shot is taken."""
+        """Check the settings and note the exposure; the rendered brightness does not depend on them."""
         check_settings(settings)
         self._exposure_us = float(settings.get("exposure_us", self._exposure_us))
         return Lock(metadata={"ExposureTime": self._exposure_us, **settings}, sync="simulated")
@@ -78,10 +78,10 @@ class VirtualNodeCamera:
         from ringdic_node.virtual_rig.render import render
         from ringdic_node.virtual_rig.scenes import scene
 
-        seen = scene(shot.kind, shot.scene, specimen=self._specimen, seed=self._seed)
+        current_scene = scene(shot.kind, shot.scene, specimen=self._specimen, seed=self._seed)
         noise = zlib.crc32(f"{self._seed}/{self.camera}/{shot.kind}/{shot.scene}".encode())
         sleep_until(self._clock, shot.fire_at_ns)
-        pixels = render(self._lens, seen, noise)
+        pixels = render(self._lens, current_scene, noise)
         delay_us = self._offset_us + self._random.normal(0.0, self._jitter_us)
         return Frame(
             pixels=pixels,
@@ -91,8 +91,8 @@ class VirtualNodeCamera:
         )
 
     def versions(self) -> dict[str, str]:
-        """Names and versions of what the images come from."""
+        """Name of this kind of camera."""
         return {"camera": "virtual"}
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing: this camera holds nothing open."""

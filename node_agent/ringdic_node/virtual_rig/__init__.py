@@ -1,4 +1,4 @@
-"""A ring of cameras about a body whose every motion is known: rendered images with exact truth.
+"""Simulated ring of cameras about bodies of known shape and motion: rendered images with exact truth.
 
 The renderer is an independent check of the processing and shares no camera mathematics with it. Conventions are the
 same: mm, z up the axis of the target, pixel (0, 0) at the centre of the top-left pixel, cameras look along +z.

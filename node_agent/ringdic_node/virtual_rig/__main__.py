@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return its exit code."""
+    """Run ``python -m ringdic_node.virtual_rig`` with its command-line arguments; return the exit code."""
     options = _parser().parse_args(arguments)
     try:
         from ringdic_node.virtual_rig.folder import Measurement, write_folder

@@ -9,7 +9,7 @@ Floats = NDArray[np.float64]
 """Numbers, positions and vectors."""
 
 Mask = NDArray[np.bool_]
-"""Which pixels or points are meant."""
+"""One truth value for each pixel or point."""
 
 Radiance = NDArray[np.float32]
 """Light that reaches a pixel, (height, width), 1 for a white surface that faces the lamps."""

@@ -1,7 +1,7 @@
 """The surfaces of the bodies as smooth maps from material coordinates (theta, z) to space, with their derivatives.
 
-A body is an array of parameters: ``[kind, radius, x, y, z, q]`` with kind 0 a cylinder displaced by (x, y, z) and
-kind 1 the limb at load q. Material coordinates are those of the reference: the angle in rad, the height in mm.
+A body p is an array of parameters, ``[kind, radius, x, y, z, q]``: kind 0 is a cylinder displaced by (x, y, z), kind 1
+the limb at load q. Material coordinates are those of the reference: the angle in rad, the height in mm.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ MIDDLE = 125.0  # mm, half the height of the body
 _BULGE, _TWIST, _STRETCH, _WAVE, _BEND = 0.10, 0.10, 0.05, 3.0, 5.0
 _BULGE_Z, _BULGE_WIDTH = 140.0, 70.0  # mm
 _SPAN = 8.0  # mm along a ray over which its clearance from the limb is like a parabola
-_FAR = 8.0  # mm clear of the section nearest to the axis: more than the surface's slopes make up for along a ray
+_FAR = 8.0  # mm of clearance where the ray is nearest to the axis, beyond which it cannot meet the sloping surface
 _BEND_X, _BEND_Y = math.cos(0.7), math.sin(0.7)
 
 
@@ -74,10 +74,10 @@ def body_point(theta, z, p):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def approach(o, d, p):  # type: ignore[no-untyped-def]
-    """How near a ray o + t d comes to the limb p: clearance, and theta, z, t near where it first meets the surface.
+    """Least clearance of the ray o + t d from the limb p, and an estimate of theta, z, t where it meets the surface.
 
-    The clearance (mm, negative inside) is the radius less the section's radius at the same angle and height, where
-    that is least along the ray.
+    The clearance (mm, negative inside) is a ray point's distance from the limb's axis less the limb's radius at the
+    same angle and height. It and the place of first contact come from a parabola along the ray.
     """
     speed = math.sqrt(d[0] * d[0] + d[1] * d[1])
     t = -(o[0] * d[0] + o[1] * d[1]) / (speed * speed)
@@ -101,14 +101,14 @@ def approach(o, d, p):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _clearance(o, d, t, p):  # type: ignore[no-untyped-def]
-    """Radius of a point of the ray about the limb's axis less that of the surface at its angle and height."""
+    """Distance of the ray's point at t from the limb's axis less the limb's radius there, mm."""
     theta, z, rho = _section(o, d, t, p)
     return rho - _radius(theta, z, p[5])
 
 
 @nb.njit(cache=True, nogil=True)
 def _section(o, d, t, p):  # type: ignore[no-untyped-def]
-    """theta, z of the section on which a point of the ray lies, and its distance from the axis."""
+    """theta and z of the limb's cross-section at the ray's point at t, and that point's distance from the axis, mm."""
     q = p[5]
     z = _height_before(o[2] + t * d[2], q)
     zeta = (z - MIDDLE) / MIDDLE
@@ -119,7 +119,7 @@ def _section(o, d, t, p):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _height_before(height, q):  # type: ignore[no-untyped-def]
-    """The reference height z that load q moves to this height, mm."""
+    """Reference height z of the cross-section that load q lifts to ``height``, mm."""
     z = MIDDLE + (height - MIDDLE) / (1.0 + _STRETCH * q)
     for _ in range(2):
         zeta = (z - MIDDLE) / MIDDLE
@@ -130,14 +130,14 @@ def _height_before(height, q):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _radius(theta, z, q):  # type: ignore[no-untyped-def]
-    """Radius of the limb's section at load q."""
+    """Radius of the limb's cross-section at load q, mm."""
     w = (z - _BULGE_Z) / _BULGE_WIDTH
     return _profile(theta, z)[0] * (1.0 + _BULGE * q * math.exp(-w * w) * (1.0 + 0.3 * math.cos(theta - 2.0)))
 
 
 @nb.njit(cache=True, nogil=True)
 def points(theta, z, p, out):  # type: ignore[no-untyped-def]
-    """Positions and derivatives, as `body_point` gives them, of points theta, z (n,) of the body p: out (n, 9)."""
+    """Positions and derivatives of points theta, z (n,) of the body p, in the order of `body_point`: out (n, 9)."""
     for i in range(len(theta)):
         out[i] = body_point(theta[i], z[i], p)
 

@@ -16,7 +16,7 @@ from ringdic_node.virtual_rig.scenes import scene
 
 @dataclass(frozen=True)
 class Measurement:
-    """What every camera takes images of.
+    """The images that each camera takes in a rendered measurement: how many of each kind, and of which specimen.
 
     boards : views of the checkerboard. steps : deformed steps after the reference. at_rest : further images of the
     undeformed specimen. specimen : "limb" or "cylinder". seed : of the speckles, the board's poses and the noise.
@@ -29,7 +29,7 @@ class Measurement:
     seed: int = 0
 
     def images(self, camera: str) -> Iterator[tuple[str, str, int]]:
-        """Path of each image of a camera within the folder, its capture kind, and the number of its scene."""
+        """List the images of one camera: path within the folder, capture kind, number of the scene."""
         for view in range(self.boards):
             yield f"board/{camera}/{view:02d}.pgm", "board", view
         yield f"target/{camera}.pgm", "target", 0
@@ -39,7 +39,7 @@ class Measurement:
             yield f"static/{camera}/{view:02d}.pgm", "static", view
 
     def image(self, camera: VirtualCamera, kind: str, number: int) -> Frame:
-        """The rendered frame of one scene, with sensor noise of its own."""
+        """Render the image of scene ``number`` of a capture kind by a camera, with noise of its own seed."""
         noise = zlib.crc32(f"{self.seed}/{camera.id}/{kind}/{number}".encode())
         pixels = render(camera, scene(kind, number, specimen=self.specimen, seed=self.seed), noise)
         return Frame(pixels=pixels, time_ns=0)

@@ -13,7 +13,10 @@ from ringdic_node.virtual_rig.arrays import Floats
 
 @nb.njit(cache=True, nogil=True)
 def distort(x, y, lens):  # type: ignore[no-untyped-def]
-    """Distorted normalised coordinates of ideal ones x, y; lens = fx fy s cx cy k1 k2 p1 p2 k3."""
+    """Brown's distortion: distorted normalised coordinates of the ideal ones x, y.
+
+    lens : fx fy s cx cy k1 k2 p1 p2 k3.
+    """
     k1, k2, p1, p2, k3 = lens[5], lens[6], lens[7], lens[8], lens[9]
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -25,7 +28,7 @@ def distort(x, y, lens):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def ideal_of_pixel(u, v, lens, x, y):  # type: ignore[no-untyped-def]
-    """Ideal normalised coordinates of the pixel (u, v), and their derivatives by the pixel, by Newton's method.
+    """Undistorted normalised coordinates of the pixel (u, v) and their derivatives by u and v, by Newton's method.
 
     lens : fx fy s cx cy k1 k2 p1 p2 k3. x, y : start of the iteration. Returns x, y, dx/du, dx/dv, dy/du, dy/dv.
     """
@@ -53,7 +56,7 @@ def ideal_of_pixel(u, v, lens, x, y):  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True)
 class VirtualCamera:
-    """A camera of the simulated rig.
+    """A camera of the simulated rig: pose, intrinsics and distortion.
 
     azimuth_deg : nominal, as a person would note it. K : (3, 3) px with skew. distortion : k1 k2 p1 p2 k3.
     R, t : world to camera, mm. width, height : px.

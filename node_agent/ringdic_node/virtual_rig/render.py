@@ -1,4 +1,4 @@
-"""Images of the scenes by ray tracing: for each sample of a pixel, the surface its ray meets and its brightness.
+"""Images of the scenes by ray tracing: each sample of a pixel has the brightness of the surface that its ray meets.
 
 The printed pattern is averaged over the sample's footprint on the surface. A pixel whose footprint on a speckled body
 is small takes one sample, any other the mean of ``SAMPLES``² samples on a grid. Radiance is linear; 1 saturates.
@@ -27,11 +27,11 @@ from ringdic_node.virtual_rig.sensor import POINT_SPREAD, blurred, expose
 from ringdic_node.virtual_rig.texture import RADIUS, checker, covered, dots, speckle
 
 SAMPLES = 2
-# mm of the surface: with a footprint no larger one sample will do. Subsets of 41 px then lie off by less than 0.0001 px
-# on the mean and 0.0007 px each, a fifth of what the sensor's noise makes.
+# mm on the surface: a pixel with a footprint no larger takes one sample. The error of a subset of 41 px is then less
+# than 0.0001 px in the mean and 0.0007 px for each, a fifth of what the sensor's noise makes.
 FINE = 0.2
-# A compiled kernel is kept on disk under this stamp too, so it is rebuilt when any file of the renderer changes
-# (the compiler itself looks at this file alone).
+# The key under which compiled kernels are kept on disk includes this stamp, so they are rebuilt when any file of the
+# renderer changes (numba itself looks at this file alone).
 STAMP = zlib.crc32(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.rglob("*.py"))))
 _WHITE, _BLACK, _SKIN, _BASE = 0.80, 0.05, 0.30, 0.03  # reflectance times exposure
 _TARGET_TOP, _BASE_RADIUS, _BASE_BOTTOM = 250.0, 66.0, -35.0  # mm
@@ -53,7 +53,7 @@ def load_renderer(specimen: str = "limb") -> None:
 
 
 def radiance(camera: VirtualCamera, scene: Scene) -> Radiance:
-    """The noise-free image (height, width) of a scene behind the lens, in linear light where 1 saturates (no unit)."""
+    """Noise-free image (height, width) of a scene after the lens, in linear light without unit; 1 saturates."""
     out = np.zeros((camera.height, camera.width), np.float32)
     if isinstance(scene, BoardScene):
         R, t = scene.pose(camera)
@@ -71,12 +71,12 @@ def radiance(camera: VirtualCamera, scene: Scene) -> Radiance:
 
 
 def _extent(scene: Specimen) -> tuple[float, float]:
-    """Lowest and highest z of the body, mm: a limb goes on beyond the picture."""
+    """Lowest and highest z of the body, mm; a limb extends beyond the image."""
     return (0.0, _TARGET_TOP) if scene.body()[0] == CYLINDER else (-120.0, 420.0)
 
 
 def _widest(scene: Specimen | TargetScene) -> float:
-    """Radius about the z axis beyond which there is neither body nor base at the heights that cameras see, mm."""
+    """Radius about the z axis, mm, that body and base nowhere exceed at the heights that cameras see."""
     if isinstance(scene, TargetScene) or scene.body()[0] == CYLINDER:
         return _BASE_RADIUS + math.hypot(*scene.body()[2:4])
     theta, z = np.meshgrid(np.linspace(0.0, 2.0 * math.pi, 73), np.linspace(-120.0, 370.0, 50))
@@ -111,7 +111,7 @@ def _background(o, d, per):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True)
 def _lit(cosine):  # type: ignore[no-untyped-def]
-    """How bright a surface is under light from all around, by the cosine of its incidence."""
+    """Brightness of a white surface lit from all sides. cosine : of the angle between its normal and the ray."""
     return 0.40 + 0.60 * cosine
 
 
@@ -127,15 +127,18 @@ def _on_cylinder(o, d, radius, x, y):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True)
 def _miss(o, d, p):  # type: ignore[no-untyped-def]
-    """By how much a ray passes the wall of the cylinder, mm."""
+    """Distance between a ray and the wall of the cylinder p, seen along z, mm; negative if it meets the wall."""
     cross = (o[0] - p[2]) * d[1] - (o[1] - p[3]) * d[0]
     return abs(cross) / math.sqrt(d[0] * d[0] + d[1] * d[1]) - p[1]
 
 
 @nb.njit(nogil=True)
 def _corrected(o, d, frame, theta, z, t):  # type: ignore[no-untyped-def]
-    """One step of Newton's method for the ray's meeting with the body, from theta, z, whose place and tangents are
-    frame: theta, z, t, and whether they have settled on a side that faces the camera."""
+    """One Newton step towards the point in which a ray meets the body, from theta, z, t.
+
+    frame : position and tangents of the body at theta, z. Returns theta, z, t and whether they have converged on a side
+    that faces the camera.
+    """
     x, y, h, tx, ty, tz, zx, zy, zz = frame
     ex, ey, ez = o[0] + t * d[0] - x, o[1] + t * d[1] - y, o[2] + t * d[2] - h
     # Solve [T Z -d] (dtheta, dz, dt) = e by Cramer's rule.
@@ -157,7 +160,7 @@ def _corrected(o, d, frame, theta, z, t):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True)
 def _place(theta, z, p, frame):  # type: ignore[no-untyped-def]
-    """The body's place and tangents at theta, z, written to frame: x y z, d/dtheta x y z, d/dz x y z."""
+    """Write position and tangents of the body at theta, z to frame: x y z, d/dtheta x y z, d/dz x y z."""
     values = body_point(theta, z, p)
     for i in range(9):
         frame[i] = values[i]
@@ -165,7 +168,10 @@ def _place(theta, z, p, frame):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True)
 def _newton(o, d, p, theta, z, t, frame):  # type: ignore[no-untyped-def]
-    """Where the ray meets the limb near a start: theta, z, t and whether it does, from the front. Fills frame."""
+    """Point in which a ray meets the limb, by Newton's method from theta, z, t: theta, z, t, and whether it meets it.
+
+    Fills frame with the position and tangents there.
+    """
     for k in range(10):
         _place(theta, z, p, frame)
         before = theta
@@ -179,8 +185,9 @@ def _newton(o, d, p, theta, z, t, frame):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True)
 def _on_limb(o, d, p, near, theta, z, t, frame):  # type: ignore[no-untyped-def]
-    """Where a ray meets the limb first, and by how much it clears it if not. near : theta, z, t are of a ray close by.
+    """First point in which a ray meets the limb, or its clearance.
 
+    near : whether theta, z, t are those of a ray close by.
     Returns theta, z, t, met, clearance (mm, 0 if met). Fills frame where it meets.
     """
     if near:
@@ -196,7 +203,7 @@ def _on_limb(o, d, p, near, theta, z, t, frame):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True)
 def _on_round(o, d, p, frame):  # type: ignore[no-untyped-def]
-    """Where a ray meets the cylinder: theta, z, t and whether it does. Fills frame where it meets."""
+    """Point in which a ray meets the cylinder: theta, z, t, and whether it meets it; then fills frame."""
     t = _on_cylinder(o, d, p[1], p[2], p[3])
     if t < 0.0:
         return 0.0, 0.0, t, False
@@ -219,9 +226,9 @@ def _footprint(d, t, frame, per_x, per_y):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True)
 def _shade(o, d, p, look, seed, marks, theta, z, t, frame, per_x, per_y, samples):  # type: ignore[no-untyped-def]
-    """Brightness of the body where a ray meets it. per_x, per_y : width of a sample at distance 1; samples : how many
-    of these a pixel is wide.
+    """Brightness of the body where a ray meets it.
 
+    per_x, per_y : width of a sample at distance 1. samples : width of a pixel in samples. look : as in `_render_body`.
     marks : print errors of the target; worn patches, lamps and bars of a specimen.
     """
     _, _, _, tx, ty, tz, zx, zy, zz = frame
@@ -262,7 +269,7 @@ def _worn(s, z, wide, patches):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True)
 def _glare(o, d, t, nx, ny, nz, length, lamps):  # type: ignore[no-untyped-def]
-    """Radiance of the lamps mirrored by the surface: a lobe about the direction half way between lamp and camera."""
+    """Radiance of the lamps' reflections: a lobe of the normal about the half vector between lamp and camera."""
     x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
     total = 0.0
     for k in range(len(lamps)):
@@ -278,7 +285,10 @@ def _glare(o, d, t, nx, ny, nz, length, lamps):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True)
 def _before_bars(o, d, t, wide, bars, value):  # type: ignore[no-untyped-def]
-    """The value seen at distance t along a ray, or the bars before it. wide : width of the sample at distance 1."""
+    """Radiance along a ray, where bars may stand before the surface.
+
+    t : distance to the surface, 0 for none; value : its radiance. wide : width of the sample at distance 1.
+    """
     for k in range(len(bars)):
         ex, ey, ez = bars[k, 3] - bars[k, 0], bars[k, 4] - bars[k, 1], bars[k, 5] - bars[k, 2]
         wx, wy, wz = o[0] - bars[k, 0], o[1] - bars[k, 1], o[2] - bars[k, 2]
@@ -296,14 +306,17 @@ def _before_bars(o, d, t, wide, bars, value):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True)
 def _to_world(R, x, y, d):  # type: ignore[no-untyped-def]
-    """The direction (x, y, 1) of the camera's frame in the world, written to d."""
+    """Write the direction (x, y, 1) of the camera's frame, turned to the world frame, to d."""
     for i in range(3):
         d[i] = R[0, i] * x + R[1, i] * y + R[2, i]
 
 
 @nb.njit(nogil=True)
 def _render_body(lens, R, o, p, look, seed, marks, out):  # type: ignore[no-untyped-def]
-    """A body on its base before the room. look : print, band from, to, bottom, top, widest radius."""
+    """Render a body on its base in front of the room.
+
+    look : kind of print, lowest and highest z of the speckles, bottom and top of the body, largest radius; mm.
+    """
     height, width = out.shape
     d, straight, middle, frame = np.empty(3), np.empty(3), np.empty(9), np.empty(9)
     share = 1.0 / SAMPLES
@@ -313,7 +326,7 @@ def _render_body(lens, R, o, p, look, seed, marks, out):  # type: ignore[no-unty
     for v in range(height):
         theta = z = t = 0.0
         near = False
-        x, y = first_x, first_y  # the first pixel of the row above is a good start
+        x, y = first_x, first_y  # starts from the first pixel of the row above
         for u in range(width):
             x, y, xu, xv, yu, yv = ideal_of_pixel(u, v, lens, x, y)
             if u == 0:
@@ -332,7 +345,7 @@ def _render_body(lens, R, o, p, look, seed, marks, out):  # type: ignore[no-unty
                 theta, z, t, near, clearance = _on_limb(o, straight, p, near, theta, z, t, middle)
                 beside = clearance > 2.0 * SAMPLES * per_x * t
             depth = t if near and look[3] <= z <= look[4] else 0.0
-            if beside:  # one sample of the room will do
+            if beside:  # one sample of the room is enough
                 near = False
                 room = _background(o, straight, SAMPLES * per_x)
                 out[v, u] = _before_bars(o, straight, 0.0, SAMPLES * per_x, marks[3], room)
@@ -363,7 +376,7 @@ def _render_body(lens, R, o, p, look, seed, marks, out):  # type: ignore[no-unty
 
 @nb.njit(nogil=True)
 def _on_limb_beside(o, d, p, near, theta, z, t, middle, frame):  # type: ignore[no-untyped-def]
-    """Where a sample's ray meets the limb: from where its pixel's middle does, two steps are mostly enough."""
+    """Point in which a sample's ray meets the limb: mostly two Newton steps from that of the pixel's middle ray."""
     if near:
         theta_k, z_k, t_k, _ = _corrected(o, d, middle, theta, z, t)
         _place(theta_k, z_k, p, frame)
@@ -376,7 +389,7 @@ def _on_limb_beside(o, d, p, near, theta, z, t, middle, frame):  # type: ignore[
 
 @nb.njit(nogil=True)
 def _behind(o, d, p, per):  # type: ignore[no-untyped-def]
-    """The base below a cylinder, else the room."""
+    """Radiance behind the body: of the base below a cylinder, else of the room."""
     if p[0] == CYLINDER:
         t = _on_cylinder(o, d, _BASE_RADIUS, p[2], p[3])
         if t > 0.0:
@@ -393,7 +406,7 @@ def _behind(o, d, p, per):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True)
 def _board_sample(x, y, o, R, d, Rb, tb, per_x, per_y):  # type: ignore[no-untyped-def]
-    """Brightness along one ray (x, y, 1) of the camera's frame, and how far outside the sheet it passes, squares."""
+    """Brightness along the ray (x, y, 1) of the camera's frame, and how many squares outside the sheet it passes."""
     slope = Rb[0, 2] * x + Rb[1, 2] * y + Rb[2, 2]
     depth = (Rb[0, 2] * tb[0] + Rb[1, 2] * tb[1] + Rb[2, 2] * tb[2]) / slope
     px, py, pz = depth * x - tb[0], depth * y - tb[1], depth - tb[2]
@@ -418,7 +431,7 @@ def _board_sample(x, y, o, R, d, Rb, tb, per_x, per_y):  # type: ignore[no-untyp
 
 @nb.njit(nogil=True)
 def _render_board(lens, R, o, Rb, tb, out):  # type: ignore[no-untyped-def]
-    """The sheet with the checkerboard before the room; Rb, tb take the board's frame to the camera's."""
+    """Render the sheet with the checkerboard in front of the room. Rb, tb : from the board's frame to the camera's."""
     height, width = out.shape
     d = np.empty(3)
     share = 1.0 / SAMPLES
@@ -431,7 +444,7 @@ def _render_board(lens, R, o, Rb, tb, out):  # type: ignore[no-untyped-def]
             if u == 0:
                 first_x, first_y = x, y
             total, outside = _board_sample(x, y, o, R, d, Rb, tb, SAMPLES * per_x, SAMPLES * per_y)
-            if outside > 1.0:  # a square beside the sheet: one sample of the room will do
+            if outside > 1.0:  # more than a square beside the sheet: one sample of the room is enough
                 out[v, u] = total
                 continue
             total = 0.0
@@ -443,12 +456,12 @@ def _render_board(lens, R, o, Rb, tb, out):  # type: ignore[no-untyped-def]
             out[v, u] = total * share * share
 
 
-def _kept(stamp: int) -> tuple[Callable[..., None], Callable[..., None]]:
-    """The two kernels, compiled and kept on disk under a stamp."""
+def _compiled_kernels(stamp: int) -> tuple[Callable[..., None], Callable[..., None]]:
+    """The kernels that render a body and a board, compiled and cached on disk under a key that includes the stamp."""
 
     @nb.njit(cache=True, nogil=True)
     def body(lens, R, o, p, look, seed, marks, out):  # type: ignore[no-untyped-def]
-        if stamp >= 0:  # named, so that it is part of the key under which the kernel is kept
+        if stamp >= 0:  # the kernel uses the stamp, so that numba includes it in the key of its cache
             _render_body(lens, R, o, p, look, seed, marks, out)
 
     @nb.njit(cache=True, nogil=True)
@@ -459,4 +472,4 @@ def _kept(stamp: int) -> tuple[Callable[..., None], Callable[..., None]]:
     return body, board
 
 
-_body_kernel, _board_kernel = _kept(STAMP)
+_body_kernel, _board_kernel = _compiled_kernels(STAMP)

@@ -1,4 +1,4 @@
-"""The ring of the paper: twelve IMX219 in portrait on a circle of 700 mm (Solav et al. 2018, Table 1)."""
+"""The paper's ring: twelve IMX219 in portrait on a circle of 700 mm diameter (Solav et al. 2018, Table 1)."""
 
 from __future__ import annotations
 
@@ -39,22 +39,24 @@ square_mm = 10.0
 
 @dataclass(frozen=True)
 class VirtualRig:
-    """The cameras in ring order."""
+    """The cameras of a simulated ring, in ring order."""
 
     cameras: tuple[VirtualCamera, ...]
 
     def rig_toml(self) -> str:
-        """The rig as a laboratory would write it: nominal azimuths, no truth."""
+        """Text of ``rig.toml`` as a laboratory would write it: target, board, nominal azimuths, but no true poses."""
         entries = [f'\n[[cameras]]\nid = "{c.id}"\nazimuth_deg = {c.azimuth_deg:.1f}\n' for c in self.cameras]
         return _HEADER + "".join(entries)
 
 
 def paper_rig(cameras: int = 12, scale: float = 1.0, seed: int = 0) -> VirtualRig:
-    """A ring with the paper's geometry and the scatter of real cameras.
+    """A ring with the paper's geometry, whose cameras scatter about it as real ones do.
 
-    Intrinsics scatter as Table 1 says; k2, whose estimates k3 compensates, by a fifth of its standard deviation
-    there, and k3 about 0 (Table 1: -0.19 ± 0.45, whose mean would fold the corners of the image over). Positions
-    scatter by 3 mm, pointing by 1.5°.
+    Intrinsics scatter as in Table 1, but for two: k2 by a fifth of its standard deviation there, because the
+    estimates of k2 and k3 compensate each other; k3 about 0, because the mean of Table 1 (-0.19 ± 0.45) would fold the
+    corners of the image over. Positions scatter by 3 mm, viewing directions by 1.5°.
+
+    cameras : their number. scale : of the images, 1 is 2464 x 3280 px. seed : of the scatter.
     """
     if cameras < 2:
         raise ValueError(f"a ring needs at least 2 cameras, not {cameras}")
@@ -65,7 +67,7 @@ def paper_rig(cameras: int = 12, scale: float = 1.0, seed: int = 0) -> VirtualRi
 
 
 def write_truth(rig: VirtualRig, folder: Path) -> Path:
-    """The true cameras as ``cameras_truth.json`` in a folder."""
+    """Write the true intrinsics and poses of all cameras to ``cameras_truth.json`` in a folder; return its path."""
     entries = [
         {
             "id": c.id,

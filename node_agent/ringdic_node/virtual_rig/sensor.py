@@ -1,4 +1,4 @@
-"""From the light behind the lens to grey levels: point spread, vignetting, shot and read noise, gamma, 8 bits."""
+"""The simulated sensor, from light to grey levels: point spread, vignetting, noise, sRGB coding, 8 bits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _VIGNETTING = 0.18  # loss in the corners
 
 
 def expose(radiance: Radiance, seed: int) -> Image:
-    """Grey levels (height, width) of the light that falls on the sensor: vignetting, noise, sRGB coding, 8 bits.
+    """Grey levels (height, width) that the sensor gives for the light on it: vignetting, noise, sRGB coding, 8 bits.
 
     radiance : (height, width), linear, 1 saturates. seed : of the noise; equal seeds give equal images.
     """
@@ -25,12 +25,12 @@ def expose(radiance: Radiance, seed: int) -> Image:
 
 
 def srgb_coded(linear: Radiance) -> Radiance:
-    """Values 0 to 1 coded as sRGB from linear light 0 to 1, of any shape (..., ) (IEC 61966-2-1)."""
+    """sRGB code of linear light (IEC 61966-2-1). linear : (..., ), 0 to 1. Returns that shape, 0 to 1."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 def blurred(image: Radiance) -> Radiance:
-    """The image (height, width), linear light where 1 saturates (no unit), after the lens's point spread.
+    """Convolve an image with the lens's point spread, a Gaussian; (height, width), linear light without unit.
 
     Two passes of a sampled Gaussian; the image is mirrored at its rim.
     """

@@ -1,9 +1,9 @@
-"""Printed patterns as signed distances in surface coordinates, averaged over what a sample sees of them.
+"""Printed patterns (speckles, dots, digits, squares) as shares of dark ink in a sample of the surface.
 
 ``s`` is the arc along the circumference of the 57 mm cylinder (57 theta), ``z`` the height; both mm. ``ws`` and
-``wz`` are the widths that one sample covers on the surface. A pattern answers with the share of the sample that is
-dark, so no pixel image is ever resampled. Speckles are seen through the lens's point spread at once: blurred only
-after sampling, their sharp rims would alias, as they do in no camera.
+``wz`` are the widths that one sample covers on the surface. A pattern is a formula that gives the share of the sample
+that is dark, so no pixel image is ever resampled. The lens's point spread is a part of the formula of the speckles:
+blurred only after sampling, their sharp rims would alias, as they do in no camera.
 """
 
 from __future__ import annotations
@@ -27,7 +27,10 @@ _SEGMENTS = np.array([0x3F, 0x06, 0x5B, 0x4F, 0x66, 0x6D, 0x7D, 0x07, 0x7F, 0x6F
 
 @nb.njit(cache=True, nogil=True)
 def covered(distance, width):  # type: ignore[no-untyped-def]
-    """Share of a sample of this width that lies inside (distance < 0) of a straight edge."""
+    """Share of a sample that lies inside a straight edge, 0 to 1.
+
+    distance : from the edge to the middle of the sample, negative inside. width : of the sample, in the same unit.
+    """
     return min(1.0, max(0.0, 0.5 - distance / width))
 
 
@@ -56,7 +59,7 @@ def _disk(x, y, radius, ws, wz):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _random(i, j, k, seed):  # type: ignore[no-untyped-def]
-    """A number in [0, 1) that belongs to a cell."""
+    """Pseudo-random number in [0, 1) from the cell (i, j), a counter k and the seed."""
     h = np.uint64(i) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(j) * np.uint64(0xC2B2AE3D27D4EB4F)
     h += np.uint64(k) * np.uint64(0x165667B19E3779F9) + np.uint64(seed) * np.uint64(0xD6E8FEB86659FD93)
     h ^= h >> np.uint64(32)
@@ -71,7 +74,8 @@ def _random(i, j, k, seed):  # type: ignore[no-untyped-def]
 def _spot(x, y, radius, ds, dz):  # type: ignore[no-untyped-def]
     """Dark share at (x, y) from the centre of a disk seen through a Gaussian of deviations ds along s and dz along z.
 
-    Exact for a straight rim; the rim's curvature enters to first order, as half of it times the variance along it.
+    Exact for a straight rim; a rim's curvature enters to first order, as half the curvature times the Gaussian's
+    variance along the rim.
     """
     length = math.sqrt(x * x + y * y)
     if length > 0.3 * radius:
@@ -111,7 +115,7 @@ def speckle(s, z, ds, dz, seed):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _box(a, b, half_a, half_b, ws, wz):  # type: ignore[no-untyped-def]
-    """Dark share of a rectangle with sides along s and z about the origin: exact for a rectangular sample."""
+    """Dark share of a sample at (a, b) of a rectangle about the origin with sides along s and z; exact."""
     in_a = min(a + ws / 2, half_a) - max(a - ws / 2, -half_a)
     in_b = min(b + wz / 2, half_b) - max(b - wz / 2, -half_b)
     return max(0.0, in_a) * max(0.0, in_b) / (ws * wz)
@@ -119,7 +123,7 @@ def _box(a, b, half_a, half_b, ws, wz):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _digit(a, b, number, ws, wz):  # type: ignore[no-untyped-def]
-    """Dark share of a digit whose lower left corner is the origin."""
+    """Dark share of a sample at (a, b) of a seven-segment digit whose lower left corner is the origin."""
     bits = _SEGMENTS[number]
     w, h, t = _DIGIT_WIDTH - 0.8, _DIGIT_HEIGHT, _STROKE / 2
     dark = 0.0
@@ -145,7 +149,7 @@ def dots(s, z, ws, wz, prints):  # type: ignore[no-untyped-def]
     """Dark share of the target's print at arc s, height z: squares, column numbers above the top row, one disk as mark.
 
     ws, wz : mm, width and height of the sample on the surface.
-    prints : (rows, columns, 2) by how much each square is off its place, mm.
+    prints : (rows, columns, 2) deviation of each square from its nominal place, mm.
     """
     column = math.floor(s / _SPACING + 0.5)
     a = s - column * _SPACING
@@ -172,13 +176,13 @@ def dots(s, z, ws, wz, prints):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _square_wave(x, width):  # type: ignore[no-untyped-def]
-    """+1 over [0, 1), -1 over [1, 2), repeated, averaged over a width."""
+    """Square wave, +1 over [0, 1) and -1 over [1, 2), repeated, averaged over a width."""
     return (_triangle(x + width / 2) - _triangle(x - width / 2)) / width
 
 
 @nb.njit(cache=True, nogil=True)
 def _triangle(x):  # type: ignore[no-untyped-def]
-    """The integral of the square wave."""
+    """Integral of the square wave: a triangle wave."""
     x = x - 2.0 * math.floor(x / 2.0)
     return x if x < 1.0 else 2.0 - x
 

@@ -31,8 +31,6 @@ from ringdic.geometry.camera import Intrinsics
 
 log = logging.getLogger(__name__)
 
-PARAMETERS = ("fx", "fy", "s", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-
 #: A third radial term with a larger standard error is fixed at zero: the views do not separate it from the second.
 K3_SIGMA_LIMIT = 0.2
 #: With fewer views than this, none is left out for an error above the percentile.
@@ -50,11 +48,11 @@ class IntrinsicsFit:
     """Intrinsics of a camera from views of a board, with their uncertainty and measures of fit.
 
     intrinsics : the lens.
-    sigma : (10,) standard errors in the order of ``PARAMETERS``, px or without unit; 0 for a fixed parameter.
+    sigma : (10,) standard errors of fx fy s cx cy, px, and k1 k2 p1 p2 k3, no unit; 0 for a parameter that was fixed.
     view_errors : (n,) px, RMS residual of the corners of each view, also of the views that were left out.
     inliers : (n,) bool, the views that the lens was fitted to.
     rms : RMS residual over these views, px.
-    covariance : (10, 10) of the parameters in the order of ``PARAMETERS``; 0 for fixed ones.
+    covariance : (10, 10) of these parameters, in that order; 0 for those that were fixed.
     model : the free terms of the lens, in words. reason : why these were chosen.
     coverage : part of the image that the board covers in these views together, 0 to 1.
     residual_distortion : px, RMS over cells of the image of the mean residual in a cell, less what noise explains; it

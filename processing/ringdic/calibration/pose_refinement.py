@@ -17,8 +17,7 @@ import scipy
 
 from ringdic.arrays import Floats, Pixels, Points
 from ringdic.calibration.adjustment import huber_weights
-from ringdic.calibration.bundle import BundleFit
-from ringdic.calibration.parameters import LENS, PER_CAMERA, POSE, CameraParameters, projection_jacobians
+from ringdic.calibration.parameters import LENS, POSE, CameraParameters, projection_jacobians
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.triangulation import reprojection_residuals, triangulate
@@ -51,15 +50,6 @@ class PoseRefinement:
     points: int
 
 
-def pose_covariance(fit: BundleFit, ids: Sequence[str]) -> Floats:
-    """Joint covariance of the poses of some cameras from a bundle adjustment, marginal over their lenses.
-
-    ids : of C cameras. Returns (6 C, 6 C) in rad and mm, ω and τ of each camera.
-    """
-    at = [PER_CAMERA * fit.cameras.index(id_) + LENS + k for id_ in ids for k in range(POSE)]
-    return fit.covariance[np.ix_(at, at)]
-
-
 def loose_covariance(count: int) -> Floats:
     """Covariance (6 C, 6 C), rad and mm, of the poses of C cameras that are known only roughly, to ``LOOSE``."""
     return np.diag(np.tile(np.repeat(np.square(LOOSE), 3), count))
@@ -80,7 +70,7 @@ def refine_poses(
     cameras : the C cameras, with poses to start from.
     px : (C, n, 2) image px, NaN where a camera does not see the point.
     sigma : (C, n, 2) px, standard deviations of the pixels, or one number.
-    covariance : (6 C, 6 C) of the given poses, rad and mm, by `pose_covariance`; None for `loose_covariance`.
+    covariance : (6 C, 6 C) of the given poses, rad and mm; None for `loose_covariance`.
     iterations : largest number of Gauss-Newton steps.
 
     Raises

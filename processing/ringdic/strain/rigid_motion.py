@@ -25,13 +25,6 @@ class RigidMotion:
         x, y, z = np.moveaxis(np.asarray(xyz, dtype=float), -1, 0)  # a matrix product is slower for so small a matrix
         return np.stack([x * a + y * b + z * c + t for (a, b, c), t in zip(self.R, self.t, strict=True)], axis=-1)
 
-    def rotate(self, directions: Vectors) -> Vectors:
-        """Directions ``R d`` after the motion; the translation does not act on them.
-
-        directions : (..., 3) of any unit. Returns (..., 3) in that unit.
-        """
-        return np.asarray(directions, dtype=float) @ self.R.T
-
     @property
     def angle(self) -> float:
         """Angle of the rotation, rad, from 0 to π."""

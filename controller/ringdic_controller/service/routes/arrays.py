@@ -19,7 +19,7 @@ Removed = Annotated[bool, Query(description="With the rigid motion of the whole 
 
 
 def add_arrays(router: APIRouter, prefix: str, locate: Callable[..., Path]) -> None:
-    """Add the routes to a router.
+    """Add to a router the routes to faces, positions and fields of a results file.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def add_arrays(router: APIRouter, prefix: str, locate: Callable[..., Path]) -> N
 
 
 def version_of(path: Path) -> str:
-    """Text that changes only if other results are put in a file's place."""
+    """Version of a results file: a text that changes only when the file is replaced."""
     status = path.stat()
     return f"{status.st_mtime_ns:x}-{status.st_size:x}"
 

@@ -32,19 +32,19 @@ class NewCapture(BaseModel):
     summary="Begin a capture in the current session",
 )
 def begin_capture(new: NewCapture, desk: TheDesk) -> dict[str, Any]:
-    """The round that has begun; ``/rounds/{id}`` and the live events show how it goes on. 409 if none can begin."""
+    """Begin a capture round and return it; ``/rounds/{id}`` and the live events show its progress. 409 if refused."""
     return asdict(desk.rounds.begin(new.kind, override=new.override))
 
 
-@router.get("/rounds/{round_id}", response_model=Round, summary="How a begun capture stands")
+@router.get("/rounds/{round_id}", response_model=Round, summary="State of a capture round")
 def read_round(round_id: str, desk: TheDesk) -> dict[str, Any]:
-    """The round: ``state`` is arming, open, closed or refused; ``capture_id`` names the record once there is one."""
+    """One capture round: ``state`` is arming, open, closed or refused; ``capture_id`` is null until it opens."""
     return asdict(desk.rounds.get(round_id))
 
 
 @router.get("/sessions/{session}/captures", summary="The capture records of a session, in order")
 def list_captures(session: str, desk: TheDesk) -> list[dict[str, Any]]:
-    """Records with, for each camera, status, reason, SHA-256, size, measured time, exposure, metadata."""
+    """Capture records with, for each camera, status, reason, SHA-256, size, measured time, exposure, metadata."""
     desk.sessions.summary(session)
     return desk.catalogue.captures(session)
 
@@ -64,7 +64,7 @@ def read_capture(session: str, capture_id: str, desk: TheDesk) -> dict[str, Any]
     summary="One image, byte for byte as archived",
 )
 def send_image(session: str, capture_id: str, camera: str, desk: TheDesk) -> FileResponse:
-    """The image file; its SHA-256 is the one in the capture's record."""
+    """Original file of an image; its SHA-256 is the one in the capture's record."""
     file, sha256 = _image(desk, session, capture_id, camera)
     path = desk.catalogue.path(session) / "captures" / capture_id / file
     if not path.is_file():
@@ -86,7 +86,7 @@ def send_preview(
     request: Request,
     width: Annotated[int, Query(ge=16, le=2048)] = 320,
 ) -> Response:
-    """The image as a JPEG, at most ``width`` px wide."""
+    """Small picture of an image as a JPEG, at most ``width`` px wide."""
     file, sha256 = _image(desk, session, capture_id, camera)
     headers = cache_headers(f"{sha256[:32]}-{width}")
     if client_has(request, headers):

@@ -1,4 +1,4 @@
-"""The operator's desk as a parameter of the routes."""
+"""Dependency that hands the operator's desk to a route (`TheDesk`)."""
 
 from typing import Annotated
 

@@ -1,12 +1,12 @@
-"""HTTP caching of answers that never change: their entity tag, and whether the client has them already."""
+"""HTTP caching by entity tags (ETag), for answers that never change."""
 
 from fastapi import Request
 
 
 def cache_headers(tag: str, *, revalidate: bool = True) -> dict[str, str]:
-    """Headers of an answer with this entity tag, which the client may keep.
+    """Headers of an answer that has this entity tag and that the client may keep.
 
-    With ``revalidate`` it has to ask before every use, and gets a short 304 if nothing has changed; without, it need
+    With ``revalidate`` the client asks before every use, and gets a short 304 if nothing has changed; without, it need
     not ask again.
     """
     cache = "private, no-cache" if revalidate else "private, max-age=31536000, immutable"
@@ -14,6 +14,6 @@ def cache_headers(tag: str, *, revalidate: bool = True) -> dict[str, str]:
 
 
 def client_has(request: Request, headers: dict[str, str]) -> bool:
-    """Whether the request names the entity tag in these headers: the answer is then a 304 without content."""
+    """Whether the client already has the answer with the entity tag in these headers; a 304 is then sent."""
     tags = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
     return headers["ETag"] in tags or "*" in tags

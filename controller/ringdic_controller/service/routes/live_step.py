@@ -1,4 +1,4 @@
-"""The newest live step, a capture that was processed alone as soon as it was archived: its header and arrays."""
+"""Live steps, captures that were processed alone as soon as they were archived: headers, arrays, files."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,9 +25,9 @@ def _locate(session: str, capture_id: str, desk: TheDesk) -> Path:
 StepFile = Annotated[Path, Depends(_locate)]
 
 
-@router.get("", summary="The newest step that was processed at once")
+@router.get("", summary="Header of the newest live step")
 def read_newest_step(session: str, desk: TheDesk) -> dict[str, Any]:
-    """Header of the newest step's results, and how many seconds after its last image they were ready; 404 if none.
+    """Header of the newest live step, and the seconds from its last image until it was ready; 404 if there is none.
 
     The results hold two steps, the reference and this one.
     """
@@ -39,15 +39,15 @@ def read_newest_step(session: str, desk: TheDesk) -> dict[str, Any]:
     return newest | read_live_step(session, newest["capture_id"], path)
 
 
-@router.get("/{capture_id}", summary="One of the newest steps; the others have been replaced")
+@router.get("/{capture_id}", summary="Header of one of the newest live steps; older ones are removed")
 def read_live_step(session: str, capture_id: str, path: StepFile) -> dict[str, Any]:
-    """Counts, steps, and the table of fields with their ranges."""
+    """Header of one live step: counts, steps, and the table of fields with their ranges."""
     return {"session": session, "capture_id": capture_id, "version": version_of(path), **read_summary(path)}
 
 
 @router.get("/{capture_id}/file", response_class=FileResponse, summary="The results file (HDF5)")
 def send_step_file(session: str, capture_id: str, path: StepFile) -> FileResponse:
-    """The results in VTKHDF form, which opens in ParaView."""
+    """Results file of one live step, in VTKHDF form, which opens in ParaView."""
     return FileResponse(path, filename=f"{session}-{capture_id}.h5")
 
 

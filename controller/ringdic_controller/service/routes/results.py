@@ -30,7 +30,7 @@ RunFile = Annotated[Path, Depends(_locate)]
 
 @router.get("", summary="The processing runs of a session, oldest first")
 def list_runs(session: str, desk: TheDesk) -> list[dict[str, Any]]:
-    """Number, time and summary of each run."""
+    """Number, time and summary of each processing run of a session, oldest first."""
     desk.catalogue.sync()
     desk.sessions.summary(session)
     return desk.catalogue.runs(session)
@@ -38,19 +38,19 @@ def list_runs(session: str, desk: TheDesk) -> list[dict[str, Any]]:
 
 @router.get("/{run}", summary="Header of a run's results: counts, steps, and the table of fields with their ranges")
 def read_run_header(session: str, run: str, path: RunFile) -> dict[str, Any]:
-    """Header of a run's results; ``version`` changes only if another run is put in its place."""
+    """Header of a run's results; ``version`` changes only when the results file is replaced."""
     return {"session": session, "run": run, "version": version_of(path), **read_summary(path)}
 
 
 @router.get("/{run}/file", response_class=FileResponse, summary="The results file (HDF5)")
 def send_run_file(session: str, run: str, path: RunFile) -> FileResponse:
-    """The results in VTKHDF form, which opens in ParaView."""
+    """Results file of one run, in VTKHDF form, which opens in ParaView."""
     return FileResponse(path, filename=f"{session}-{run}.h5")
 
 
 @router.get("/{run}/report", response_class=HTMLResponse, summary="The run's report: one page of HTML")
 def read_report(session: str, run: str, results: RunFile, desk: TheDesk) -> Response:
-    """The report, which is written beside the results when it is first asked for; that takes a while."""
+    """The report of a run as HTML; the first request writes it beside the results, which takes a while."""
     path = results.with_name("report.html")
     if not path.is_file() or path.stat().st_mtime_ns < results.stat().st_mtime_ns:
         from ringdic.report import write_report  # loads the drawing library, which nothing else here needs

@@ -13,7 +13,7 @@ router = APIRouter(prefix="/rig", tags=["rig"])
 
 @router.get("", summary="The nodes in ring order and whether a capture can be taken")
 def read_rig_state(desk: TheDesk) -> dict[str, Any]:
-    """The state of the rig's nodes.
+    """Present state of the rig's nodes.
 
     ``nodes`` holds a dictionary for each camera, ``missing`` the ids of cameras whose node is not alive, ``refusal``
     why no capture can be taken, or null.

@@ -47,16 +47,22 @@ def list_sessions(desk: TheDesk) -> dict[str, object]:
 
 
 @router.post(
-    "", response_model=SessionBody, status_code=status.HTTP_201_CREATED, summary="Make a session and select it"
+    "", response_model=SessionBody, status_code=status.HTTP_201_CREATED, summary="Create a session and select it"
 )
 def create_session(new: NewSession, desk: TheDesk) -> dict[str, object]:
-    """The new session; 409 if the name is taken, there is no rig or a capture is under way, 422 if it is unusable."""
+    """Create a session, select it and return it.
+
+    409 if the name is taken, there is no rig or a capture is under way; 422 if the name is unusable.
+    """
     return desk.create_session(new.name)
 
 
 @router.put("/current", response_model=SessionBody, summary="Select the session that captures go to")
 def select_session(selection: Selection, desk: TheDesk) -> dict[str, object]:
-    """The selected session; 404 if there is no such session, 409 while a capture is under way in another."""
+    """Send captures to a session from now on, and return it.
+
+    404 if there is no such session, 409 while a capture is under way in another.
+    """
     return desk.select_session(selection.name)
 
 

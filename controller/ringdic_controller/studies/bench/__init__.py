@@ -1,1 +1,1 @@
-"""Benchmarks of more than one package: what the rig and a whole job take on this machine."""
+"""Benchmarks of the whole system on this machine: captures, whole jobs, live steps."""

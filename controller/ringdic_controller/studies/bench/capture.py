@@ -1,4 +1,4 @@
-"""How long a capture takes from its moment until every image is archived, verified, acknowledged and freed.
+"""Benchmark of captures: time from the planned moment until every image is archived, acknowledged and freed.
 
 Every node is a process with a real spool that plays back a prepared image over loopback; the controller is the real
 one, driven over HTTP. Nodes and controller share this machine's processors and disk, which a real rig's do not, so
@@ -27,7 +27,7 @@ from ringdic_controller.studies.demo.client import Client
 from ringdic_controller.studies.demo.rig import check_alive, running_controller, running_nodes
 
 _START = 120.0  # seconds for all nodes to appear on a busy machine
-_FREED = 60.0  # seconds after the close until every node has heard that its image is safe
+_FREED = 60.0  # seconds after the close until every node has freed its image
 _MB = 1e6
 _SESSION = "bench"
 
@@ -38,10 +38,10 @@ def bench_capture(
     size: tuple[int, int] = (2464, 3280),
     say: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
-    """The figures of `rounds` captures, one after the other, for every number of nodes.
+    """Time `rounds` captures, one after the other, on simulated rigs of several numbers of nodes.
 
-    size : width and height of the images, px; one byte a pixel.
-    say : is told a line about every rig.
+    nodes : numbers of nodes, one rig for each. size : width and height of the images, px; one byte a pixel.
+    say : called with one line about each rig.
 
     Returns JSON values; times in seconds, rates in 1e6 bytes a second. Raises ComputationError if an image was lost or
     changed on its way.
@@ -56,7 +56,10 @@ def bench_capture(
 
 
 def capture_ratios(new: dict[str, Any], old: dict[str, Any]) -> list[dict[str, Any]]:
-    """Ratios of the runs that both results hold, above 1 is better. InputError if they share none."""
+    """Speed relative to an earlier result, for each rig that both results have: a ratio above 1 is better.
+
+    Raises InputError if they have no rig in common.
+    """
     before = {(run["nodes"], run["bytes"]): run for run in old.get("runs", [])}
     rows = [
         {
@@ -74,7 +77,7 @@ def capture_ratios(new: dict[str, Any], old: dict[str, Any]) -> list[dict[str, A
 
 
 def _measure(folder: Path, count: int, rounds: int, size: tuple[int, int]) -> dict[str, Any]:
-    """One rig of `count` nodes, started, triggered `rounds` times, stopped."""
+    """Figures of one rig of `count` nodes that is started, triggered `rounds` times and stopped."""
     rig = paper_rig(count)
     ids = [camera.id for camera in rig.cameras]
     images = folder / "images"
@@ -90,16 +93,16 @@ def _measure(folder: Path, count: int, rounds: int, size: tuple[int, int]) -> di
         client.post("/sessions", {"name": _SESSION})
         parts = {"controller_cpu_s": [running.pid], "nodes_cpu_s": [process.pid for process in processes]}
         before = {name: _worked(pids) for name, pids in parts.items()}
-        taken = []
+        captures = []
         for _ in range(rounds):
-            taken.append(_capture(client, folder, expected))
+            captures.append(_capture(client, folder, expected))
             check_alive(processes, folder)
         worked = {name: (_worked(pids) - before[name]) / rounds for name, pids in parts.items()}
-        return {**_figures(expected, taken, images), **worked, "controller_memory_mb": _peak_memory(running.pid)}
+        return {**_figures(expected, captures, images), **worked, "controller_memory_mb": _peak_memory(running.pid)}
 
 
 def _prepare(path: Path, seed: int, size: tuple[int, int]) -> str:
-    """An image of noise, which nothing on its way can make smaller; its SHA-256."""
+    """Write an image of noise, which no compression can make smaller; returns its SHA-256."""
     width, height = size
     pixels = np.random.default_rng(seed).integers(0, 256, width * height, np.uint8)
     content = f"P5\n{width} {height}\n255\n".encode() + pixels.tobytes()
@@ -108,7 +111,7 @@ def _prepare(path: Path, seed: int, size: tuple[int, int]) -> str:
 
 
 def _capture(client: Client, folder: Path, expected: dict[str, str]) -> dict[str, float]:
-    """Seconds of one capture: from the press, and from its moment to the close and to the last freed image."""
+    """Seconds of one capture from its moment to the close, and to the last freed image from moment and press."""
     pressed_ns = time.time_ns()
     record = client.capture("static")
     stem = f"{_SESSION}~{record['capture_id']}~{record['fire_at_ns']}"
@@ -129,7 +132,7 @@ def _capture(client: Client, folder: Path, expected: dict[str, str]) -> dict[str
 
 
 def _freed_ns(tombstone: Path, id_: str) -> int:
-    """When a node heard that its image is safe: the time of its tombstone."""
+    """Time at which a node freed its acknowledged image, ns: that of the file (tombstone) that it then leaves."""
     deadline = time.monotonic() + _FREED
     while not tombstone.exists():
         if time.monotonic() > deadline:
@@ -159,7 +162,7 @@ def _spread(values: Iterable[float]) -> dict[str, float]:
 
 
 def _told(run: dict[str, Any]) -> str:
-    """One line about a rig."""
+    """The figures of one rig in one line of text."""
     cpu, nodes, memory = run["controller_cpu_s"], run["nodes_cpu_s"], run["controller_memory_mb"]
     return (
         f"{run['nodes']} nodes, {run['bytes'] / _MB:.0f} MB a capture: from the moment to archived "
@@ -172,7 +175,7 @@ def _told(run: dict[str, Any]) -> str:
 
 
 def _limits(folder: Path, volume: int = 64 << 20) -> dict[str, float]:
-    """What this machine does at most, 1e6 bytes a second: SHA-256 on one core, writing flushed to the disk."""
+    """Limits of this machine, 1e6 bytes a second: SHA-256 on one core, and writing flushed to the disk."""
     content = bytes(volume)
     began = time.process_time()
     hashlib.sha256(content).hexdigest()
@@ -187,12 +190,12 @@ def _limits(folder: Path, volume: int = 64 << 20) -> dict[str, float]:
 
 
 def _worked(pids: Sequence[int]) -> float:
-    """Processor time of processes so far, s; 0 where the system does not tell."""
+    """Processor time of some processes so far, s; 0 where the system does not report it."""
     return sum(processor_seconds(pid) or 0.0 for pid in pids)
 
 
 def processor_seconds(pid: int) -> float | None:
-    """Processor time of a process so far; None where the system does not tell."""
+    """Processor time of a process so far, s; None where the system does not report it."""
     if not sys.platform.startswith("linux"):
         return None
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -200,7 +203,7 @@ def processor_seconds(pid: int) -> float | None:
 
 
 def _peak_memory(pid: int) -> float | None:
-    """Largest resident set of a process so far, 1e6 bytes; None where the system does not tell."""
+    """Largest resident set of a process so far, 1e6 bytes; None where the system does not report it."""
     if not sys.platform.startswith("linux"):
         return None
     for line in Path(f"/proc/{pid}/status").read_text().splitlines():
@@ -210,6 +213,6 @@ def _peak_memory(pid: int) -> float | None:
 
 
 def _ratios_told(old: dict[str, Any], new: dict[str, Any]) -> dict[str, float]:
-    """Ratios of what only some systems tell, where both results have it."""
+    """Ratios of processor times and memory, which only some systems report, where both results have them."""
     names = {"controller_cpu": "controller_cpu_s", "nodes_cpu": "nodes_cpu_s", "memory": "controller_memory_mb"}
     return {name: old[key] / new[key] for name, key in names.items() if old.get(key) and new.get(key)}

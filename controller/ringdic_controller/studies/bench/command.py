@@ -16,26 +16,29 @@ _FOLDER = Path("ringdic-bench")
 
 
 def bench_command(
-    data: Annotated[Path | None, typer.Option(help="Folder of the MultiDIC rig; else synthetic.")] = None,
-    repeats: Annotated[int, typer.Option(min=1, help="Runs of which the best counts.")] = 5,
-    interpolation: Annotated[str, typer.Option(help="cubic or quintic.")] = "cubic",
-    job: Annotated[bool, typer.Option("--job", help="A whole job, from the specimen's images to the results.")] = False,
-    capture: Annotated[bool, typer.Option("--capture", help="Captures of 12 and 30 nodes over loopback.")] = False,
-    live: Annotated[bool, typer.Option("--live", help="Steps every 5 s until each is on the page.")] = False,
-    all_: Annotated[bool, typer.Option("--all", help="Every part; alone, the correlation is measured.")] = False,
-    steps: Annotated[str, typer.Option(help="Of the job: images of the specimen a camera, such as 2,5,10,20.")] = "5",
-    scale: Annotated[
-        float, typer.Option(min=0.1, max=1.0, help="Of the images of job and live; 1 is 2464 x 3280 px.")
-    ] = 1.0,
-    cameras: Annotated[int, typer.Option(min=6, max=30, help="Of job and live.")] = 12,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", metavar="GROUP.NAME=VALUE", help="Of job and live.")
+    data: Annotated[
+        Path | None, typer.Option(help="Folder of MultiDIC's sample images; without it, synthetic ones.")
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder of images that are rendered, kept for the next time.")] = _FOLDER,
+    repeats: Annotated[int, typer.Option(min=1, help="Number of runs, of which the fastest counts.")] = 5,
+    interpolation: Annotated[str, typer.Option(help="Spline of the images: cubic or quintic.")] = "cubic",
+    job: Annotated[bool, typer.Option("--job", help="Time whole jobs, from images to results.")] = False,
+    capture: Annotated[bool, typer.Option("--capture", help="Time captures of 12 and 30 nodes over loopback.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="Time live steps, captured one every 5 s.")] = False,
+    all_: Annotated[bool, typer.Option("--all", help="Measure all parts; without any, the correlation.")] = False,
+    steps: Annotated[str, typer.Option(help="For --job: specimen images a camera, such as 2,5,10,20.")] = "5",
+    scale: Annotated[
+        float, typer.Option(min=0.1, max=1.0, help="For --job and --live: size of the images; 1 is 2464 x 3280 px.")
+    ] = 1.0,
+    cameras: Annotated[int, typer.Option(min=6, max=30, help="For --job and --live: number of cameras.")] = 12,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="GROUP.NAME=VALUE", help="For --job and --live: a setting; repeatable."),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder of rendered images, kept for the next time.")] = _FOLDER,
     compare: Annotated[Path | None, typer.Option(help="An earlier result (JSON) to compare with.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
 ) -> None:
-    """How fast the correlation is on this machine, and, where asked for, a whole job, captures and live steps."""
+    """Measure how fast the correlation is on this machine and, if asked for, a whole job, captures and live steps."""
     from ringdic.correlation.bench import bench_correlation, read_result
 
     before = read_result(compare) if compare is not None else None
@@ -67,9 +70,9 @@ def bench_command(
 
 
 def compared(new: dict[str, Any], old: dict[str, Any]) -> list[dict[str, Any]]:
-    """A row for each run that both results hold, with the part it belongs to; a ratio above 1 is better.
+    """Ratios to an earlier result, a row for each run that both results have; a ratio above 1 is better.
 
-    InputError if they have no part in common.
+    Each row names its part of the benchmark. Raises InputError if they have no part in common.
     """
     from ringdic.correlation.bench import ratios
 

@@ -1,9 +1,9 @@
-"""How long a whole job takes from the images of the specimen to the results, by stage and by number of steps.
+"""Benchmark of whole jobs: time from the specimen's images to the results, by stage and by number of steps.
 
-A rig of virtual cameras with full-size images, rendered once and kept in a folder; those of the specimen are PGM files,
-as a rig's nodes deliver them and the archive keeps them. Each job runs in a process of its
-own, from nothing matched to the results written, once the kernels are compiled and the cameras calibrated, as in a
-session that goes on: so its peak memory and its processor time are known too. The calibration is timed by itself.
+The images are those of virtual cameras, rendered once and kept in a folder; those of the specimen are PGM files, as
+nodes deliver them and the archive keeps them. Each job runs in a process of its own, so that its peak memory and
+processor time are known. It begins without any matches, but with compiled kernels and calibrated cameras, as in a
+session that goes on. The calibration is timed by itself.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from ringdic.errors import ComputationError, InputError
 from ringdic.session.images import read_gray
 from ringdic_node.virtual_rig.scenes import Specimen
 
-from ringdic_controller.studies.validate.darkroom import Darkroom, RenderedShot
 from ringdic_controller.studies.validate.folders import make_session
+from ringdic_controller.studies.validate.image_cache import ImageCache, RenderedShot
 from ringdic_controller.studies.validate.scenery import Scenery
 
 Say = Callable[[str], None]
 
-_RENDERED = 5  # steps that are rendered; later ones are these again with noise of their own
+_RENDERED = 5  # steps that are rendered; later ones are copies of these with noise of their own
 _BOARDS = 15
 _MB = 1e6
 
 
 @dataclass(frozen=True)
-class _Again(RenderedShot):
-    """An image once more, with rounding noise of its own, so that it is another image and costs no rendering."""
+class _NoisyCopy(RenderedShot):
+    """A rendered image with a little noise added, which stands for a further step without rendering one."""
 
     turn: int = 0
 
@@ -49,17 +49,17 @@ class _Again(RenderedShot):
 
     @property
     def first(self) -> RenderedShot:
-        """The image as it was rendered."""
+        """The image without the added noise."""
         return RenderedShot(self.camera, self.scene, self.seed, self.jpeg)
 
 
-class _Delivered(Darkroom):
-    """Images of the specimen as PGM files, the others as they were developed."""
+class _SessionImages(ImageCache):
+    """Images as they go into sessions: those of the specimen as PGM files, all others as rendered."""
 
     def path(self, shot: RenderedShot) -> Path:
-        """Where an image lies as it goes into the session."""
-        developed = super().path(shot)
-        return developed.with_suffix(".pgm") if isinstance(shot.scene, Specimen) else developed
+        """File of an image in the form that goes into a session."""
+        rendered = super().path(shot)
+        return rendered.with_suffix(".pgm") if isinstance(shot.scene, Specimen) else rendered
 
 
 def bench_job(
@@ -71,21 +71,21 @@ def bench_job(
     settings: Sequence[str] = (),
     say: Say = lambda _: None,
 ) -> dict[str, Any]:
-    """Figures of whole jobs, one for each number of images of the specimen a camera (the reference included).
+    """Time whole jobs, one for each number of specimen images a camera (the reference included).
 
-    folder : of the images and sessions, kept for the next time. scale : 1 is 2464 x 3280 px. settings :
-    ``group.name=value`` to process with. say : is told a line about every job.
+    folder : of the images and sessions, which are kept for the next time. scale : 1 is 2464 x 3280 px. settings :
+    ``group.name=value`` to process with. say : called with one line about each job.
 
     Returns JSON values: the rig, the seconds of its calibration from the images of boards and target, and for each
     number of steps the seconds (``wall``, ``cpu``, by stage), the peak memory in 1e6 bytes (None where the system does
-    not tell), the triangles and the size of what is kept of the matches; ``seconds_per_step`` and ``memory_per_step``
-    by a straight line through several.
+    not report it), the triangles and the size of the stored matches. Several numbers of steps also give
+    ``seconds_per_step``, ``cpu_seconds_per_step`` and ``peak_mb_per_step``, by a straight line.
     """
     if min(steps, default=0) < 2:
         raise InputError("a job needs the reference and at least one step: 2 steps or more")
     scenery = Scenery(scale=scale, cameras=cameras, boards=_BOARDS, limb=_RENDERED)
-    darkroom = _Delivered(Path(folder) / "images")
-    shots = _shots(scenery, darkroom, max(steps), say)
+    cache = _SessionImages(Path(folder) / "images")
+    shots = _shots(scenery, cache, max(steps), say)
     runs: list[dict[str, Any]] = []
     warm: Path | None = None
     calibration = 0.0
@@ -95,7 +95,7 @@ def bench_job(
         captures += [("target", shot) for shot in scenery.shots("target")] + [("specimen", s) for s in shots[:count]]
         path = Path(folder) / "sessions" / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        session = make_session(path, scenery.rig.rig_toml(), captures, darkroom, calibration=warm)
+        session = make_session(path, scenery.rig.rig_toml(), captures, cache, calibration=warm)
         if warm is None:
             shutil.rmtree(session / "calibration", ignore_errors=True)
             calibration = _process(session, settings)["seconds"]["calibrate"]
@@ -112,7 +112,10 @@ def bench_job(
 
 
 def job_ratios(new: dict[str, Any], old: dict[str, Any]) -> list[dict[str, Any]]:
-    """Ratios of the jobs that both results hold, above 1 is better. InputError if they share none."""
+    """Speed relative to an earlier result, for each job that both results have: a ratio above 1 is better.
+
+    Raises InputError if they have no job in common.
+    """
     alike = [new.get(name) == old.get(name) for name in ("cameras", "scale", "settings")]
     before = {run["steps"]: run for run in old.get("runs", [])} if all(alike) else {}
     rows = [
@@ -125,30 +128,30 @@ def job_ratios(new: dict[str, Any], old: dict[str, Any]) -> list[dict[str, Any]]
     return rows
 
 
-def _shots(scenery: Scenery, delivered: Darkroom, count: int, say: Say) -> list[Mapping[str, RenderedShot]]:
-    """The specimen's images of each step by camera, all there."""
-    developed, rendered = Darkroom(delivered.folder), scenery.shots("limb")
+def _shots(scenery: Scenery, session_images: ImageCache, count: int, say: Say) -> list[Mapping[str, RenderedShot]]:
+    """The specimen's images of each step by camera; those that are missing are rendered or copied first."""
+    rendered_images, rendered = ImageCache(session_images.folder), scenery.shots("limb")
     every = [shot for scene in ("boards", "target") for shots in scenery.shots(scene) for shot in shots.values()]
     every += [shot for shots in rendered[:count] for shot in shots.values()]
-    missing = sum(not developed.path(shot).is_file() for shot in every)
+    missing = sum(not rendered_images.path(shot).is_file() for shot in every)
     if missing:
-        say(f"rendering {missing} images into {developed.folder}")
-    developed.develop(every)
+        say(f"rendering {missing} images into {rendered_images.folder}")
+    rendered_images.render_missing(every)
     steps: list[Mapping[str, RenderedShot]] = list(rendered[:count])
     for k in range(len(steps), count):
         turn, which = divmod(k - 1, _RENDERED)
         shots = rendered[1 + which].items()
-        steps.append({id_: _Again(shot.camera, shot.scene, shot.seed, shot.jpeg, turn) for id_, shot in shots})
+        steps.append({id_: _NoisyCopy(shot.camera, shot.scene, shot.seed, shot.jpeg, turn) for id_, shot in shots})
     for shot in [shot for shots in steps for shot in shots.values()]:
-        if not delivered.path(shot).is_file():
-            _deliver(shot, developed, delivered.path(shot))
+        if not session_images.path(shot).is_file():
+            _deliver(shot, rendered_images, session_images.path(shot))
     return steps
 
 
-def _deliver(shot: RenderedShot, developed: Darkroom, path: Path) -> None:
-    """Write an image as it goes into the session."""
-    image = read_gray(developed.path(shot.first if isinstance(shot, _Again) else shot))
-    if isinstance(shot, _Again):
+def _deliver(shot: RenderedShot, rendered_images: ImageCache, path: Path) -> None:
+    """Write an image in the form that goes into a session, with its noise if it is a copy."""
+    image = read_gray(rendered_images.path(shot.first if isinstance(shot, _NoisyCopy) else shot))
+    if isinstance(shot, _NoisyCopy):
         noise = np.random.default_rng([shot.turn, shot.seed]).integers(-1, 2, image.shape)
         image = np.clip(image.astype(np.int64) + noise, 0, 255).astype(np.uint8)
     aside = path.with_name(f".{path.stem}.partial{path.suffix}")
@@ -163,12 +166,12 @@ def _process(session: Path, settings: Sequence[str]) -> dict[str, Any]:
     stages: dict[str, float] = {}
     outcome: dict[str, Any] = {}
     began = time.monotonic()
-    # What it says beside its progress goes to a file: a full pipe would hold it up.
-    with tempfile.TemporaryFile("w+", encoding="utf-8") as said:
+    # Standard error goes to a file: nobody reads it meanwhile, and a full pipe would block the child.
+    with tempfile.TemporaryFile("w+", encoding="utf-8") as errors:
         child = subprocess.Popen(
             [sys.executable, "-P", "-m", "ringdic.jobs", str(session), *chosen],
             stdout=subprocess.PIPE,
-            stderr=said,
+            stderr=errors,
             text=True,
         )
         assert child.stdout is not None
@@ -183,20 +186,20 @@ def _process(session: Path, settings: Sequence[str]) -> dict[str, Any]:
         used = _ended(child)
         stages[before] = stages.get(before, 0.0) + time.monotonic() - since
         if outcome.get("state") != "done":
-            said.seek(0)
-            raise ComputationError(f"{session}: the job failed: {outcome.get('error') or said.read()[-500:]}")
+            errors.seek(0)
+            raise ComputationError(f"{session}: the job failed: {outcome.get('error') or errors.read()[-500:]}")
     results = session / "results" / outcome["run"]
-    kept = sum(path.stat().st_size for path in (session / "work").glob("*.npz"))
+    matches_size = sum(path.stat().st_size for path in (session / "work").glob("*.npz"))
     size = (results / "results.h5").stat().st_size
     shutil.rmtree(results)
     return {
         "wall": time.monotonic() - began, **used, "seconds": stages,
-        "faces": outcome["summary"].get("faces"), "kept_mb": kept / _MB, "results_mb": size / _MB,
+        "faces": outcome["summary"].get("faces"), "kept_mb": matches_size / _MB, "results_mb": size / _MB,
     }  # fmt: skip
 
 
 def _ended(child: subprocess.Popen[str]) -> dict[str, float | None]:
-    """Wait for the child: its processor time in seconds, and its peak memory in 1e6 bytes, None where not told."""
+    """Wait for the child; its processor time, s, and peak memory, 1e6 bytes, None where the system reports none."""
     if not hasattr(os, "wait4"):
         child.wait()
         return {"cpu": None, "peak_mb": None}
@@ -207,7 +210,7 @@ def _ended(child: subprocess.Popen[str]) -> dict[str, float | None]:
 
 
 def _lines(runs: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Slopes over the number of steps."""
+    """Time and memory for each further step: slopes of straight lines over the number of steps."""
     if len(runs) < 2 or any(run["cpu"] is None for run in runs):
         return {}
     steps = [run["steps"] for run in runs]

@@ -1,4 +1,4 @@
-"""How soon a step's strain is on the page: seconds from its last image's arrival, steps coming at a steady pace.
+"""Benchmark of live steps: seconds from a step's last image to its results, with steps at a steady pace.
 
 Every node is a process with a real spool that plays back images of the simulated rig, rendered beforehand; controller
 and warm processing are the real ones, driven over HTTP. The calibration and the reference are processed before the
@@ -25,14 +25,14 @@ from ringdic_controller.studies.bench.capture import processor_seconds
 from ringdic_controller.studies.demo.client import Client
 from ringdic_controller.studies.demo.rig import check_alive, running_controller, running_nodes
 from ringdic_controller.studies.demo.run import settings_for
-from ringdic_controller.studies.validate.darkroom import Darkroom, RenderedShot
 from ringdic_controller.studies.validate.folders import make_session
+from ringdic_controller.studies.validate.image_cache import ImageCache, RenderedShot
 from ringdic_controller.studies.validate.scenery import Scenery
 
 _START = 300.0  # seconds for the nodes to appear and for the kernels, which are compiled once
 _REFERENCE = 1800.0  # seconds for calibrating and matching the reference
 _SESSION = "bench"
-_LOOK = 0.05  # seconds between two looks at what is newest
+_LOOK = 0.05  # seconds between two requests for the newest live step
 
 
 def bench_live(
@@ -46,24 +46,26 @@ def bench_live(
     settings: Settings | None = None,
     say: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
-    """The figures of `steps` steps, one every `interval` seconds, after the reference. JSON values, times in seconds.
+    """Time `steps` live steps, captured one every `interval` seconds after the reference.
+
+    Returns JSON values, times in seconds.
 
     folder : where images and calibration are kept for the next time. boards : views of the checkerboard.
     settings : of the processing; None takes those of the demo at this size of the images.
     Raises ComputationError if a step could not be processed.
     """
     scenery = Scenery(scale, cameras, boards, limb=steps)
-    darkroom = Darkroom(folder / "images")
+    cache = ImageCache(folder / "images")
     work = folder / f"live-{time.strftime('%Y-%m-%d-%H%M%S')}"
     shots = [shot for name in ("boards", "target", "limb") for each in scenery.shots(name) for shot in each.values()]
     say(f"{len(shots)} images of {cameras} cameras")
-    darkroom.develop(shots)
+    cache.render_missing(shots)
     text = scenery.rig.rig_toml()
     calibration = [
         (kind, each) for kind, name in (("board", "boards"), ("target", "target")) for each in scenery.shots(name)
     ]
-    make_session(work / "archive" / _SESSION, text, calibration, darkroom, calibration=folder / "calibrated")
-    tables = _frames(work / "frames", scenery.shots("limb"), darkroom)
+    make_session(work / "archive" / _SESSION, text, calibration, cache, calibration=folder / "calibrated")
+    tables = _frames(work / "frames", scenery.shots("limb"), cache)
     with (
         running_controller(work, text, settings or settings_for(scale)) as running,
         running_nodes(work, parse_rig(text).name, tables, running.endpoint) as processes,
@@ -96,7 +98,10 @@ def bench_live(
 
 
 def live_ratios(new: dict[str, Any], old: dict[str, Any]) -> list[dict[str, Any]]:
-    """Ratios to an earlier result of the same rig, above 1 is better. InputError if the rigs differ."""
+    """Speed relative to an earlier result of the same rig: a ratio above 1 is better.
+
+    Raises InputError if the rigs differ.
+    """
     same = ("cameras", "scale", "interval_s")
     if any(new[name] != old.get(name) for name in same):
         raise InputError("the two results are of other live rigs; compare results of the same command")
@@ -106,11 +111,11 @@ def live_ratios(new: dict[str, Any], old: dict[str, Any]) -> list[dict[str, Any]
     return [row]
 
 
-def _frames(folder: Path, steps: Sequence[Mapping[str, RenderedShot]], darkroom: Darkroom) -> dict[str, str]:
-    """The images that every node plays back, and what its configuration says of them."""
+def _frames(folder: Path, steps: Sequence[Mapping[str, RenderedShot]], cache: ImageCache) -> dict[str, str]:
+    """Write the images that each node plays back; returns the camera table of each node's configuration."""
     for number, shots in enumerate(steps):
         for id_, shot in shots.items():
-            grey = read_gray(darkroom.path(shot))
+            grey = read_gray(cache.path(shot))
             (folder / id_).mkdir(parents=True, exist_ok=True)
             if not cv2.imwrite(str(folder / id_ / f"specimen-{number}.pgm"), grey):
                 raise ComputationError(f"{folder / id_}: the images cannot be written; check the disk")
@@ -122,7 +127,7 @@ def _frames(folder: Path, steps: Sequence[Mapping[str, RenderedShot]], darkroom:
 
 
 def _steps(client: Client, count: int, interval: float) -> tuple[list[dict[str, Any]], list[str]]:
-    """Press the button at a steady pace, and note every step that is shown; these, and all that were captured."""
+    """Capture steps at a steady pace; returns the live steps that were ready in time, and ids of all captures."""
     shown: dict[str, dict[str, Any]] = {}
     taken: list[str] = []
 
@@ -144,14 +149,14 @@ def _steps(client: Client, count: int, interval: float) -> tuple[list[dict[str, 
     return list(shown.values()), taken
 
 
-def _keep_calibration(session: Path, kept: Path) -> None:
-    (kept / "calibration").mkdir(parents=True, exist_ok=True)
+def _keep_calibration(session: Path, folder: Path) -> None:
+    (folder / "calibration").mkdir(parents=True, exist_ok=True)
     for file in (session / "calibration").glob("*.json"):
-        (kept / "calibration" / file.name).write_bytes(file.read_bytes())
+        (folder / "calibration" / file.name).write_bytes(file.read_bytes())
 
 
 def _processing_seconds(pid: int) -> float | None:
-    """Processor time of the controller's children so far; None where the system does not tell."""
+    """Processor time of the controller's child processes so far, s; None where the system does not report it."""
     if not sys.platform.startswith("linux"):
         return None
     children = Path(f"/proc/{pid}/task").glob("*/children")

@@ -11,11 +11,11 @@ from typing import Any
 
 from ringdic.errors import ComputationError
 
-_EVERY = 0.2  # seconds between two looks
+_EVERY = 0.2  # seconds between two requests
 
 
 class Client:
-    """Talks to the controller at ``address``."""
+    """Client of the controller's HTTP interface at ``address``, such as ``http://127.0.0.1:8000``."""
 
     def __init__(self, address: str) -> None:
         self.address = address
@@ -25,7 +25,7 @@ class Client:
         return self._call("GET", path, None)
 
     def post(self, path: str, body: dict[str, Any] | None = None) -> Any:
-        """The JSON answer to a request under /api/v1; ComputationError with the controller's sentence if refused."""
+        """The JSON answer to a request under /api/v1. Raises ComputationError with the controller's refusal."""
         return self._call("POST", path, body or {})
 
     def put(self, path: str, body: dict[str, Any]) -> Any:
@@ -44,7 +44,7 @@ class Client:
         raise ComputationError(f"after {timeout:.0f} s there was no node {', '.join(missing or ids)}; see its log")
 
     def capture(self, kind: str, timeout: float = 180.0) -> dict[str, Any]:
-        """Press a capture button and wait for the round to close; the record."""
+        """Begin a capture, wait until its round has closed, and return its record."""
         started = self.post("/captures", {"kind": kind})
         deadline = time.monotonic() + timeout
         while time.monotonic() < deadline:
@@ -57,7 +57,7 @@ class Client:
         raise ComputationError(f"the {kind} capture did not close within {timeout:.0f} s")
 
     def follow_job(self, job_id: str, watch: Callable[[dict[str, Any]], None], timeout: float) -> dict[str, Any]:
-        """Wait for a job to end, telling ``watch`` of its progress; the job."""
+        """Wait until a job is done and return it; ``watch`` is called often with its present state."""
         deadline = time.monotonic() + timeout
         while time.monotonic() < deadline:
             job = self.get(f"/jobs/{job_id}")
@@ -72,7 +72,7 @@ class Client:
     def wait_for_step(
         self, session: str, capture_id: str, timeout: float, meanwhile: Callable[[], None] = lambda: None
     ) -> None:
-        """Wait until the live result of a step, or of a newer one, is there; ``meanwhile`` is called often."""
+        """Wait until a live step, or a newer one, has been processed; ``meanwhile`` is called often."""
         deadline = time.monotonic() + timeout
         while time.monotonic() < deadline:
             meanwhile()

@@ -16,7 +16,10 @@ from ringdic_controller.studies.truth import errors, face_centroids
 
 @dataclass(frozen=True)
 class TruthFigure:
-    """One row: measured minus true. mean and rms (about zero), and the largest; in ``unit``; ``true`` for scale."""
+    """Error, measured minus true, of one quantity at one step, over all points or triangles.
+
+    mean, rms (about zero), largest : in ``unit``. true : range of the true values, as text. lost : number not measured.
+    """
 
     quantity: str
     step: str
@@ -28,7 +31,7 @@ class TruthFigure:
     lost: int
 
     def row(self) -> dict[str, str]:
-        """The figure as text."""
+        """The figure as a row of a table, in text."""
         digits = 4 if self.unit == "mm" else 5
         return {
             "measured − true": self.quantity,
@@ -47,19 +50,22 @@ class TruthFigure:
 
 
 def compare_with_truth(results_file: Path, limb: Limb) -> list[TruthFigure]:
-    """Errors of every step of the results by the limb's formulas; step k of the results is step k of the limb."""
+    """Errors of shape, displacement and stretches at every step against the limb's formulas.
+
+    Step k of the results must be step k of the limb.
+    """
     results = read_results(results_file)
-    found = errors(results, limb)
-    reference = limb.position(found.theta, found.z, 0)
+    deviations = errors(results, limb)
+    reference = limb.position(deviations.theta, deviations.z, 0)
     radii = _span(np.hypot(*reference.T[:2]), "mm")
-    figures = [_figure("distance from the surface", "reference", radii, found.distance, "mm")]
-    middles = face_centroids(found.theta, found.z, results.faces)
+    figures = [_figure("distance from the surface", "reference", radii, deviations.distance, "mm")]
+    middles = face_centroids(deviations.theta, deviations.z, results.faces)
     for step, name in list(enumerate(results.steps))[1:]:
-        length = np.linalg.norm(limb.position(found.theta, found.z, step) - reference, axis=1)
-        error = np.linalg.norm(found.displacement[step], axis=1)
+        length = np.linalg.norm(limb.position(deviations.theta, deviations.z, step) - reference, axis=1)
+        error = np.linalg.norm(deviations.displacement[step], axis=1)
         figures.append(_figure("displacement", name, _span(length, "mm"), error, "mm"))
         for k, true in enumerate(limb.stretches(*middles, step)):
-            figures.append(_figure(f"stretch λ{k + 1}", name, _span(true), found.stretches[step, :, k], ""))
+            figures.append(_figure(f"stretch λ{k + 1}", name, _span(true), deviations.stretches[step, :, k], ""))
     return figures
 
 

@@ -1,4 +1,4 @@
-"""The processes of the simulated rig: one node a camera, each with a spool of its own, and the controller."""
+"""The processes of the simulated rig: a node for each camera, with a spool of its own, and the controller."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Setting:
         return self.folder / "archive"
 
     def node_tables(self, ids: list[str]) -> dict[str, str]:
-        """What the configuration of each camera's node says of its camera."""
+        """The part of each node's configuration file that describes its camera, by camera id."""
         table = f'camera = "virtual"\n\n[virtual]\ncameras = {self.cameras}\nscale = {self.scale}\nseed = {self.seed}\n'
         return dict.fromkeys(ids, table)
 
@@ -52,7 +52,7 @@ class Running:
 
 @contextmanager
 def running_controller(folder: Path, rig_toml: str, settings: Settings) -> Iterator[Running]:
-    """The controller as a process of its own; its archive is ``folder/archive``."""
+    """Run a controller in a process of its own for the time of a ``with`` block; its archive is ``folder/archive``."""
     (folder / "rig.toml").write_text(rig_toml, encoding="utf-8")
     (folder / "settings.toml").write_text(settings.to_toml(), encoding="utf-8")
     endpoint = free_endpoint(ControllerConfig()).endpoint
@@ -79,7 +79,7 @@ def running_controller(folder: Path, rig_toml: str, settings: Settings) -> Itera
 def running_nodes(
     parent: Path, rig: str, tables: Mapping[str, str], endpoint: str
 ) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """One node process a camera in ``parent/nodes/<camera>``, its spool there.
+    """Run a node process for each camera for the time of a ``with`` block, in ``parent/nodes/<camera>``.
 
     tables : by camera, the end of the node's configuration: ``camera = …`` and that camera's table.
     """
@@ -105,14 +105,14 @@ def running_nodes(
 
 
 def check_alive(processes: list[subprocess.Popen[bytes]], folder: Path) -> None:
-    """ComputationError if a node has ended."""
+    """Raise ComputationError if a node's process has ended."""
     for process in processes:
         if process.poll() is not None:
             raise ComputationError(f"a node ended with code {process.returncode}; see the logs in {folder / 'nodes'}")
 
 
 def _address(process: subprocess.Popen[str], log: Path) -> str:
-    """The address that the controller prints when it serves."""
+    """Address of the page, which the controller prints when it is ready."""
     lines: queue.SimpleQueue[str] = queue.SimpleQueue()
 
     def read() -> None:

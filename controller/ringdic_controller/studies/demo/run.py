@@ -38,7 +38,7 @@ def run_demo(folder: Path, *, cameras: int, scale: float, steps: int, serve: boo
     setting = Setting(_new_folder(folder), cameras, scale)
     rig = paper_rig(cameras, scale, setting.seed)
     say(f"a simulated ring of {cameras} cameras of {rig.cameras[0].width} x {rig.cameras[0].height} px")
-    load_renderer()  # compiled once here, the renderer is found compiled by every node
+    load_renderer()  # compiled once here, so that the nodes load it from the cache
     write_truth(rig, setting.folder)
     name = parse_rig(rig.rig_toml()).name
     ids = [camera.id for camera in rig.cameras]
@@ -61,12 +61,12 @@ def run_demo(folder: Path, *, cameras: int, scale: float, steps: int, serve: boo
 
 
 def _leave(signum: int, _: FrameType | None) -> None:
-    """End as Ctrl-C does, through the exits that stop the processes of the rig."""
+    """End in the way of Ctrl-C, so that the ``with`` blocks stop the processes of the rig."""
     raise SystemExit(128 + signum)
 
 
 def _capture_all(client: Client, steps: int, report: Report) -> None:
-    """Boards, target, the reference and the steps; each step is on the page while the next ones are captured."""
+    """Capture boards, target, reference and steps; each step is shown on the page while the next are captured."""
     kinds = ["board"] * BOARDS + ["target"] + ["specimen"] * (steps + 1)
     for k, kind in enumerate(kinds):
         report(Progress("capture", k / len(kinds), f"{kind}, capture {k + 1} of {len(kinds)}"))
@@ -86,7 +86,7 @@ def _follow(client: Client, session: str, report: Report) -> None:
 
 
 def _compare(setting: Setting, session: str, rig: VirtualRig, began: float) -> dict[str, Any]:
-    """Show and keep the table of measured against true."""
+    """Print the table of measured against true values and write it to ``comparison.json``."""
     results = newest_results(setting.archive / session)
     figures = compare_with_truth(results, Limb())
     summary = json.loads((results.parent / "summary.json").read_text(encoding="utf-8"))
@@ -106,12 +106,12 @@ def _compare(setting: Setting, session: str, rig: VirtualRig, began: float) -> d
 
 
 def settings_for(scale: float) -> Settings:
-    """The paper's settings at a scale of the images, with no fewer pixels in a subset than it needs."""
+    """The paper's settings for images of another scale; the subsets keep the least size that they need."""
     return PAPER.model_copy(update={"correlation": PAPER.correlation.at_scale(scale)})
 
 
 def _new_folder(folder: Path) -> Path:
-    """A folder of this run's own: nothing of an earlier run is touched."""
+    """Create a new folder, named by the time, for this run."""
     stamp = datetime.now().strftime("%Y-%m-%d-%H%M%S")
     for k in range(100):
         path = Path(folder) / (stamp if k == 0 else f"{stamp}-{k}")

@@ -1,13 +1,13 @@
-"""The paper's experiments on the virtual rig, beside the paper's figures: the paper's way and the better way.
+"""The paper's experiments on the virtual rig, processed in the paper's way and in the most exact ("better") way.
 
-``scenery``      what stands in the ring and which images it takes
-``darkroom``     renders them once and keeps them
-``folders``      session folders of them, in the form that captures and imports make
-``experiments``  the line from images to findings
+``scenery``      the scenes of each experiment and the images taken of them
+``image_cache``  renders each image once and keeps it
+``folders``      session folders of rendered images
+``experiments``  the sequence from images to figures
 ``calibration``  Tables 1 and 2, Fig. 6, exact lines of sight
-``cylinder``     diameter, Fig. 7, the systematic errors apart
-``limb``         Fig. 9, clean and spoilt
-``figures``      one figure with its aim; ``report``, ``plots`` show them
+``cylinder``     diameter, Fig. 7, the systematic errors separated
+``limb``         Fig. 9, in undisturbed and in spoilt images
+``figures``      a figure with its aim; ``report`` and ``plots`` show them
 """
 
 from ringdic_controller.studies.validate.run import run_validation

@@ -1,4 +1,4 @@
-"""The calibration against the true cameras: Tables 1 and 2, the moved target of Fig. 6, and exact lines of sight."""
+"""Calibrations compared with the true cameras: Tables 1 and 2, Fig. 6, and the diameter from exact pixels."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _SIXTY_DEGREES = 0.5
 
 
 def true_camera(camera: VirtualCamera) -> Camera:
-    """The true camera of the virtual rig as a camera of the library."""
+    """The library's `Camera` with the true pose and lens of a camera of the virtual rig."""
     size = camera.width, camera.height
     lens = Intrinsics(camera.K, camera.distortion, size)
     P = lens.K_undistorted @ np.column_stack([camera.R, camera.t])
@@ -49,13 +49,16 @@ def true_camera(camera: VirtualCamera) -> Camera:
 
 
 def table_1(rings: Mapping[str, CalibratedRig], true: Mapping[str, Camera], scale: float) -> Findings:
-    """Mean and standard deviation of the intrinsics over the cameras, at full scale, and their RMS error."""
+    """Intrinsics (Table 1): mean and standard deviation over the cameras, at full scale, and RMS error.
+
+    rings : calibrations by way of processing. true : true cameras by id. scale : of the images.
+    """
     inner = {way: _inner({id_: each.camera for id_, each in ring.cameras.items()}) for way, ring in rings.items()}
     truth = _inner(true)
     figures = []
     for k, (name, unit, paper, digits) in enumerate(_TABLE_1):
         size = 1.0 / scale if unit == "px" else 1.0
-        shift = 0.5 * (size - 1.0) if name in ("cx", "cy") else 0.0  # a small pixel's centre is that of several
+        shift = 0.5 * (size - 1.0) if name in ("cx", "cy") else 0.0  # pixel centres: x_full = (x + 0.5) / scale - 0.5
         means = {way: size * each[:, k].mean() + shift for way, each in {"true": truth, **inner}.items()}
         spread = {"true": size * truth[:, k].std(), **{way: size * each[:, k].std() for way, each in inner.items()}}
         rms = {way: size * float(np.sqrt(np.mean((each[:, k] - truth[:, k]) ** 2))) for way, each in inner.items()}
@@ -69,7 +72,7 @@ def table_1(rings: Mapping[str, CalibratedRig], true: Mapping[str, Camera], scal
 
 
 def table_2(rings: Mapping[str, CalibratedRig], pairs: tuple[tuple[str, str], ...]) -> Findings:
-    """Reconstruction error of the control points over all pairs."""
+    """Reconstruction error of the control points over all camera pairs (Table 2)."""
     means, rms, curves = {}, {}, {}
     for way, ring in rings.items():
         each = [control_points(ring.cameras[a], ring.cameras[b]) for a, b in pairs]
@@ -88,7 +91,10 @@ def table_2(rings: Mapping[str, CalibratedRig], pairs: tuple[tuple[str, str], ..
 def figure_6(
     rings: Mapping[str, CalibratedRig], rig: Rig, images: Mapping[str, Path], pairs: tuple[tuple[str, str], ...]
 ) -> Findings:
-    """The target moved by the stage: length of the motion, and misfit of the control points superimposed rigidly."""
+    """The target moved by a stage (Fig. 6): length of the motion, and residual of the control points after a rigid fit.
+
+    images : of the moved target, by camera.
+    """
     lengths, misfits, curves = {}, {}, {}
     for way, ring in rings.items():
         moved = {id_: _moved_dots(ring.cameras[id_], rig, image) for id_, image in images.items()}
@@ -112,7 +118,7 @@ def figure_6(
 
 @dataclass(frozen=True)
 class ExactRays:
-    """Exact pixels of points on a perfect cylinder, in the pairs of cameras that see them under 60°.
+    """Exact pixels of points on a perfect cylinder, for each camera pair that sees them at less than 60° to the normal.
 
     pairs : P pairs of camera ids. px : of each pair (2, n, 2) px, distorted, in its first and second camera.
     """
@@ -122,15 +128,15 @@ class ExactRays:
 
     @classmethod
     def of(cls, true: Mapping[str, Camera], pairs: tuple[tuple[str, str], ...], radius: float = 57.0) -> ExactRays:
-        """Exact pixels of points every three degrees and twenty millimetres, by the true cameras."""
+        """Project points every three degrees and twenty millimetres into the true cameras."""
         angle, z = (a.ravel() for a in np.meshgrid(np.arange(0, 2 * np.pi, np.pi / 60), np.linspace(15, 235, 12)))
         normals = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
         xyz = radius * normals + np.outer(z, [0, 0, 1])
-        seen = []
+        pixels = []
         for pair in pairs:
             both = np.min([true[id_].incidence_cosine(xyz, normals) for id_ in pair], axis=0) > _SIXTY_DEGREES
-            seen.append(np.stack([true[id_].project(xyz[both]) for id_ in pair]))
-        return cls(pairs, tuple(seen))
+            pixels.append(np.stack([true[id_].project(xyz[both]) for id_ in pair]))
+        return cls(pairs, tuple(pixels))
 
     def diameter_bias(self, cameras: Mapping[str, Camera]) -> float:
         """Diameter of the cylinder fitted to these points triangulated with a calibration, minus the true one, mm."""
@@ -139,13 +145,13 @@ class ExactRays:
 
 
 def _inner(cameras: Mapping[str, Camera]) -> Floats:
-    """fx fy s cx cy k1 k2 p1 p2 k3 of every camera that has a lens. (C, 10)."""
+    """Intrinsics fx fy s cx cy k1 k2 p1 p2 k3 of every camera that has a lens, (C, 10)."""
     lenses = [camera.intrinsics for camera in cameras.values() if camera.intrinsics is not None]
     return np.array([[L.K[0, 0], L.K[1, 1], L.K[0, 1], L.K[0, 2], L.K[1, 2], *L.distortion] for L in lenses])
 
 
 def _moved_dots(calibration: CameraCalibration, rig: Rig, image: Path) -> DotObservations:
-    """The dots of a further image of the target."""
+    """Dots found and numbered in the image of the moved target by one camera."""
     camera = calibration.camera
     entry = rig.camera(camera.id)
     return identify_dots(
@@ -161,7 +167,7 @@ def _moved_dots(calibration: CameraCalibration, rig: Rig, image: Path) -> DotObs
 def _stage_points(
     ring: CalibratedRig, rig: Rig, pair: tuple[str, str], moved: Mapping[str, DotObservations]
 ) -> tuple[Floats, Floats]:
-    """The dots that a pair sees before and after the motion. Two of (n, 3) mm."""
+    """Positions of the dots that a camera pair sees, before and after the motion: two arrays (n, 3) mm."""
     calibrations = [ring.cameras[id_] for id_ in pair]
     observed = [each.dots for each in calibrations] + [moved[id_] for id_ in pair]
     places = [
@@ -173,7 +179,7 @@ def _stage_points(
     cameras = [each.camera for each in calibrations]
     before = np.stack([each.dot_centres[rows] for each, rows in zip(calibrations, chosen[:2], strict=True)])
     after = np.stack([each.px[rows] for each, rows in zip(observed[2:], chosen[2:], strict=True)])
-    if ring.bundle is not None:  # the adjustment knows centroids from centres
+    if ring.bundle is not None:  # the bundle adjustment distinguishes a dot's centroid from its projected centre
         rows, columns = (np.array(names) for names in zip(*common, strict=True))
         after -= np.stack(
             [centroid_shift(each, rig.target, rows, columns, translation=np.array(STAGE)) for each in cameras]

@@ -24,7 +24,7 @@ ALL, PAIRS = "all views", "pairs"
 
 @dataclass(frozen=True)
 class CylinderRun:
-    """A run of one way of processing over the images of the cylinder. cameras : as this way calibrated them, by id."""
+    """Results of the speckled cylinder by one way of processing. cameras : as calibrated by this way, by id."""
 
     results: Results
     cameras: Mapping[str, Camera]
@@ -32,7 +32,7 @@ class CylinderRun:
 
     @classmethod
     def of(cls, results: Results) -> CylinderRun:
-        """The run whose results these are."""
+        """Take cameras and matches from the results of a run."""
         return cls(results, {camera.id: camera for camera in results.cameras}, Tracks.of(results))
 
     def cloud(self, pairs: tuple[tuple[str, str], ...], step: int | None = None) -> Floats:
@@ -44,7 +44,7 @@ class CylinderRun:
 
 
 def diameter(runs: Mapping[str, CylinderRun], pairs: tuple[tuple[str, str], ...]) -> Findings:
-    """Figures of the fitted cylinder: its diameter, and the standard deviation of twice the points' radii."""
+    """Diameter of the fitted cylinder and standard deviation of twice the points' radii."""
     fits = {way: fitted_cylinder(run.results.vertices_ref) for way, run in runs.items()}
     single = {way: fitted_cylinder(np.concatenate(run.cloud(pairs))) for way, run in runs.items()}
     bias = {way: fit.diameter - TRUE for way, fit in fits.items()}
@@ -59,19 +59,19 @@ def diameter(runs: Mapping[str, CylinderRun], pairs: tuple[tuple[str, str], ...]
 
 def figure_7a(runs: Mapping[str, CylinderRun], pairs: tuple[tuple[str, str], ...]) -> Findings:
     """Merging mismatch: the distance between points measured by two pairs that share a camera (Fig. 7a)."""
-    found = {way: mismatch(run.tracks, run.cameras, pairs) for way, run in runs.items()}
-    mean = {way: float(each.mean()) for way, each in found.items() if len(each)}
-    spread = {way: float(each.std()) for way, each in found.items() if len(each)}
+    distances = {way: mismatch(run.tracks, run.cameras, pairs) for way, run in runs.items()}
+    mean = {way: float(each.mean()) for way, each in distances.items() if len(each)}
+    spread = {way: float(each.std()) for way, each in distances.items() if len(each)}
     figures = (
         Figure("Fig. 7a", "merging mismatch, mean", "mm", mean, "0.06", 0.005),
         Figure("Fig. 7a", "merging mismatch, STD", "mm", spread, "0.03"),
     )
-    return Findings(figures, found)
+    return Findings(figures, distances)
 
 
 @dataclass(frozen=True)
 class _Steps:
-    """Errors of each step: mean and std (F - 1, 3) mm; strain (F - 1, 2), median and 95th percentile of |E|."""
+    """Errors of each step: mean and std of displacement, (F - 1, 3) mm; strain (F - 1, 2): median and 95 % of |E|."""
 
     mean: Floats
     std: Floats
@@ -83,10 +83,10 @@ def figure_7b(runs: Mapping[str, CylinderRun], surface: Cylinder, pairs: tuple[t
     every = {way: _all_views(run, surface) for way, run in runs.items()}
     single = {way: _from_pairs(run, surface, pairs) for way, run in runs.items()}
     figures: list[Figure] = []
-    for name, found, std_limit in ((ALL, every, 0.0007), (PAIRS, single, 0.001)):
+    for name, steps_of, std_limit in ((ALL, every, 0.0007), (PAIRS, single, 0.001)):
         for when, rows in (("first step", slice(0, 1)), ("worst of all steps", slice(None))):
-            mean = {way: float(np.abs(each.mean[rows]).max()) for way, each in found.items()}
-            std = {way: float(each.std[rows].max()) for way, each in found.items()}
+            mean = {way: float(np.abs(each.mean[rows]).max()) for way, each in steps_of.items()}
+            std = {way: float(each.std[rows].max()) for way, each in steps_of.items()}
             figures += [
                 Figure("Fig. 7b", f"displacement, |mean|, {name}, {when}", "mm", mean, "0.01", 0.0003, digits=5),
                 Figure("Fig. 7b", f"displacement, STD, {name}, {when}", "mm", std, "0.01", std_limit, digits=5),
@@ -104,11 +104,12 @@ def figure_7b(runs: Mapping[str, CylinderRun], surface: Cylinder, pairs: tuple[t
     return Findings(tuple(figures), curves)
 
 
-def apart(
+def separate_errors(
     runs: Mapping[str, CylinderRun], rays: ExactRays, true: Mapping[str, Camera], uncorrected: Mapping[str, Camera]
 ) -> Findings:
-    """The two systematic errors separated: the calibration on exact pixels, the matching with the true cameras.
+    """Diameter errors of the calibration and of the matching, each without the other.
 
+    The calibration is applied to exact pixels (``rays``), the matches are triangulated with the true cameras.
     uncorrected : the paper's cameras without correction of distortion.
     """
     calibration = {way: rays.diameter_bias(run.cameras) for way, run in runs.items()}
@@ -136,22 +137,22 @@ def apart(
     return Findings(tuple(figures))
 
 
-def print_errors(runs: Mapping[str, CylinderRun]) -> Findings:
-    """Diameter after a calibration on a target whose dots are printed off their places."""
+def diameter_with_print_errors(runs: Mapping[str, CylinderRun]) -> Findings:
+    """Diameter error after a calibration with a target whose dots have print errors."""
     bias = {way: fitted_cylinder(run.results.vertices_ref).diameter - TRUE for way, run in runs.items()}
     return Findings((Figure("print errors 0.03 mm", "diameter bias", "mm", bias, "", 0.005),))
 
 
 def _all_views(run: CylinderRun, surface: Cylinder) -> _Steps:
-    found = errors(run.results, surface)
+    deviations = errors(run.results, surface)
     steps = range(1, len(run.results.steps))
     strain = []
     for step in steps:
         magnitude = run.results.deformation(step).E_magnitude
         strain.append([np.nanmedian(magnitude), np.nanpercentile(magnitude, 95)])
     return _Steps(
-        np.array([np.nanmean(found.displacement[step], axis=0) for step in steps]),
-        np.array([np.nanstd(found.displacement[step], axis=0) for step in steps]),
+        np.array([np.nanmean(deviations.displacement[step], axis=0) for step in steps]),
+        np.array([np.nanstd(deviations.displacement[step], axis=0) for step in steps]),
         np.array(strain),
     )
 

@@ -21,15 +21,15 @@ from ringdic_node.virtual_rig.scenes import Cylinder, Specimen
 from ringdic_controller.studies.validate.calibration import ExactRays, figure_6, table_1, table_2, true_camera
 from ringdic_controller.studies.validate.cylinder import (
     CylinderRun,
-    apart,
     diameter,
+    diameter_with_print_errors,
     figure_7a,
     figure_7b,
-    print_errors,
+    separate_errors,
 )
-from ringdic_controller.studies.validate.darkroom import Darkroom, RenderedShot
 from ringdic_controller.studies.validate.figures import PAPER, Figure, Findings
 from ringdic_controller.studies.validate.folders import make_session
+from ringdic_controller.studies.validate.image_cache import ImageCache, RenderedShot
 from ringdic_controller.studies.validate.limb import LimbRun, compare_spoilt, figure_9
 from ringdic_controller.studies.validate.scenery import Scenery
 
@@ -47,10 +47,11 @@ _SCENES = {
 
 @dataclass
 class Validation:
-    """The rig, the folder of everything written, and the ways of processing by name.
+    """The experiments on one simulated rig: renders, calibrates and processes them, and gathers their figures.
 
-    Sessions and results that are there already are used again where they were made with the same settings; a run is
-    not repeated when the program changes: remove ``sessions/*/results`` for that.
+    folder : receives images, sessions and results. scenery : scenes and views. ways : settings of the processing by
+    name. Existing sessions, and results made with the same settings, are used again, even if the program has changed
+    since; remove ``sessions/*/results`` to process again.
     """
 
     folder: Path
@@ -65,7 +66,7 @@ class Validation:
     def __post_init__(self) -> None:
         self.rig = parse_rig(self.scenery.rig.rig_toml())
         self.true = {camera.id: true_camera(camera) for camera in self.scenery.rig.cameras}
-        self.darkroom = Darkroom(self.folder / "images")
+        self.image_cache = ImageCache(self.folder / "images")
 
     @property
     def pairs(self) -> tuple[tuple[str, str], ...]:
@@ -73,28 +74,28 @@ class Validation:
         return self.rig.pairs
 
     def run(self, experiments: Sequence[str] = EXPERIMENTS) -> dict[str, Findings]:
-        """The findings of the experiments by figure of the paper."""
-        found: dict[str, Findings] = {}
+        """Run the experiments; figures and curves by table or figure of the paper."""
+        findings: dict[str, Findings] = {}
         rings = self._rings()
         if "calibration" in experiments:
-            found |= self._calibration(rings)
+            findings |= self._calibration(rings)
         if "cylinder" in experiments:
-            found |= self._cylinder(rings)
+            findings |= self._cylinder(rings)
         if "printed" in experiments:
             runs = {way: CylinderRun.of(results) for way, results in self._process("printed", 1).items()}
-            found["printed"] = print_errors(runs)
+            findings["printed"] = diameter_with_print_errors(runs)
         if "limb" in experiments or "spoilt" in experiments:
-            found |= self._limb("spoilt" in experiments)
-        return found
+            findings |= self._limb("spoilt" in experiments)
+        return findings
 
     def render(self, experiments: Sequence[str] = EXPERIMENTS) -> None:
         """Render the images of these experiments that are missing."""
         for name in dict.fromkeys(("moved", *(name for each in experiments for name in _SCENES[each]))):
-            self._develop(name)
+            self._render_missing(name)
 
     def _calibration(self, rings: Mapping[str, CalibratedRig]) -> dict[str, Findings]:
-        self._develop("moved")
-        images = {id_: self.darkroom.path(shot) for id_, shot in self.scenery.shots("moved")[0].items()}
+        self._render_missing("moved")
+        images = {id_: self.image_cache.path(shot) for id_, shot in self.scenery.shots("moved")[0].items()}
         uncorrected = {"paper's, no correction": self._uncorrected()} if PAPER in self.ways else {}
         return {
             "table_1": table_1(rings, self.true, self.scenery.scale),
@@ -109,7 +110,7 @@ class Validation:
         rays = ExactRays.of(self.true, self.pairs)
         return {
             "diameter": diameter(runs, self.pairs),
-            "apart": apart(runs, rays, self.true, uncorrected),
+            "apart": separate_errors(runs, rays, self.true, uncorrected),
             "figure_7a": figure_7a(runs, self.pairs),
             "figure_7b": figure_7b(runs, Cylinder(), self.pairs),
         }
@@ -118,21 +119,21 @@ class Validation:
         cameras = self.scenery.rig.cameras
         scenes = _specimens(self.scenery, "limb")
         clean = {way: LimbRun.of(results, scenes) for way, results in self._process("limb").items()}
-        found = {"figure_9": figure_9(clean, scenes, cameras)}
+        findings = {"figure_9": figure_9(clean, scenes, cameras)}
         if with_spoilt:
             scenes = _specimens(self.scenery, "spoilt")
             runs = {way: LimbRun.of(results, scenes) for way, results in self._process("spoilt").items()}
-            found["spoilt"] = compare_spoilt(runs, clean, scenes, cameras)
-        return found
+            findings["spoilt"] = compare_spoilt(runs, clean, scenes, cameras)
+        return findings
 
     def _rings(self) -> dict[str, CalibratedRig]:
-        """The cameras as each way calibrates them; kept in the calibration's session for all others."""
+        """The cameras as calibrated by each way; all other sessions take the calibrations over from this one."""
         session = open_session(self._session("calibration"))
         rings = {}
         for way, settings in self.ways.items():
             began = self.clock()
             rings[way] = calibrate_rig(session, settings.calibration, self._step(f"calibrate, {way}"))
-            self._took(f"calibration, {way}", began)
+            self._add_seconds(f"calibration, {way}", began)
         return rings
 
     def _uncorrected(self) -> CalibratedRig:
@@ -140,22 +141,22 @@ class Validation:
         return calibrate_rig(session, CalibrationGroup(method="dlt", distortion=False))
 
     def _process(self, name: str, steps: int | None = None) -> dict[str, Results]:
-        """The results of every way over an experiment; those there already with the same settings are read."""
+        """Results of an experiment by every way; a run that exists with the same settings is only read."""
         session = self._session(name, steps)
-        found = {}
+        findings = {}
         for way, settings in self.ways.items():
             run = _run_with(session, settings)
             if run is None:
                 began = self.clock()
                 run = process_session(session, settings, self._renamed(f"{name}, {way}"))
-                self._took(f"{name}, {way}", began)
-            found[way] = read_results(run / "results.h5")
-        return found
+                self._add_seconds(f"{name}, {way}", began)
+            findings[way] = read_results(run / "results.h5")
+        return findings
 
     def _session(self, name: str, steps: int | None = None) -> Path:
         captures: list[tuple[str, Mapping[str, RenderedShot]]] = []
         for scenes in _SCENES[name]:
-            self._develop(scenes)
+            self._render_missing(scenes)
             kind = _KINDS.get(scenes, "specimen")
             shots = self.scenery.shots(scenes)
             captures += [(kind, each) for each in (shots[:steps] if kind == "specimen" else shots)]
@@ -166,17 +167,17 @@ class Validation:
             path,
             self.scenery.rig.rig_toml(),
             captures,
-            self.darkroom,
+            self.image_cache,
             calibration=None if path == calibrated else calibrated,
         )
 
-    def _develop(self, name: str) -> None:
+    def _render_missing(self, name: str) -> None:
         shots = [shot for scene in self.scenery.shots(name) for shot in scene.values()]
         began = self.clock()
-        rendered = sum(not self.darkroom.path(shot).is_file() for shot in shots)
-        self.darkroom.develop(shots, lambda done: self.report(Progress("render", done, name)))
+        rendered = sum(not self.image_cache.path(shot).is_file() for shot in shots)
+        self.image_cache.render_missing(shots, lambda done: self.report(Progress("render", done, name)))
         if rendered:
-            self._took(f"render {name}, {rendered} images", began)
+            self._add_seconds(f"render {name}, {rendered} images", began)
 
     def _step(self, stage: str) -> Callable[[float, str], None]:
         return lambda done, message: self.report(Progress(stage, done, message))
@@ -188,13 +189,13 @@ class Validation:
 
         return report
 
-    def _took(self, what: str, began: float) -> None:
+    def _add_seconds(self, what: str, began: float) -> None:
         self.seconds[what] = round(self.seconds.get(what, 0.0) + self.clock() - began, 1)
 
 
-def figures(found: Mapping[str, Findings]) -> list[Figure]:
-    """All figures in order."""
-    return [figure for each in found.values() for figure in each.figures]
+def figures(findings: Mapping[str, Findings]) -> list[Figure]:
+    """The figures of all experiments in one list."""
+    return [figure for each in findings.values() for figure in each.figures]
 
 
 def _specimens(scenery: Scenery, name: str) -> list[Specimen]:

@@ -1,4 +1,4 @@
-"""One figure of the comparison: the paper's, what is aimed at, and what each way reached."""
+"""Figures of the comparison: a quantity by each way of processing, beside the paper's value and the aim."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ PAPER, BETTER = "paper's way", "better way"
 
 @dataclass(frozen=True)
 class Figure:
-    """A quantity of an experiment.
+    """One quantity of one experiment: its value by each way, the paper's value and the aim.
 
-    paper : the paper's figure as text, with its unit. limit : the largest magnitude aimed at for the better way, in
-    ``unit``, or the least value where ``least``; None where nothing is aimed at. values : by way.
+    values : by way of processing. paper : the paper's value as text. limit : the largest magnitude aimed at for the
+    better way, in ``unit``, or the least value if ``least``; None where nothing is aimed at.
     """
 
     experiment: str
@@ -29,21 +29,21 @@ class Figure:
 
     @property
     def reached(self) -> bool | None:
-        """Whether the better way is where it should be; None where nothing is aimed at or nothing was measured."""
+        """Whether the better way meets the aim; None where there is no aim or no value."""
         value = self.values.get(BETTER)
         if self.limit is None or value is None:
             return None
         return value >= self.limit if self.least else abs(value) <= self.limit
 
     def text(self, value: float | None) -> str:
-        """A value as text, with its unit's number of digits."""
+        """A value as text with the figure's number of digits; empty for None."""
         if value is None:
             return ""
         return "–" if value != value else f"{value:.{self.digits}f}"
 
     @property
     def aim(self) -> str:
-        """What is aimed at, as text."""
+        """The aim as text, such as "≤ 0.0030"; empty without one."""
         if self.limit is None:
             return ""
         return f"{'≥' if self.least else '≤'} {self.text(self.limit)}"
@@ -77,7 +77,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Findings:
-    """The figures of an experiment and what its plots are drawn from."""
+    """Figures of an experiment, and the arrays (curves) that its plots are drawn from."""
 
     figures: tuple[Figure, ...]
     curves: Mapping[str, Any] = field(default_factory=dict)

@@ -9,22 +9,22 @@ from pathlib import Path
 
 from ringdic.session.writer import SessionWriter
 
-from ringdic_controller.studies.validate.darkroom import Darkroom, RenderedShot
+from ringdic_controller.studies.validate.image_cache import ImageCache, RenderedShot
 
 
 def make_session(
     path: Path,
     rig_toml: str,
     captures: Sequence[tuple[str, Mapping[str, RenderedShot]]],
-    darkroom: Darkroom,
+    cache: ImageCache,
     *,
     calibration: Path | None = None,
     wall_ns: Callable[[], int] = time.time_ns,
 ) -> Path:
-    """The session at ``path`` with these captures, each a kind and an image a camera; one that is there is kept.
+    """Make a session folder of rendered images at ``path``, unless there is one, and return its path.
 
-    Images share their file with the darkroom. calibration : a session whose kept calibrations are taken over: they
-    lie under keys of the images, so what does not fit is not used.
+    captures : the kind of each and its images by camera, which share their files with the cache. calibration : a
+    session whose stored calibrations are copied; their keys include the images, so one of other images is not used.
     """
     if not (path / "session.json").is_file():
         shutil.rmtree(path, ignore_errors=True)
@@ -35,11 +35,11 @@ def make_session(
             capture = writer.begin_capture(kind, list(shots))
             for id_, shot in shots.items():
                 size = shot.camera.width, shot.camera.height
-                capture.store_file(id_, darkroom.path(shot), *size, link=True)
+                capture.store_file(id_, cache.path(shot), *size, link=True)
             capture.close()
         aside.rename(path)
     if calibration is not None and (calibration / "calibration").is_dir():
         (path / "calibration").mkdir(exist_ok=True)
-        for kept in (calibration / "calibration").glob("*.json"):
-            shutil.copy2(kept, path / "calibration" / kept.name)
+        for file in (calibration / "calibration").glob("*.json"):
+            shutil.copy2(file, path / "calibration" / file.name)
     return path

@@ -25,7 +25,7 @@ _HOLE = 5.0  # mm²
 
 @dataclass(frozen=True)
 class LimbRun:
-    """A run of one way of processing over the images of the limb. steps : the scene at each step of the run."""
+    """Results of the limb by one way of processing. steps : step of the limb at each step of the results."""
 
     results: Results
     steps: tuple[int, ...]
@@ -33,7 +33,7 @@ class LimbRun:
 
     @classmethod
     def of(cls, results: Results, scenes: Sequence[Specimen]) -> LimbRun:
-        """The run whose results these are. scenes : the limb at each step of the results."""
+        """Compare the results of a run with the truth. scenes : the limb at each step of the results."""
         steps = tuple(scene.step for scene in scenes)
         return cls(results, steps, errors(results, scenes[0].surface, steps))
 
@@ -44,7 +44,7 @@ class LimbRun:
 
     @property
     def wrong(self) -> int:
-        """Number of points that lie off the surface, or whose displacement is off, by more than a millimetre."""
+        """Number of points whose distance from the surface or error of displacement exceeds one millimetre."""
         off = np.abs(self.errors.distance) > _WRONG
         return int((off | (self.displacement > _WRONG).any(axis=0)).sum())
 
@@ -56,10 +56,10 @@ class LimbRun:
 
 
 def figure_9(runs: Mapping[str, LimbRun], scenes: Sequence[Specimen], cameras: Sequence[VirtualCamera]) -> Findings:
-    """Coverage, shape, displacement and stretches of the limb."""
+    """Coverage, shape, displacement, stretches and topology of the limb (Fig. 9)."""
     grid = SurfaceGrid.of(scenes[0])
-    seen, _ = grid.views(cameras)
-    two = grid.area * (seen.sum(axis=0) >= 2)
+    visible, _ = grid.views(cameras)
+    two = grid.area * (visible.sum(axis=0) >= 2)
     covered = {way: float(100 * two[run.covered(grid, 0)].sum() / two.sum()) for way, run in runs.items()}
     distance = {way: _rms(run.errors.distance) for way, run in runs.items()}
     wrong = {way: float(run.wrong) for way, run in runs.items()}
@@ -98,11 +98,11 @@ def compare_spoilt(
     scenes: Sequence[Specimen],
     cameras: Sequence[VirtualCamera],
 ) -> Findings:
-    """Figures of the limb with worn speckles, reflections, bars and JPEG beside the clean one: wrong and lost points.
+    """Wrong and lost points of the limb in images with worn speckles, reflections, bars and JPEG.
 
-    An area is spoilt where a bar, a reflection or a worn patch hides it in an image that sees it under 60°, at the
-    reference or at the step. It is blind where fewer than two cameras see it unspoilt at both. It is lost where the
-    clean run covers it and this one does not.
+    An area is spoilt where a bar, a reflection or a worn patch hides it from a camera that sees it at less than 60° to
+    the normal, at the reference or at the step. It is blind where fewer than two cameras see it unspoilt at both. It is
+    lost where the run of undisturbed images (``clean``) covers it and this one does not.
     """
     grids = [SurfaceGrid.of(scene) for scene in scenes]
     views = [grid.views(cameras) for grid in grids]
@@ -143,7 +143,7 @@ def compare_spoilt(
 
 
 def _topology(meshes: Mapping[str, Mesh]) -> list[Figure]:
-    """Faults of the mesh."""
+    """Figures of the mesh's faults: non-manifold edges, holes, area covered twice."""
     edges = {way: float(len(non_manifold_edges(mesh))) for way, mesh in meshes.items()}
     gaps = {way: float(len(holes(mesh, _HOLE))) for way, mesh in meshes.items()}
     twice = {way: float(overlap_area(mesh, 2.0)) for way, mesh in meshes.items()}
@@ -155,13 +155,13 @@ def _topology(meshes: Mapping[str, Mesh]) -> list[Figure]:
 
 
 def _unnamed(results: Results) -> int:
-    """Points that are lost without a status that says why."""
+    """Number of points that are lost without a status that says why."""
     lost = ~np.isfinite(results.vertices).all(axis=2)
     return int((lost & (results.status == 0)).sum())
 
 
 def _reasons(results: Results) -> str:
-    """How many points were lost for which reason."""
+    """Number of lost points by reason, as text."""
     names = {int(each): each.name.lower() for kind in (Status, LostPoint) for each in kind}
     counts = Counter(results.status[results.status != 0].tolist())
     return ", ".join(f"{count:,} {names.get(code, code)}" for code, count in counts.most_common()) or "none lost"

@@ -18,69 +18,69 @@ _PARAMETERS = ("fx, px", "fy, px", "skew, px", "cx, px", "cy, px", "k1", "k2", "
 _GREY = "#666666"
 
 
-def draw(folder: Path, found: Mapping[str, Findings]) -> dict[str, Path]:
-    """Draw what there is to draw as PNG; the pictures' paths by title."""
+def draw(folder: Path, findings: Mapping[str, Findings]) -> dict[str, Path]:
+    """Draw a PNG picture for each experiment of `_PLOTS` that was run; returns the paths by title."""
     drawn: dict[str, Path] = {}
     for name, (title, plot) in _PLOTS.items():
-        if name not in found:
+        if name not in findings:
             continue
         picture = Picture(figsize=(11, 4.2), layout="constrained")
-        plot(picture, found[name])
+        plot(picture, findings[name])
         picture.suptitle(title)
         drawn[title] = folder / f"{name}.png"
         picture.savefig(drawn[title], dpi=110)
     return drawn
 
 
-def _table_1(picture: Picture, found: Findings) -> None:
+def _table_1(picture: Picture, findings: Findings) -> None:
     axes = picture.subplots(2, 5)
-    truth = found.curves["true"]
+    truth = findings.curves["true"]
     for k, (name, each) in enumerate(zip(_PARAMETERS, axes.ravel(), strict=True)):
-        for way in _ways(found.curves):
-            each.plot(found.curves[way][:, k] - truth[:, k], "o", ms=3, color=_COLOURS[way], label=way)
+        for way in _ways(findings.curves):
+            each.plot(findings.curves[way][:, k] - truth[:, k], "o", ms=3, color=_COLOURS[way], label=way)
         each.axhline(0, color=_GREY, lw=0.8)
         each.set_title(f"{name}, measured − true", fontsize=8)
         each.tick_params(labelsize=7)
     axes[0, 0].legend(fontsize=7)
 
 
-def _table_2(picture: Picture, found: Findings) -> None:
+def _table_2(picture: Picture, findings: Findings) -> None:
     axes = picture.subplots()
-    for k, way in enumerate(_ways(found.curves["rms"])):
-        values = np.array(found.curves["rms"][way])
+    for k, way in enumerate(_ways(findings.curves["rms"])):
+        values = np.array(findings.curves["rms"][way])
         axes.bar(0.8 + np.arange(len(values)) + 0.4 * k, 1000 * values, 0.4, color=_COLOURS[way], label=way)
     _paper(axes, 47.0, "paper: 47 µm", horizontal=True)
     axes.set(xlabel="camera pair", ylabel="RMS of the control points, µm", yscale="log")
     axes.legend()
 
 
-def _figure_6(picture: Picture, found: Findings) -> None:
+def _figure_6(picture: Picture, findings: Findings) -> None:
     axes = picture.subplots()
-    values = {way: 1000 * np.array(found.curves["residuals"][way]) for way in _ways(found.curves["residuals"])}
+    values = {way: 1000 * np.array(findings.curves["residuals"][way]) for way in _ways(findings.curves["residuals"])}
     _histogram(axes, values)
     _paper(axes, 17.0, "paper: RMS 17 µm")
     axes.set(xlabel="control points after 5 mm, superimposed: distance, µm", ylabel="share")
 
 
-def _diameter(picture: Picture, found: Findings) -> None:
+def _diameter(picture: Picture, findings: Findings) -> None:
     axes = picture.subplots()
-    values = {way: 2000 * (found.curves[way]["radii"] - 57.0) for way in _ways(found.curves)}
+    values = {way: 2000 * (findings.curves[way]["radii"] - 57.0) for way in _ways(findings.curves)}
     _histogram(axes, values)
     _paper(axes, -70.0, "paper: −70 ± 270 µm")
     axes.set(xlabel="diameter of each point − 114 mm, µm", ylabel="share")
 
 
-def _figure_7a(picture: Picture, found: Findings) -> None:
+def _figure_7a(picture: Picture, findings: Findings) -> None:
     axes = picture.subplots()
-    _histogram(axes, {way: 1000 * found.curves[way] for way in _ways(found.curves)})
+    _histogram(axes, {way: 1000 * findings.curves[way] for way in _ways(findings.curves)})
     _paper(axes, 60.0, "paper: 60 ± 30 µm")
     axes.set(xlabel="the same point from two pairs: distance, µm", ylabel="share")
 
 
-def _figure_7b(picture: Picture, found: Findings) -> None:
+def _figure_7b(picture: Picture, findings: Findings) -> None:
     left, right = picture.subplots(1, 2)
-    for way in _ways(found.curves):
-        each = found.curves[way]
+    for way in _ways(findings.curves):
+        each = findings.curves[way]
         steps = 1 + np.arange(len(each["mean"]))
         for k, (name, style) in enumerate(zip("xyz", ("o-", "s--", "^:"), strict=True)):
             mean, std = 1000 * each["mean"][:, k], 1000 * each["std"][:, k]
@@ -95,11 +95,11 @@ def _figure_7b(picture: Picture, found: Findings) -> None:
     right.legend(fontsize=7)
 
 
-def _figure_9(picture: Picture, found: Findings) -> None:
-    ways = _ways(found.curves)
+def _figure_9(picture: Picture, findings: Findings) -> None:
+    ways = _ways(findings.curves)
     axes = picture.subplots(1, len(ways) + 1, width_ratios=[2] * len(ways) + [1.3])
     for way, each in zip(ways, axes[:-1], strict=True):
-        curves = found.curves[way]
+        curves = findings.curves[way]
         shown = each.scatter(
             np.degrees(curves["theta"]) % 360, curves["z"], c=1000 * curves["error"], s=0.5, vmin=0, vmax=15,
             cmap="viridis", rasterized=True,
@@ -108,20 +108,20 @@ def _figure_9(picture: Picture, found: Findings) -> None:
         each.title.set_fontsize(9)
         picture.colorbar(shown, ax=each)
     for way in ways:
-        values = 1000 * np.array(found.curves[way]["displacement"])
+        values = 1000 * np.array(findings.curves[way]["displacement"])
         axes[-1].plot(1 + np.arange(len(values)), values, "o-", color=_COLOURS[way], label=way)
     axes[-1].set(xlabel="step", ylabel="displacement error, RMS, µm", ylim=(0, None))
     axes[-1].legend(fontsize=7)
 
 
-def _spoilt(picture: Picture, found: Findings) -> None:
-    ways = _ways(found.curves["lost"])
-    grid = found.curves["grid"]
+def _spoilt(picture: Picture, findings: Findings) -> None:
+    ways = _ways(findings.curves["lost"])
+    grid = findings.curves["grid"]
     extent = (0.0, 360.0, float(grid.z.min()), float(grid.z.max()))
     axes = picture.subplots(1, len(ways) + 1)
-    state = np.where(found.curves["blind"], 2, np.where(found.curves["hit"], 1, 0))
+    state = np.where(findings.curves["blind"], 2, np.where(findings.curves["hit"], 1, 0))
     pictures = {"spoilt in a view (1), too few views left (2)": state}
-    pictures |= {f"lost, {way}": found.curves["lost"][way] for way in ways}
+    pictures |= {f"lost, {way}": findings.curves["lost"][way] for way in ways}
     for each, (title, values) in zip(axes, pictures.items(), strict=True):
         each.imshow(values, origin="lower", extent=extent, aspect="auto", cmap="magma_r", interpolation="nearest")
         each.set(title=title, xlabel="angle, degrees", ylabel="height, mm")

@@ -1,4 +1,4 @@
-"""The findings as a table on the terminal, as JSON, and as a page of Markdown with plots."""
+"""The figures as tables for the terminal, as JSON, and as a page of Markdown with plots."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from ringdic_controller.studies.validate.figures import BETTER, PAPER, Figure
 
-#: What tells of the systematic errors of calibration and matching is this many times larger the paper's way.
+#: A figure shows the systematic errors if it is at least this many times larger by the paper's way.
 _SEEN = 3.0
 #: The paper's figures of quality, by experiment and the beginning of their name.
 _QUALITY = (
@@ -24,7 +24,7 @@ _QUALITY = (
 
 
 def rows(figures: Sequence[Figure], ways: Sequence[str]) -> list[dict[str, str]]:
-    """The figures as rows of a table; a column for every way that has a value anywhere, none that is empty."""
+    """The figures as rows of a table, with a column for every way; empty columns are left out."""
     names = list(dict.fromkeys([*ways, *(way for figure in figures for way in figure.values)]))
     table = [figure.row(names) for figure in figures]
     filled = [name for name in (table[0] if table else {}) if any(row[name] for row in table)]
@@ -32,7 +32,10 @@ def rows(figures: Sequence[Figure], ways: Sequence[str]) -> list[dict[str, str]]
 
 
 def blindness(figures: Sequence[Figure]) -> list[dict[str, str]]:
-    """Which figures of quality see that the paper's way is wrong: rows of both ways' magnitudes and a verdict."""
+    """Table of the paper's figures of quality: does each show the systematic errors of the paper's way?
+
+    A row has the magnitude by both ways and a verdict.
+    """
     table = []
     for experiment, name in _QUALITY:
         for figure in figures:
@@ -53,7 +56,7 @@ def blindness(figures: Sequence[Figure]) -> list[dict[str, str]]:
 
 
 def summary(figures: Sequence[Figure], about: Mapping[str, Any]) -> dict[str, Any]:
-    """Everything as JSON values."""
+    """All figures, the number of aims reached and a description of the run (``about``) as JSON values."""
     judged = [figure for figure in figures if figure.reached is not None]
     return {
         **about,
@@ -69,18 +72,19 @@ def write(
     folder: Path, figures: Sequence[Figure], ways: Sequence[str], about: Mapping[str, Any], plots: Mapping[str, Path]
 ) -> dict[str, Any]:
     """Write ``validation.json`` and ``validation.md`` and return the summary."""
-    found = summary(figures, about)
-    (folder / "validation.json").write_text(json.dumps(found, indent=1, ensure_ascii=False), encoding="utf-8")
-    (folder / "validation.md").write_text(_page(figures, ways, found, plots), encoding="utf-8")
-    return found
+    totals = summary(figures, about)
+    (folder / "validation.json").write_text(json.dumps(totals, indent=1, ensure_ascii=False), encoding="utf-8")
+    (folder / "validation.md").write_text(_page(figures, ways, totals, plots), encoding="utf-8")
+    return totals
 
 
-def _page(figures: Sequence[Figure], ways: Sequence[str], found: Mapping[str, Any], plots: Mapping[str, Path]) -> str:
+def _page(figures: Sequence[Figure], ways: Sequence[str], totals: Mapping[str, Any], plots: Mapping[str, Path]) -> str:
     lines = [
         "# The paper's experiments on the virtual rig",
         "",
-        f"{found['cameras']} cameras of {found['size'][0]} × {found['size'][1]} px, subset radius "
-        f"{found['radius_px']} px, step {found['step_px']} px; {found['reached']} of {found['aimed_at']} aims reached.",
+        f"{totals['cameras']} cameras of {totals['size'][0]} × {totals['size'][1]} px, subset radius "
+        f"{totals['radius_px']} px, step {totals['step_px']} px; "
+        f"{totals['reached']} of {totals['aimed_at']} aims reached.",
         "The paper: D. Solav et al., IEEE Access 6 (2018) 30520.",
         "",
         *_table(rows(figures, ways)),
@@ -93,7 +97,7 @@ def _page(figures: Sequence[Figure], ways: Sequence[str], found: Mapping[str, An
     lines += [
         *(f"![{name}]({path.name})" for name, path in plots.items()),
         "",
-        *_table([{"step": name, "seconds": f"{value:.1f}"} for name, value in found["seconds"].items()]),
+        *_table([{"step": name, "seconds": f"{value:.1f}"} for name, value in totals["seconds"].items()]),
     ]
     return "\n".join(lines)
 

@@ -1,4 +1,4 @@
-"""``ringdic validate``: from a scale to tables, JSON, Markdown and plots."""
+"""``ringdic validate``: run the experiments at a scale and write tables, JSON, Markdown and plots."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def run_validation(
     """Run the experiments both ways, write the comparison into ``folder`` and return it as JSON values.
 
     quick : fewer views of the board and fewer steps. only : names of experiments; all if empty. images_only : render
-    what is missing and stop. What lies in the folder from an earlier run with the same settings is used again.
+    missing images and stop. Images and results of an earlier run with the same settings in the folder are used again.
     Raises InputError for an experiment that does not exist.
     """
     unknown = [name for name in only if name not in EXPERIMENTS]
@@ -46,8 +46,8 @@ def run_validation(
         if images_only:
             validation.render(chosen)
             return {"folder": str(folder), "seconds": validation.seconds}
-        found = validation.run(chosen)
-    shown = figures(found)
+        findings = validation.run(chosen)
+    shown = figures(findings)
     camera = scenery.rig.cameras[0]
     about = {
         "folder": str(folder),
@@ -59,16 +59,16 @@ def run_validation(
         "step_px": ways[PAPER].correlation.step_px,
         "seconds": {**validation.seconds, "all": round(time.monotonic() - began, 1)},
     }
-    plots = draw(folder, found)
-    written = report.write(folder, shown, list(ways), about, plots)
+    plots = draw(folder, findings)
+    totals = report.write(folder, shown, list(ways), about, plots)
     for experiment in dict.fromkeys(figure.experiment for figure in shown):
         own = [figure for figure in shown if figure.experiment == experiment]
         show_table(experiment, report.rows(own, list(ways)))
     show_table("which figures see the systematic errors of the paper's way", report.blindness(shown))
-    say(f"{written['reached']} of {written['aimed_at']} aims reached; tables and plots in {folder}")
-    return written
+    say(f"{totals['reached']} of {totals['aimed_at']} aims reached; tables and plots in {folder}")
+    return totals
 
 
 def scaled(settings: Settings, scale: float) -> Settings:
-    """The settings of full scale at a smaller one, with no fewer pixels than a subset needs."""
+    """Settings for images of a smaller scale; the subsets keep the least size that they need."""
     return settings.model_copy(update={"correlation": settings.correlation.at_scale(scale)})

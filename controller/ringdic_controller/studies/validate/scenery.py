@@ -27,7 +27,7 @@ from ringdic_node.virtual_rig.scenes import (
     TargetScene,
 )
 
-from ringdic_controller.studies.validate.darkroom import RenderedShot
+from ringdic_controller.studies.validate.image_cache import RenderedShot
 
 STAGE = (5.0, 0.0, 0.0)  # mm, by which the target is moved
 PRINT_ERROR = 0.03  # mm, of every dot in each direction
@@ -41,7 +41,7 @@ _LAMPS = ((460.0, 195.0, 250.0), (-430.0, 260.0, 60.0), (40.0, -500.0, 180.0))
 
 @dataclass(frozen=True)
 class Scenery:
-    """The paper's rig at a scale, and how many views and steps are taken.
+    """The scenes of all experiments: the paper's rig at a scale, and the numbers of views and steps.
 
     boards : views of the checkerboard a camera. cylinder, limb : steps after the reference. spoilt_step : the step of
     the limb at which its spoilt images are taken, after the spoilt reference.
@@ -83,7 +83,7 @@ class Scenery:
         raise ValueError(f"there is no experiment '{name}'")
 
     def shots(self, name: str) -> list[Mapping[str, RenderedShot]]:
-        """The images of one experiment: for each scene one of every camera, by its id."""
+        """The images of one experiment: for each scene, one image by camera id."""
         jpeg = JPEG if name == "spoilt" else None
         return [
             {
@@ -95,7 +95,7 @@ class Scenery:
 
 
 def _damage(later: bool) -> Damage:
-    """Worn speckles, lamps and bars of the reference, and of a later step: more worn off, the bars elsewhere."""
+    """Worn speckles, lamps and bars at the reference, or at a later step with more worn speckles and moved bars."""
     turn = 0.35 if later else 0.0
     cable = Bar(_about(1.2 + turn, 92.0, 20.0), _about(1.6 + turn, 92.0, 230.0), 4.0)
     hand = Bar(_about(4.0 - turn, 110.0, 70.0), _about(4.0 - turn, 110.0, 100.0), 14.0)

@@ -1,4 +1,4 @@
-"""A cylinder fitted to points, as the paper measures a diameter."""
+"""Least-squares cylinder through points, by which the paper measures a diameter."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from scipy.optimize import least_squares
 
 @dataclass(frozen=True)
 class FittedCylinder:
-    """A cylinder fitted to points.
+    """A cylinder fitted to n points.
 
-    diameter : mm. spread : standard deviation of the points' own diameters, mm. radial : (n,) distances, mm."""
+    diameter : mm. spread : standard deviation of twice the points' radii, mm. radial : (n,) distances from the surface,
+    outside positive, mm.
+    """
 
     diameter: float
     spread: float
@@ -30,5 +32,5 @@ def fitted_cylinder(points: Floats, radius: float = 57.0) -> FittedCylinder:
         offset = points - [q[0], q[1], middle]
         return np.asarray(np.linalg.norm(offset - np.outer(offset @ axis, axis), axis=1) - q[4])
 
-    found = least_squares(misfit, [0.0, 0.0, 0.0, 0.0, radius], x_scale=[1.0, 1.0, 0.01, 0.01, 1.0])
-    return FittedCylinder(2.0 * float(found.x[4]), 2.0 * float(found.fun.std()), found.fun)
+    fit = least_squares(misfit, [0.0, 0.0, 0.0, 0.0, radius], x_scale=[1.0, 1.0, 0.01, 0.01, 1.0])
+    return FittedCylinder(2.0 * float(fit.x[4]), 2.0 * float(fit.fun.std()), fit.fun)

@@ -1,4 +1,4 @@
-"""The pixels from which the points of a run were triangulated, camera by camera, for every way of processing."""
+"""Pixels from which the points of a run were triangulated, camera by camera, in one form for all ways."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from scipy.spatial import cKDTree
 class Tracks:
     """Pixels of all measured points, including those that the merging of the pairs removes.
 
-    cameras : C ids. px : (F, C, N, 2), NaN where a camera did not measure a point. reference : (C, N, 2), where each
-    was matched between the cameras; tracking in time sets out from the place that all views together give.
+    cameras : C ids. px : (F, C, N, 2), NaN where a camera did not measure a point. reference : (C, N, 2), as matched
+    between the cameras; by the global method px at step 0 is instead where all views together place the point.
     """
 
     cameras: tuple[str, ...]
@@ -68,10 +68,10 @@ class Tracks:
 
 
 def mismatch(tracks: Tracks, cameras: Mapping[str, Camera], pairs: tuple[tuple[str, str], ...]) -> Floats:
-    """Distances between the same surface from two pairs that share a camera, (n,) mm (Fig. 7a).
+    """Distances (n,) mm between the surfaces that two camera pairs with a common camera measure (Fig. 7a).
 
-    Where the pairs have vertices in common these are compared; where they do not, one pair's surface is carried to
-    the other's points over the image of the camera they share, by cubic interpolation.
+    Vertices that both pairs have are compared. Where there are none, one pair's surface is interpolated at the other's
+    points in the image of the common camera, by cubic interpolation.
     """
     distances = []
     for one, other in tracks.neighbours(pairs):
@@ -91,7 +91,7 @@ def mismatch(tracks: Tracks, cameras: Mapping[str, Camera], pairs: tuple[tuple[s
 
 
 def _gap(source: Floats, wanted: Floats) -> Floats:
-    """Distance of points from the nearest of others, in units of these points' usual spacing."""
+    """Distance of each point of ``wanted`` from the nearest of ``source``, in units of the median spacing of these."""
     tree = cKDTree(source)
     spacing = float(np.median(tree.query(source[:2000], k=2)[0][:, 1]))
     return np.asarray(tree.query(wanted)[0]) / spacing

@@ -1,22 +1,24 @@
-// The capture buttons and the list of captures with how every camera fared.
+// The capture buttons, and the list of captures with the outcome of every camera.
 
 import { post, url } from "./api.js";
 import { byId, clockTime, element, notice } from "./dom.js";
 import { state } from "./live.js";
 
 const KINDS = ["board", "target", "specimen", "static"];
-const HINTS = { static: "Capture the specimen at rest with every camera: tells the noise floor" };
+const HINTS = { static: "Capture the specimen at rest with every camera, to measure the noise floor" };
 
 // The buttons ------------------------------------------------------------------------------------
 
-/** Why the buttons do nothing now, or null. */
+/** The sentence that says why no capture can begin now, or null. */
 function refusal() {
   if (!state.connected) return "The controller does not answer.";
   if (!state.rig) return "Waiting for the controller.";
   if (state.rig.refusal) return state.rig.refusal;
   const missing = state.rig.missing;
   if (missing.length && !byId("override").checked) {
-    return `Camera ${missing.join(", ")} not there: start the node, or tick the box to capture without it.`;
+    return missing.length === 1
+      ? `Camera ${missing[0]} is not connected: start its node, or tick the box to capture without it.`
+      : `Cameras ${missing.join(", ")} are not connected: start their nodes, or tick the box to capture without them.`;
   }
   return null;
 }
@@ -47,7 +49,7 @@ async function capture(kind) {
   try {
     notice("");
     const round = await post(url("captures"), { kind, override: byId("override").checked });
-    if (state.round?.id !== round.id) state.round = round; // else the events were quicker, and know more
+    if (state.round?.id !== round.id) state.round = round; // else an event has brought a newer state already
   } catch (error) {
     notice(error.message);
   }
@@ -140,7 +142,7 @@ export function showCaptures() {
   });
   const list = byId("captures");
   if (!items.length) {
-    list.replaceChildren(element("li", { class: "muted" }, "None in this session."));
+    list.replaceChildren(element("li", { class: "muted" }, "No captures in this session yet."));
   } else if (items.length !== list.children.length || items.some((item, i) => item !== list.children[i])) {
     list.replaceChildren(...items);
   }

@@ -1,16 +1,16 @@
-// The few things the page does with elements.
+// Short forms for elements of the page and for numbers as text.
 
 export const byId = (id) => document.getElementById(id);
 
 /** An element: element("li", { class: "node", title: "…" }, child, "text", …). Absent attributes: null, false. */
 export function element(tag, attributes = {}, ...children) {
-  const made = document.createElement(tag);
+  const item = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
-    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
-    else if (value !== null && value !== false && value !== undefined) made.setAttribute(name, value === true ? "" : value);
+    if (name.startsWith("on")) item.addEventListener(name.slice(2), value);
+    else if (value !== null && value !== false && value !== undefined) item.setAttribute(name, value === true ? "" : value);
   }
-  made.append(...children.filter((child) => child !== null && child !== undefined));
-  return made;
+  item.append(...children.filter((child) => child !== null && child !== undefined));
+  return item;
 }
 
 /** Make the options of a select, keeping what was chosen where it is still there. */
@@ -32,7 +32,7 @@ export function setOptions(select, options, chosen = select.value) {
 
 let noticeTimer;
 
-/** Tell a sentence at the top of the page; an empty one takes it away. */
+/** Show a sentence at the top of the page for 15 s; an empty one removes it. */
 export function notice(sentence) {
   const box = byId("notice");
   box.textContent = sentence;
@@ -52,7 +52,7 @@ export const counted = (number, noun) => `${number.toLocaleString()} ${noun}${nu
 
 export const clockTime = (iso) => (iso ? new Date(iso).toLocaleTimeString([], { hour12: false }) : "");
 
-/** A number with as many digits as a reader wants. */
+/** A number as text with a given number of significant digits. */
 export function figure(value, digits = 4) {
   if (!Number.isFinite(value)) return "–";
   if (value === 0) return "0";

@@ -1,4 +1,4 @@
-// What the line beside the switch "Live" tells: which step is shown, how soon it was, and what comes.
+// The line beside the switch "Live": which step is shown, how soon after its last image, and which step comes next.
 
 import { byId } from "./dom.js";
 import { state } from "./live.js";
@@ -7,7 +7,7 @@ const shown = new Map(); // address of live results -> seconds from the last ima
 
 const keyOf = ({ session, capture_id }) => `${session}/${capture_id}`;
 
-/** Note that a live step has just been drawn. How soon is known if the page was there when it was announced. */
+/** Note that a live step has just been drawn. The time since its last image includes that since its event arrived. */
 export function noteDrawn(header) {
   const { newest } = state;
   if (!newest || keyOf(newest) !== keyOf(header) || shown.has(keyOf(header))) return;

@@ -6,7 +6,7 @@ import { state } from "./live.js";
 
 const active = (job) => job.state === "running" || job.state === "queued";
 
-/** The job to show: what runs or waits for this session, else its last one. Single steps are told with the results. */
+/** The job to show: what runs or waits for this session, else its last one. Jobs of single steps are shown with the results. */
 function present() {
   const own = state.jobs.filter((job) => job.session === state.current && !job.step);
   return own.find((job) => job.state === "running") ?? own.find(active) ?? own[0] ?? null;
@@ -28,7 +28,7 @@ function warmth() {
   const { state: how, compiling, seconds } = state.processing ?? {};
   if (how === "warming") return compiling ? "warming up: compiling its kernels, once on this machine …" : "warming up …";
   if (how === "ready") return `ready${seconds >= 20 ? `, after ${duration(seconds)} of compiling` : ""}`;
-  return how === "ended" ? "starts anew with the next job" : "";
+  return how === "ended" ? "stopped; starts again with the next job" : "";
 }
 
 export function showJobs() {
@@ -38,10 +38,10 @@ export function showJobs() {
   const box = byId("job");
   byId("job-cancel").hidden = !job || !active(job);
   const taken = Boolean(job && (job.state === "running" || (job.state === "queued" && !job.automatic)));
-  byId("job-start").disabled = !state.current || taken; // one that waits for the capturing to end can be begun at once
+  byId("job-start").disabled = !state.current || taken; // an automatic job that waits for a pause in the captures can be started at once
   byId("job-log-box").hidden = !job;
   if (!job) {
-    box.replaceChildren(element("p", { class: "muted" }, "No job of this session yet. Processing starts by itself after a specimen capture."));
+    box.replaceChildren(element("p", { class: "muted" }, "No job in this session yet. Processing starts by itself after a specimen capture."));
     return;
   }
   const percent = Math.round(100 * job.done);

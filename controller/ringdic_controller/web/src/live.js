@@ -6,7 +6,7 @@ export const state = {
   current: null,
   captures: [],
   runs: [],
-  newest: null, // the newest step that was processed at once
+  newest: null, // the newest live step: processed alone as soon as it was archived
   jobs: [],
   processing: null,
   round: null,
@@ -15,7 +15,7 @@ export const state = {
 
 const listeners = new Set();
 
-/** Call `listener(names)` now and whenever parts of the state, called by these names, have changed. */
+/** Call `listener(names)` whenever the parts of the state with these names have changed. */
 export function onChange(listener) {
   listeners.add(listener);
 }

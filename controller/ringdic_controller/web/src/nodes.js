@@ -1,4 +1,4 @@
-// The ring of nodes: one tile a camera, in ring order.
+// The list of nodes: one tile for each camera, in ring order.
 
 import { byId, element } from "./dom.js";
 import { state } from "./live.js";
@@ -6,7 +6,7 @@ import { state } from "./live.js";
 const megabytes = (bytes) => (bytes >= 1e9 ? `${(bytes / 1e9).toFixed(1)} GB` : `${Math.round(bytes / 1e6)} MB`);
 
 function condition(node) {
-  if (!node.alive) return ["gone", "not there"];
+  if (!node.alive) return ["gone", "not connected"];
   if (node.armed) return ["armed", "armed"];
   return ["alive", node.state && node.state !== "unknown" ? node.state : "ready"];
 }
@@ -43,7 +43,7 @@ export function showNodes() {
   if (!rig) return;
   byId("rig-name").textContent = rig.name ?? "no rig: viewer only";
   const alive = rig.nodes.filter((node) => node.alive).length;
-  byId("nodes-count").textContent = rig.nodes.length ? `${alive} of ${rig.nodes.length} there` : "";
+  byId("nodes-count").textContent = rig.nodes.length ? `${alive} of ${rig.nodes.length} connected` : "";
   byId("nodes").replaceChildren(
     ...(rig.nodes.length ? rig.nodes.map(tile) : [element("li", { class: "muted" }, "The controller runs without a rig.")]),
   );

@@ -20,8 +20,8 @@ let limitsByHand = null; // [low, high] typed by the operator for the present fi
 let playing = null;
 let viewedSession = null; // the session that the view was made for
 let shownPoints = null; // the positions that the viewer has
-let opening = 0; // the newest request to open results, and
-let wanted = 0; // the newest to show a step of them: older ones give up when their numbers arrive
+let opening = 0; // number of the newest request to open results
+let wanted = 0; // number of the newest request to show a step: older requests give up when their arrays arrive
 const arrays = new Map(); // address -> promise of an ArrayBuffer
 
 const chosenField = () => header.fields.find((field) => field.name === byId("field").value) ?? header.fields[0];
@@ -47,7 +47,7 @@ function bytes(...parts) {
 
 const following = () => byId("follow").checked;
 
-/** What is newest in the present session, the live step or the last run: the choice that shows it, and its name. */
+/** The newest result of the present session, a live step or a run: the choice that shows it, and its name. */
 function newest() {
   const [run, step] = [state.runs.at(-1), state.newest];
   if (step && (!run || Date.parse(step.ready_at) > Date.parse(run.finished_at) + 999)) {
@@ -56,7 +56,7 @@ function newest() {
   return run ? { choice: run.run, name: `${state.current}/${run.run}/${run.finished_at}` } : null;
 }
 
-/** Offer what there is in the present session; what has just been made is shown at once while it is followed. */
+/** Offer the results of the present session; while the switch "Live" is on, a new one is shown at once. */
 export async function showNewest() {
   const latest = newest();
   byId("results-empty").hidden = latest !== null;
@@ -79,7 +79,7 @@ export async function showNewest() {
   await attempt(() => openChosen(true));
 }
 
-/** Load what is chosen. While the newest is followed, limits stay and widen; the view and the field always stay. */
+/** Load the chosen results. While the newest is followed, limits only widen; the view and the field always stay. */
 async function openChosen(followed = false) {
   stop();
   arrays.clear();
@@ -142,7 +142,7 @@ async function show() {
   const name = step === 0 ? `${header.steps[0]} (reference)` : header.steps[step];
   byId("step-name").textContent = `${step} of ${header.steps.length - 1}: ${name}`;
   byId("step").setAttribute("aria-valuetext", name);
-  byId("rigid").title = field.rigid ? "" : "This field is the same with and without; the shape moves.";
+  byId("rigid").title = field.rigid ? "" : "The values of this field do not depend on it; the drawn shape does.";
   byId("surface").dataset.shown = `${field.name}/${step}/${removed()}`;
   byId("surface").dataset.of = header.place.join("/");
   if (header.capture_id) noteDrawn(header);
@@ -150,7 +150,7 @@ async function show() {
 
 // Colours ----------------------------------------------------------------------------------------
 
-/** Limits over all steps; even about the centre where the field has one. */
+/** Limits over all steps; symmetric about the centre where the field has one. */
 function automaticLimits(field) {
   const range = (removed() && field.range_without_rigid_motion) || field.range || [0, 1];
   let [low, high] = range.map((value) => value ?? 0);
@@ -249,12 +249,12 @@ function wirePicking() {
     }
     cancelAnimationFrame(due);
     due = requestAnimationFrame(() => {
-      const found = surface.pick(event.clientX, event.clientY);
-      output.hidden = !found;
-      if (!found) return;
-      const { x, y, z } = found.position;
+      const hit = surface.pick(event.clientX, event.clientY);
+      output.hidden = !hit;
+      if (!hit) return;
+      const { x, y, z } = hit.position;
       const field = chosenField();
-      const value = Number.isFinite(found.value) ? `${figure(found.value)} ${field.unit}` : "not measured";
+      const value = Number.isFinite(hit.value) ? `${figure(hit.value)} ${field.unit}` : "not measured";
       output.textContent = `${value}   at (${[x, y, z].map((mm) => mm.toFixed(1)).join(", ")}) mm`;
     });
   });

@@ -1,4 +1,4 @@
-// Choosing and making sessions.
+// The choice of the session, and the creation of a new one.
 
 import { post, put, url } from "./api.js";
 import { byId, counted, notice, setOptions } from "./dom.js";
@@ -13,7 +13,7 @@ export function showSessions() {
   setOptions(byId("session-select"), options.length ? options : none, state.current ?? "");
   const rig = state.rig?.name;
   byId("session-name").disabled = byId("session-create").disabled = !rig;
-  byId("session-create").title = rig ? "" : "The controller runs without a rig.toml.";
+  byId("session-create").title = rig ? "" : "The controller runs without a rig.toml, so no session can be created.";
 }
 
 export function wireSessions() {

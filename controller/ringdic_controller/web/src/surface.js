@@ -20,11 +20,11 @@ import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { paint } from "./colours.js";
 
 export class Surface {
-  /** @param {HTMLCanvasElement} canvas @param {(axes: number[][]) => void} onDraw told, after each drawing, how the axes lie */
+  /** @param {HTMLCanvasElement} canvas @param {(axes: number[][]) => void} onDraw called after each drawing with the directions of the axes */
   constructor(canvas, onDraw = () => {}) {
     this.canvas = canvas;
     this.onDraw = onDraw;
-    // The drawing is kept, so that it can be copied and looked at by a test.
+    // The drawing is preserved, so that it can be copied, and read by a test.
     this.renderer = new WebGLRenderer({ canvas, antialias: false, alpha: true, preserveDrawingBuffer: true });
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     this.scene = new Scene();
@@ -99,7 +99,7 @@ export class Surface {
     this.draw();
   }
 
-  /** Look at the whole surface from where it faces, a little from above; a closed ring from any side. */
+  /** View the whole surface from the side that it faces, a little from above; a closed one from a fixed side. */
   resetView() {
     const sphere = this.mesh.geometry.boundingSphere;
     if (!sphere || !(sphere.radius > 0)) return;

@@ -26,7 +26,7 @@ _SPECIMENS = {"limb": Limb, "cylinder": Cylinder}
 
 
 def scene(kind: str, index: int, specimen: str = "limb", seed: int = 0) -> Scene:
-    """The scene of a capture: ``index`` is the pose of a board, the step of a specimen.
+    """The scene that a simulated camera renders for a capture. index : view of the board, or step of the specimen.
 
     kind : board, target, specimen, or static (the specimen at rest). specimen : limb or cylinder.
     Raises ValueError for a kind, an index or a specimen that does not exist.

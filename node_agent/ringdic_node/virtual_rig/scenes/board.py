@@ -1,4 +1,4 @@
-"""The checkerboard held before each camera: 15 x 20 squares of 10 mm on white, a pose of its own for every view."""
+"""The checkerboard before each camera: 15 x 20 squares of 10 mm on white, in another pose for every view."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _PLASTIC = np.array([0.7548776662466927, 0.5698402909980532])  # 1/p and 1/p² o
 
 @dataclass(frozen=True)
 class BoardScene:
-    """The board in its view number ``index``; the pose also depends on the camera and the seed."""
+    """The checkerboard in view number ``index``; its pose also depends on the camera and the seed."""
 
     index: int
     seed: int = 0
 
     def pose(self, camera: VirtualCamera) -> tuple[Floats, Floats]:
-        """R (3, 3) and t (3,) mm from the board's frame to the camera's.
+        """Pose of the board: R (3, 3) and t (3,) mm from the board's frame to the camera's.
 
-        The board's frame has its origin at the corner of the squares, x across, y along, both as the squares run.
+        The board's frame has its origin at the first corner of the squares, x across and y along them.
         The middles of successive views spread evenly over the image (the additive recurrence of the plastic number:
-        Roberts 2018). A pose is drawn until all squares lie in the image, the margin perhaps not; tilts
-        are 25° to 45°, and no more than 50° against the line of sight.
+        Roberts 2018). Random poses are tried until all squares, though not always the
+        margin, lie in the image; tilts are 25° to 45°, and at most 50° against the line of sight.
         """
         name = zlib.crc32(camera.id.encode())
         rng = np.random.default_rng([self.seed, name, self.index])
@@ -41,11 +41,11 @@ class BoardScene:
         rim = self.rim()
         edge = 0.012 * camera.width
         for attempt in range(_ATTEMPTS):
-            calm = 1.0 - attempt / _ATTEMPTS  # a place far out is drawn inwards until the board fits
+            shrink = 1.0 - attempt / _ATTEMPTS  # a place far out moves inwards until the board fits
             tilt, towards = rng.uniform(25.0, 45.0), rng.uniform(0.0, 2.0 * np.pi)
             R = _rotation(tilt * np.cos(towards), tilt * np.sin(towards), rng.uniform(-25, 25))
             distance = rng.uniform(290, 400)
-            place = calm * spread * [camera.width / camera.K[0, 0], camera.height / camera.K[1, 1]]
+            place = shrink * spread * [camera.width / camera.K[0, 0], camera.height / camera.K[1, 1]]
             t = distance * np.array([*place, 1.0]) - R @ middle
             sight = R[:, 2] @ (R @ middle + t) / np.linalg.norm(R @ middle + t)
             if abs(sight) < _STEEPEST:

@@ -1,4 +1,4 @@
-"""What spoils the images of a specimen: worn speckles, reflections of lamps, bars in front of the body.
+"""Disturbances of a specimen's images: worn speckles, reflections of lamps, bars in front of the body.
 
 Positions are in the world, mm; worn patches lie on the body, in its material coordinates.
 """
@@ -15,7 +15,7 @@ from ringdic_node.virtual_rig.texture import RADIUS
 GLARE_PEAK = 3.0  # radiance of a lamp's reflection; 1 saturates
 GLARE_WIDTH = 0.03  # rad, standard deviation of the lobe about the mirror's direction
 BAR = 0.10  # radiance of a bar
-_GLARING = 0.3  # radiance added above which a speckle pattern is spoilt
+_GLARING = 0.3  # radiance of a reflection above which the speckles under it count as spoilt
 
 
 @dataclass(frozen=True)
@@ -39,14 +39,17 @@ class Bar:
 
 @dataclass(frozen=True)
 class Damage:
-    """Everything that spoils a specimen's images at one step. lamps : positions, mm, mirrored by a glossy body."""
+    """Disturbances of a specimen's images at one step. lamps : positions, mm, reflected by the glossy body."""
 
     patches: tuple[SpoiltPatch, ...] = ()
     lamps: tuple[tuple[float, float, float], ...] = ()
     bars: tuple[Bar, ...] = ()
 
     def arrays(self) -> tuple[Floats, Floats, Floats]:
-        """Patches (k, 4) as arc, z and half axes; lamps (m, 3); bars (b, 7) as start, end, radius. All mm."""
+        """Arrays for the renderer, mm.
+
+        Patches (k, 4): arc, z, half axes. Lamps (m, 3). Bars (b, 7): start, end, radius.
+        """
         patches = [
             (each.theta % (2 * np.pi) * RADIUS, each.z, each.half_arc, each.half_height) for each in self.patches
         ]
@@ -66,7 +69,7 @@ class Damage:
         return off
 
     def spoilt(self, centre: Floats, xyz: Floats, normals: Floats) -> Mask:
-        """Which points of the surface a camera sees behind a bar or in a lamp's reflection, (n,) bool.
+        """Which points of the surface are hidden from a camera by a bar or lie in a lamp's reflection, (n,) bool.
 
         centre : (3,) of the camera; xyz : (n, 3) points of the surface, mm; normals : (n, 3) of unit length, outwards.
         """
@@ -89,7 +92,7 @@ class Damage:
 
 
 def _gap(centre: Floats, xyz: Floats, start: Floats, end: Floats) -> Floats:
-    """Least distance of each line of sight, from the centre to a point (n, 3), from a segment. (n,) mm."""
+    """Distance (n,) mm of each line of sight, from the centre to a point (n, 3), from the segment start to end."""
     d, e = xyz - centre, end - start
     w = centre - start
     a, b, c = np.sum(d * d, axis=1), d @ e, float(e @ e)

@@ -57,18 +57,18 @@ class _Surface(ABC):
 
 @dataclass(frozen=True)
 class Cylinder(_Surface):
-    """A rigid cylinder of 114 mm that moves by ``per_step`` mm a step."""
+    """A rigid cylinder of 114 mm diameter that moves by ``per_step`` mm a step."""
 
     per_step: tuple[float, float, float] = (0.1, 0.0, 0.0)
 
     def parameters(self, step: int) -> Floats:
-        """Parameters (6,) of the cylinder moved to its place at a step, mm."""
+        """Parameters (6,) of the cylinder at its position at a step, mm."""
         return np.array([body.CYLINDER, RADIUS, *(step * np.array(self.per_step)), 0.0])
 
 
 @dataclass(frozen=True)
 class Limb(_Surface):
-    """A calf, 47 to 66 mm in radius, loaded by a fifth of its full load a step: about 15 % stretch at step 5."""
+    """A calf, 47 to 66 mm in radius, loaded by a fifth of its full load a step: stretched by about 15 % at step 5."""
 
     load_per_step: float = 0.2
 
@@ -79,7 +79,7 @@ class Limb(_Surface):
 
 @dataclass(frozen=True)
 class Specimen:
-    """A body at a step, speckled from a seed over z 5 … 245 mm (the limb) or 12 … 238 mm (the cylinder)."""
+    """A specimen at one step: its surface with speckles over z 5 … 245 mm (limb) or 12 … 238 mm (cylinder)."""
 
     surface: Cylinder | Limb
     step: int
@@ -88,7 +88,7 @@ class Specimen:
 
     @property
     def band(self) -> tuple[float, float]:
-        """Heights between which the body is speckled, mm of the reference."""
+        """Lowest and highest z of the speckles in the reference, mm."""
         return (5.0, 245.0) if isinstance(self.surface, Limb) else (12.0, 238.0)
 
     def body(self) -> Floats:

@@ -16,7 +16,7 @@ _LARGEST = 0.5  # mm of print error: a dot stays in its own cell of the print
 
 @dataclass(frozen=True)
 class TargetScene:
-    """The target, displaced by ``offset`` mm from where it defines the world.
+    """The calibration target, displaced by ``offset`` mm from the place at which it defines the world frame.
 
     print_error : standard deviation of the printed dots' places along the arc and along the axis, mm, drawn from
     ``seed`` and never beyond 0.5 mm.
@@ -35,12 +35,12 @@ class TargetScene:
         return np.array([CYLINDER, RADIUS, *self.offset, 0.0])
 
     def prints(self) -> Floats:
-        """By how much each dot is off its place along arc and axis, (20 rows, 30 columns, 2) mm."""
+        """Print errors: deviation of each dot from its nominal place along arc and axis, (20, 30, 2) mm, row by row."""
         drawn = np.random.default_rng([self.seed, 3012]).standard_normal((ROWS, COLUMNS, 2))
         return np.clip(self.print_error * drawn, -_LARGEST, _LARGEST)
 
     def dots(self) -> Floats:
-        """Centres of the dots (20 rows, 30 columns, 3) mm."""
+        """Centres of the printed dots in space, (20 rows, 30 columns, 3) mm, world frame."""
         prints = self.prints()
         theta = (np.arange(COLUMNS) * 12.0 + prints[..., 0]) / RADIUS
         z = 10.0 + 12.0 * np.arange(ROWS)[:, None] + prints[..., 1]

@@ -5,7 +5,7 @@ import pytest
 from ringdic.geometry.camera import Camera
 from ringdic.results.results import Matches, Results
 from ringdic_controller.studies.validate.calibration import ExactRays, true_camera
-from ringdic_controller.studies.validate.cylinder import CylinderRun, apart, diameter, figure_7a, figure_7b
+from ringdic_controller.studies.validate.cylinder import CylinderRun, diameter, figure_7a, figure_7b, separate_errors
 from ringdic_controller.studies.validate.figures import BETTER, PAPER, Figure
 from ringdic_controller.studies.validate.limb import LimbRun, compare_spoilt, figure_9
 from ringdic_controller.studies.validate.report import blindness
@@ -104,7 +104,7 @@ def test_an_exact_cylinder_has_no_error_in_any_figure(cylinder: Results) -> None
     found = values(diameter(runs, PAIRS).figures)
     found |= values(figure_7a(runs, PAIRS).figures)
     found |= values(figure_7b(runs, Cylinder(), PAIRS).figures)
-    found |= values(apart(runs, ExactRays.of(TRUE, PAIRS), TRUE, TRUE).figures)
+    found |= values(separate_errors(runs, ExactRays.of(TRUE, PAIRS), TRUE, TRUE).figures)
     assert len(found) > 15
     for name, value in found.items():
         assert abs(value) < 1e-6, name
@@ -123,7 +123,7 @@ def test_a_bias_of_the_matching_shows_in_true_cameras_and_not_on_exact_lines_of_
         )  # fmt: skip
     tracks = Tracks.of(_with_matches(cylinder, tuple(shifted)))
     run = CylinderRun(cylinder, TRUE, tracks)
-    found = values(apart({BETTER: run}, ExactRays.of(TRUE, PAIRS), TRUE, TRUE).figures)
+    found = values(separate_errors({BETTER: run}, ExactRays.of(TRUE, PAIRS), TRUE, TRUE).figures)
     assert abs(found["diameter, exact lines of sight, this calibration"]) < 1e-9
     assert mismatch(tracks, TRUE, PAIRS).mean() > 0.01  # 0.1 px are 0.04 mm here, to either side by turns
 

@@ -10,10 +10,10 @@ from ringdic.errors import InputError
 from ringdic.session.folder import open_session
 from ringdic.session.images import read_gray
 from ringdic_controller.studies.validate import report
-from ringdic_controller.studies.validate.darkroom import Darkroom, RenderedShot
 from ringdic_controller.studies.validate.experiments import Validation, figures
 from ringdic_controller.studies.validate.figures import PAPER
 from ringdic_controller.studies.validate.folders import make_session
+from ringdic_controller.studies.validate.image_cache import ImageCache, RenderedShot
 from ringdic_controller.studies.validate.plots import draw
 from ringdic_controller.studies.validate.run import run_validation, scaled
 from ringdic_controller.studies.validate.scenery import Scenery
@@ -29,11 +29,11 @@ def shots(kind: int = 0) -> dict[str, RenderedShot]:
 
 
 def test_an_image_is_rendered_once_and_again_only_if_something_it_depends_on_changes(tmp_path: Path) -> None:
-    darkroom = Darkroom(tmp_path / "images")
+    cache = ImageCache(tmp_path / "images")
     wanted = list(shots().values())
-    first = darkroom.develop(wanted)
+    first = cache.render_missing(wanted)
     times = [path.stat().st_mtime_ns for path in first]
-    assert darkroom.develop(wanted) == first
+    assert cache.render_missing(wanted) == first
     assert [path.stat().st_mtime_ns for path in first] == times
     camera = SMALL.cameras[0]
     keys = {
@@ -50,18 +50,18 @@ def test_an_image_is_rendered_once_and_again_only_if_something_it_depends_on_cha
     assert len(keys) == 9
 
 
-def test_a_session_shares_its_images_with_the_darkroom(tmp_path: Path) -> None:
-    darkroom = Darkroom(tmp_path / "images")
-    darkroom.develop([*shots(0).values(), *shots(1).values()])
-    path = make_session(tmp_path / "s", SMALL.rig_toml(), [("board", shots(0)), ("board", shots(1))], darkroom)
+def test_a_session_shares_its_images_with_the_cache(tmp_path: Path) -> None:
+    cache = ImageCache(tmp_path / "images")
+    cache.render_missing([*shots(0).values(), *shots(1).values()])
+    path = make_session(tmp_path / "s", SMALL.rig_toml(), [("board", shots(0)), ("board", shots(1))], cache)
     session = open_session(path)
     assert [capture.kind for capture in session.captures] == ["board", "board"]
     for capture, wanted in zip(session.captures, (shots(0), shots(1)), strict=True):
         for id_, shot in wanted.items():
-            assert capture.images[id_].stat().st_ino == darkroom.path(shot).stat().st_ino
-            np.testing.assert_array_equal(read_gray(capture.images[id_]), read_gray(darkroom.path(shot)))
+            assert capture.images[id_].stat().st_ino == cache.path(shot).stat().st_ino
+            np.testing.assert_array_equal(read_gray(capture.images[id_]), read_gray(cache.path(shot)))
     made = (path / "session.json").stat().st_mtime_ns
-    make_session(path, SMALL.rig_toml(), [], darkroom)
+    make_session(path, SMALL.rig_toml(), [], cache)
     assert (path / "session.json").stat().st_mtime_ns == made  # one that is there is kept
 
 

@@ -1,4 +1,4 @@
-"""A cache of rendered images of the simulated rig."""
+"""A cache of rendered images of the simulated rig on disk."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 @dataclass(frozen=True)
 class RenderedShot:
-    """An image to be rendered. seed : of the sensor's noise. jpeg : its quality, or None for an image without loss."""
+    """Description of an image to render. seed : of the sensor's noise. jpeg : quality, or None for a lossless image."""
 
     camera: VirtualCamera
     scene: Scene
@@ -28,7 +28,7 @@ class RenderedShot:
 
     @property
     def key(self) -> str:
-        """Key of everything the image depends on: camera, scene, noise, coding and the renderer's code. 16 digits."""
+        """Hash (16 digits) of all that the image depends on: camera, scene, noise, coding, the renderer's code."""
         camera = self.camera
         view = (camera.id, camera.width, camera.height)
         exact = [values.tobytes() for values in (camera.lens, camera.R, camera.t)]
@@ -37,17 +37,19 @@ class RenderedShot:
 
 
 @dataclass(frozen=True)
-class Darkroom:
-    """A folder of rendered images, each under a key of everything it depends on."""
+class ImageCache:
+    """A folder of rendered images, each named by a hash of everything that it depends on."""
 
     folder: Path
 
     def path(self, shot: RenderedShot) -> Path:
-        """File of an image, whether it has been rendered or not."""
+        """File of an image, which may not have been rendered yet."""
         return self.folder / f"{shot.camera.id}-{shot.key}.{'png' if shot.jpeg is None else 'jpg'}"
 
-    def develop(self, shots: Sequence[RenderedShot], progress: Callable[[float], None] = lambda _: None) -> list[Path]:
-        """Render the images that are missing, on all cores; the file of each image, in the order given."""
+    def render_missing(
+        self, shots: Sequence[RenderedShot], progress: Callable[[float], None] = lambda _: None
+    ) -> list[Path]:
+        """Render missing images on all cores; returns the file of each image, in the order given."""
         self.folder.mkdir(parents=True, exist_ok=True)
         paths = {self.path(shot): shot for shot in shots}
         missing = [shot for path, shot in paths.items() if not path.is_file()]
