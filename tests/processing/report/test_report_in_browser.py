@@ -63,10 +63,14 @@ def session(tmp_path_factory: pytest.TempPathFactory, rig_toml: Callable[[str, S
             coarse = rng.uniform(20, 235, (SIZE[1] // 8, SIZE[0] // 8)).astype(np.uint8)
             cv2.imwrite(str(folder / "captures" / name / f"{id_}.png"), cv2.resize(coarse, SIZE))
             frames[id_] = {"file": f"{id_}.png", "exposure_us": 4321.0, "metadata": {"AnalogueGain": 1.5}}
-        record = {"cameras": frames, "opened_at": "2026-05-04T03:02:01.5+00:00", "skew_ns": 123456}
+        record = {
+            "schema": 1, "capture_id": name, "number": int(name[:4]), "kind": "specimen", "session": "tube",
+            "state": "closed", "cameras": frames, "opened_at": "2026-05-04T03:02:01.5+00:00", "skew_ns": 123456,
+        }  # fmt: skip
         (folder / "captures" / name / "capture.json").write_text(json.dumps(record))
     (folder / "rig.toml").write_text(rig_toml("report-ring", "1234"))
-    (folder / "session.json").write_text('{"session": "tube"}')
+    header = {"schema": 1, "session": "tube", "rig": "report-ring", "created": "2026-05-04", "source": "capture"}
+    (folder / "session.json").write_text(json.dumps(header))
     (folder / "results" / "0001").mkdir(parents=True)
     write_results(folder / "results" / "0001" / "results.h5", twisted_tube())
     return folder
