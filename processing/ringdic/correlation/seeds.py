@@ -18,6 +18,7 @@ _FLOW_SIDE = 700  # px of the longer side of the reduced region
 _FLOW_MARGIN = 96  # px around the region
 _LEVELLED = 35  # px of the reduced image over which mean and contrast are equalised
 _SEARCH = 160  # px, largest displacement of the template search
+_ROW = 1024  # samples in a row of those that OpenCV takes at a time: it takes fewer than 32,767 rows
 
 
 def even_sample(xy: Pixels, count: int = _SEEDS) -> Indices:
@@ -129,6 +130,9 @@ def _reduced_position(xy: Pixels, scale: float) -> Pixels:
 
 def _sample(flow: NDArray[np.float32], at: Pixels) -> Pixels:
     """Bilinear samples (n, 2) of a flow field at positions (n, 2), px of the field."""
-    points = at.astype(np.float32)
-    sampled = cv2.remap(flow, points[:, None, 0], points[:, None, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(sampled[:, 0], dtype=np.float64)
+    rows = len(at) // _ROW + 1
+    filled = np.zeros((2, rows * _ROW), np.float32)
+    filled[:, : len(at)] = at.T
+    x, y = filled.reshape(2, rows, _ROW)
+    sampled = cv2.remap(flow, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(sampled.reshape(-1, 2)[: len(at)], dtype=np.float64)
