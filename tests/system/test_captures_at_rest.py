@@ -243,7 +243,7 @@ def test_the_report_tells_floor_and_uncertainty(
     told = float(rows["Displacement"][3])
     assert told == pytest.approx(floor["displacement"]["rms"], rel=0.01)
     stated = {row[0]: row[2] for row in page.cells["stated"][1:]}
-    assert float(stated["displacement"]) == pytest.approx(
+    assert float(stated["displacement, by the image noise"]) == pytest.approx(
         seen.results.summary["uncertainty"]["noise"]["displacement_mm"], rel=0.05
     )
     bundle = seen.results.summary["calibration"]["method"] == "bundle"

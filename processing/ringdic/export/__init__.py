@@ -17,6 +17,10 @@ glb      a folder, one coloured surface a step        viewers, Blender (metres, 
 Lengths are mm in the world frame of the target, except in glb, whose standard is metres. Every format is evaluated
 from the stored positions, so that a step can be compared with the one before it, freed of its rigid motion, or given
 strains over another window than that of the run.
+
+A standard deviation whose name does not say its cause, such as ``sigma_xyz``, ``sigma_displacement`` and
+``sigma_lambda``, is in every format that by image noise and calibration together, or by the noise alone where the part
+of the calibration is unknown. Endings ``_noise`` and ``_calibration`` name the parts.
 """
 
 from __future__ import annotations

@@ -22,23 +22,32 @@ def arrays(results: EvaluatedResults) -> dict[str, Any]:
     """All results as arrays by name, in full precision, for F steps of N points and M triangles.
 
     ``vertices_ref`` (N, 3) and ``vertices`` (F, N, 3) mm, world frame; ``faces`` (M, 3); ``lambda1``, ``lambda2`` and
-    ``J`` (F, M); ``E`` (F, M, 3, 3), Cartesian Green-Lagrange; ``correlation`` (F, N), C_LS; ``sigma_xyz`` (F, N, 3)
-    mm, the standard deviation of a position over repeated noise of the images; ``sigma_calibration`` (F, N, 3) mm,
-    where it is known, the part of the calibration, which all points and steps share; ``pair`` (M,), −1 where a
+    ``J`` (F, M); ``E`` (F, M, 3, 3), Cartesian Green-Lagrange; ``correlation`` (F, N), C_LS; ``pair`` (M,), −1 where a
     triangle joins two camera pairs. Step 0 is the reference, with identity deformation. NaN where not measured. With a
     strain window, the arrays of deformation also as ``window_…``.
+
+    Standard deviations by image noise and calibration together, by noise alone where the part of the calibration is
+    unknown, NaN where nothing is known: ``sigma_xyz`` and ``sigma_displacement`` (F, N, 3) mm, and ``sigma_lambda``
+    (F, M, 2), of λ1 and λ2. ``sigma_calibration`` (F, N, 3) mm, where it is known, is the part of the calibration in
+    ``sigma_xyz``, an error that all points and steps share.
     """
     source = results.results
-    F, M = len(source.steps), len(source.faces)
+    F, N, M = len(source.steps), len(source.vertices_ref), len(source.faces)
     prefixes = ("", "window_") if results.window is not None else ("",)
     deformation: dict[str, Any] = {prefix + name: np.empty((F, M)) for prefix in prefixes for name in _SCALARS}
     deformation |= {f"{prefix}E": np.empty((F, M, 3, 3)) for prefix in prefixes}
+    ends = {"sigma_xyz": (N, 3), "sigma_displacement": (N, 3), "sigma_lambda": (M, 2)}
+    deviations: dict[str, Any] = {name: np.full((F, *end), np.nan) for name, end in ends.items()}
     for step in range(F):
         fields = results.step(step)
         for prefix in prefixes:
             for name in _SCALARS:
                 deformation[prefix + name][step] = fields.face[prefix + name]
             deformation[f"{prefix}E"][step] = square(fields.face[f"{prefix}E_tensor"])
+        for name, values in fields.joint_deviations("point").items():
+            deviations[name][step] = values
+        for name, values in fields.joint_deviations("face").items():
+            deviations["sigma_lambda"][step, :, int(name[-1]) - 1] = values
     by_cameras = {} if source.sigma_calibration is None else {"sigma_calibration": source.sigma_calibration}
     return {
         "vertices_ref": source.vertices_ref,
@@ -46,7 +55,7 @@ def arrays(results: EvaluatedResults) -> dict[str, Any]:
         "faces": source.faces,
         **deformation,
         "correlation": source.correlation,
-        "sigma_xyz": source.sigma_xyz,
+        **deviations,
         **by_cameras,
         "pair": source.pair,
     }

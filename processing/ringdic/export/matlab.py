@@ -29,8 +29,8 @@ def export_mat(results: EvaluatedResults, out: Path) -> None:
     ``DIC3DPPresults`` is the structure that MultiDIC's post-processing makes and its plots read: Points3D, Faces, Disp,
     RBM, Deform and others as cells with one entry a step; fields with the ending ``_ARBM`` have the rigid motion
     removed; Deform_window holds the strain over the window if there is one. Deformation is in single precision. Beside
-    it stand the arrays of the npz (`ringdic.export.arrays`), where ``faces`` and ``pair`` count from 1 (0: a triangle
-    joins two pairs), and ``steps`` and ``settings`` as text.
+    it stand the arrays of the npz (`ringdic.export.arrays`), standard deviations among them, where ``faces`` and
+    ``pair`` count from 1 (0: a triangle joins two pairs), and ``steps`` and ``settings`` as text.
 
     Raises InputError where a level 5 file cannot hold it.
     """

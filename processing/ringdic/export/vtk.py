@@ -57,13 +57,16 @@ def _step(results: EvaluatedResults, step: int) -> tuple[Floats, Arrays, Arrays]
 
 
 def _arrays(results: EvaluatedResults, fields: StepFields, location: str) -> Arrays:
-    """Vectors and tensors, and the scalar fields that are neither a component nor the length of one of these."""
-    arrays = fields.point if location == "point" else fields.face
+    """Vectors and tensors, and the scalar fields that are neither a component nor the length of one of these.
+
+    Vectors of standard deviations are those by noise and calibration together, and by the calibration alone.
+    """
+    arrays = (fields.point if location == "point" else fields.face) | fields.joint_deviations(location)
     wide = {name: values for name, values in arrays.items() if values.ndim > 1}
     scalars = {
         entry.name: fields.scalar(entry)
         for entry in results.fields
-        if entry.location == location and not any(name in wide for name in entry.of)
+        if entry.location == location and (entry.name.endswith("_noise") or not any(name in wide for name in entry.of))
     }
     return {name: np.asarray(values, dtype=np.float32) for name, values in (wide | scalars).items()}
 

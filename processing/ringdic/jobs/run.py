@@ -81,7 +81,10 @@ class Run:
 
     @cached_property
     def results(self) -> Results:
-        """The stored arrays of the run, without the 2D matches; read on first use."""
+        """The stored arrays of the run, without the 2D matches; read on first use.
+
+        Its standard deviations are kept in parts, by image noise alone and by the calibration alone; fields join them.
+        """
         return read_results(self.path / "results.h5", matches=False)
 
     @cached_property
@@ -117,6 +120,9 @@ class Run:
         """Values of a field at a step: of every point, (N,), or of every triangle, (M,).
 
         Units are mm for lengths and none for stretches, strains and correlation; see `ringdic.results.fields`.
+        Standard deviations such as ``sigma_displacement`` are those by image noise and calibration together, or by the
+        noise alone where the part of the calibration is unknown; ``sigma_displacement_noise`` and
+        ``sigma_displacement_calibration`` are the parts.
         Raises InputError for a field or a step that does not exist.
 
         >>> float(run.field("displacement", step=0).max())

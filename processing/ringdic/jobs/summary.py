@@ -124,7 +124,13 @@ def _uncertainty(results: Results, step: int) -> dict[str, Any]:
 
     return {
         "step": results.steps[step],
-        "noise": row({"position_mm": "sigma", "displacement_mm": "sigma_displacement", "stretch": "sigma_lambda2"}),
+        "noise": row(
+            {
+                "position_mm": "sigma_noise",
+                "displacement_mm": "sigma_displacement_noise",
+                "stretch": "sigma_lambda_noise2",
+            }
+        ),
         "calibration": row(
             {
                 "position_mm": "sigma_calibration",

@@ -12,7 +12,12 @@ from ringdic.results.results import Results
 STATED = {
     "sigma": "position", "sigma_displacement": "displacement", "sigma_lambda1": "stretch λ1",
     "sigma_lambda2": "stretch λ2", "sigma_E1": "strain E1", "sigma_E2": "strain E2",
-    "window_sigma_lambda1": "stretch λ1 over the window", "window_sigma_lambda2": "stretch λ2 over the window",
+    "sigma_noise": "position, by the image noise",
+    "sigma_displacement_noise": "displacement, by the image noise",
+    "sigma_lambda_noise1": "stretch λ1, by the image noise",
+    "sigma_lambda_noise2": "stretch λ2, by the image noise",
+    "window_sigma_lambda1": "stretch λ1 over the window, by the image noise",
+    "window_sigma_lambda2": "stretch λ2 over the window, by the image noise",
     "sigma_calibration": "position, by the calibration",
     "sigma_displacement_calibration": "displacement, by the calibration",
     "sigma_lambda_calibration1": "stretch λ1, by the calibration",
@@ -32,12 +37,14 @@ def noise_rows(results: Results, gathered: Gathered) -> dict[str, str]:
             f"({how})",
         }
     stated = _stated(gathered)
-    how = "median of the stated standard deviation; no capture at rest"
+    how = "median of the standard deviation stated for the image noise; no capture at rest"
     rows = {}
-    for name, title in (("sigma_displacement", "Displacement noise floor"), ("sigma_E2", "Strain noise floor")):
+    for name, title, symbol, unit in (
+        ("sigma_displacement_noise", "Displacement noise floor", "", " mm"),
+        ("sigma_lambda_noise2", "Strain noise floor", "λ2 ", ""),
+    ):
         if name in stated:
-            unit = " mm" if name == "sigma_displacement" else ""
-            rows[title] = f"{figure(stated[name]['median'], 3)}{unit} ({how})"
+            rows[title] = f"{symbol}{figure(stated[name]['median'], 3)}{unit} ({how})"
         else:
             rows[title] = "not measured: no capture at rest, and this way of evaluation states none"
     return rows
@@ -76,8 +83,9 @@ def noise(document: Document, results: Results, gathered: Gathered) -> None:
             ("standard deviation of", "unit", "median", "95 %"),
             ((STATED[name], row["unit"], figure(row["median"], 3), figure(row["p95"], 3))
              for name, row in stated.items()),
-            "Over all points or triangles of the last step: scatter over repeated image noise; and by the calibration, "
-            "from the covariance of the cameras, an error that all points and steps share.",
+            "Over all points or triangles of the last step. By the image noise: scatter over repeated exposures. By "
+            "the calibration: from the covariance of the cameras, an error that all points and steps share. With no "
+            "cause named: both together, or the noise alone where the part of the calibration is unknown.",
         )  # fmt: skip
     why = results.summary.get("uncertainty", {}).get("why")
     if why:

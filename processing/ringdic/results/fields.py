@@ -10,6 +10,7 @@ always computed after the rigid motion is removed.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -41,8 +42,9 @@ class Field:
 
     location : "point" or "face". centre : middle of the diverging colour scale, None for a sequential one.
     rigid : whether removing the rigid motion changes it. group : heading under which lists of fields show it.
-    of : names of the arrays that it is computed from; its own name by default. value : the function of these arrays,
-        (N, ...) of the vertices or (M, ...) of the triangles, which returns (N,) or (M,).
+    of : names of the arrays that it is computed from; its own name by default. also : names of arrays that it takes too
+        where they are known. value : the function of these arrays, (N, ...) of the vertices or (M, ...) of the
+        triangles, which returns (N,) or (M,).
     """
 
     name: str
@@ -54,6 +56,7 @@ class Field:
     group: str = "Quality"
     of: tuple[str, ...] = ()
     value: Callable[..., Floats] = _itself
+    also: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.location not in ("point", "face"):
@@ -69,12 +72,16 @@ class Field:
     def from_arrays(self, array: Callable[[str], Floats], rigid_motion_removed: bool = False) -> Floats:
         """Values of the field, (N,) or (M,) by its location, in its unit.
 
-        array : function that returns the array of a name in ``of``. rigid_motion_removed : the values after the rigid
-        motion is removed.
+        array : function that returns the array of a name in ``of`` or ``also``, and raises KeyError for a name in
+        ``also`` that is not known. rigid_motion_removed : the values after the rigid motion is removed.
         """
         suffix = "_without_rigid_motion" if self.rigid and rigid_motion_removed else ""
+        arrays = [array(name + suffix) for name in self.of]
+        for name in self.also:
+            with suppress(KeyError):
+                arrays.append(array(name))
         with np.errstate(invalid="ignore", divide="ignore"):
-            return self.value(*(array(name + suffix) for name in self.of))
+            return self.value(*arrays)
 
 
 def _column(index: int, values: Floats) -> Floats:
@@ -154,8 +161,44 @@ def _windowed(entry: Field) -> Field:
     )  # fmt: skip
 
 
-def _strain_sigma(E: Floats, sigma_stretch: Floats) -> Floats:
-    return _stretch(E) * sigma_stretch  # dE = λ dλ
+def joint_deviation(noise: Floats, calibration: Floats | None = None) -> Floats:
+    """Standard deviations by image noise and calibration together: the root of the sum of the squares.
+
+    noise, calibration : (N, 3) mm of the vertices, or (M,) of the triangles. Returns the same shape and unit: the part
+    of the noise alone where that of the calibration is unknown, None or NaN.
+    """
+    return noise if calibration is None else np.hypot(noise, np.nan_to_num(calibration))
+
+
+def _joint_length(*parts: Floats) -> Floats:
+    return _length(joint_deviation(*parts))
+
+
+def _strain_sigma(E: Floats, *of_stretch: Floats) -> Floats:
+    return _stretch(E) * joint_deviation(*of_stretch)  # dE = λ dλ
+
+
+#: Arrays of standard deviations by image noise, and for each the array of those by the calibration.
+_CAUSES = {
+    "sigma_xyz": "sigma_calibration", "sigma_displacement": "sigma_displacement_calibration",
+    "sigma_lambda1": "sigma_lambda_calibration1", "sigma_lambda2": "sigma_lambda_calibration2",
+}  # fmt: skip
+
+
+def _deviations(name: str, label: str, unit: str, location: str, array: str) -> Iterator[Field]:
+    """The three fields of a standard deviation: by image noise and calibration together, and by each of them alone.
+
+    array : name of the array of those by image noise.
+    """
+    stem, digit = (name[:-1], name[-1]) if name[-1].isdigit() else (name, "")
+    joint, alone = (joint_deviation, _itself) if location == "face" else (_joint_length, _length)
+    text = f"Standard deviation of {label}"
+    for end, cause, of, also, value in (
+        ("", "", array, (_CAUSES[array],), joint),
+        ("_noise", " by the image noise", array, (), alone),
+        ("_calibration", " by the calibration", _CAUSES[array], (), alone),
+    ):
+        yield Field(stem + end + digit, text + cause, unit, location, None, False, "Uncertainty", (of,), value, also)
 
 
 FIELDS = (
@@ -169,32 +212,18 @@ FIELDS = (
     ),
     *_DEFORMATION,
     *(_windowed(entry) for entry in _DEFORMATION if entry.name in _OVER_WINDOW),
-    Field("sigma", "Standard deviation of the position", "mm", "point", None, False, "Uncertainty",
-          ("sigma_xyz",), _length),
-    Field("sigma_displacement", "Standard deviation of the displacement", "mm", "point", None, False, "Uncertainty",
-          ("sigma_displacement",), _length),
-    *(
-        Field(f"sigma_lambda{k}", f"Standard deviation of λ{k}", "", "face", None, False, "Uncertainty")
-        for k in (1, 2)
-    ),
+    *_deviations("sigma", "the position", "mm", "point", "sigma_xyz"),
+    *_deviations("sigma_displacement", "the displacement", "mm", "point", "sigma_displacement"),
+    *_deviations("sigma_lambda1", "λ1", "", "face", "sigma_lambda1"),
+    *_deviations("sigma_lambda2", "λ2", "", "face", "sigma_lambda2"),
     *(
         Field(f"sigma_E{k}", f"Standard deviation of E{k}", "", "face", None, False, "Uncertainty",
-              (f"E{k}", f"sigma_lambda{k}"), _strain_sigma)
+              (f"E{k}", f"sigma_lambda{k}"), _strain_sigma, (f"sigma_lambda_calibration{k}",))
         for k in (1, 2)
     ),
     *(
-        Field(f"window_sigma_lambda{k}", f"Window: Standard deviation of λ{k}", "", "face", None, False, "Uncertainty")
-        for k in (1, 2)
-    ),
-    Field("sigma_calibration", "Standard deviation of the position by the calibration", "mm", "point", None, False,
-          "Uncertainty", ("sigma_calibration",), _length),
-    Field("sigma_total", "Standard deviation of the position by noise and calibration", "mm", "point", None, False,
-          "Uncertainty", ("sigma_xyz", "sigma_calibration"), lambda *parts: _length(np.concatenate(parts, axis=-1))),
-    Field("sigma_displacement_calibration", "Standard deviation of the displacement by the calibration", "mm", "point",
-          None, False, "Uncertainty", ("sigma_displacement_calibration",), _length),
-    *(
-        Field(f"sigma_lambda_calibration{k}", f"Standard deviation of λ{k} by the calibration", "", "face", None, False,
-              "Uncertainty")
+        Field(f"window_sigma_lambda{k}", f"Window: Standard deviation of λ{k} by the image noise", "", "face", None,
+              False, "Uncertainty")
         for k in (1, 2)
     ),
     Field("chi2", "Disagreement of the cameras, χ² a degree of freedom", "", "point"),
@@ -217,6 +246,7 @@ class StepFields:
 
     point : (N, ...) of the vertices, by name. face : (M, ...) of the triangles, by name.
     Scalars have no second axis; vectors are (·, 3), symmetric tensors (·, 6) in the order xx yy zz xy yz xz.
+    Standard deviations are here in their two parts, by image noise and by the calibration; fields join them.
     """
 
     point: dict[str, Floats]
@@ -226,6 +256,19 @@ class StepFields:
     def names(self) -> set[str]:
         """Names of all arrays."""
         return {*self.point, *self.face}
+
+    def joint_deviations(self, location: str) -> dict[str, Floats]:
+        """Standard deviations by image noise and calibration together, by noise alone where nothing else is known.
+
+        location : "point" for ``sigma_xyz`` and ``sigma_displacement`` (N, 3) mm, "face" for ``sigma_lambda1`` and
+        ``sigma_lambda2`` (M,); those that are known.
+        """
+        arrays = self.point if location == "point" else self.face
+        return {
+            name: joint_deviation(arrays[name], arrays.get(calibration))
+            for name, calibration in _CAUSES.items()
+            if name in arrays
+        }
 
     def scalar(self, entry: Field, rigid_motion_removed: bool = False) -> Floats:
         """Values of a field in its unit, (N,) where its location is "point", (M,) where it is "face"."""

@@ -14,6 +14,8 @@
         settings, calibration, summary    text: TOML, JSON, JSON
 
 Fields are computed from the stored arrays when they are read: a step takes about 100 bytes a point, 130 a triangle.
+Standard deviations are stored in two parts, ``sigma_…`` by image noise alone and ``sigma_…calibration…``; fields join
+them.
 A reader ignores groups, arrays and attributes that it does not know, and refuses a file of another schema than its own.
 The schema number is raised by a change that an older reader would misunderstand.
 """

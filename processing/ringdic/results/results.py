@@ -65,14 +65,15 @@ class Results:
     faces : (M, 3) vertex indices, normals outwards. pair : (M,) index of the pair that measured the triangle, -1 where
         a triangle joins two pairs. vertex_pair : (N,) index of the pair that measured the vertex.
     correlation : (F, N) C_LS, the largest over the images used. sigma_xyz : (F, N, 3) mm, standard deviations due to
-        image noise. status : (F, N), 0 measured.
+        image noise alone. status : (F, N), 0 measured.
     matches : the 2D matches, of each pair or of each camera. settings : TOML text. calibration, summary : JSON values.
-    sigma_displacement : (F, N, 3) mm, and sigma_lambda : (F, M, 2), of λ1 and λ2, both due to image noise.
+    sigma_displacement : (F, N, 3) mm, and sigma_lambda : (F, M, 2), of λ1 and λ2, both due to image noise alone.
     chi2 : (F, N) reprojection residual of the point, χ² a degree of freedom.
     sigma_calibration, sigma_displacement_calibration : (F, N, 3) mm, and sigma_lambda_calibration : (F, M, 2), due to
         the covariance of the cameras' parameters alone.
 
-    The arrays with default None are None where they are not known.
+    The arrays with default None are None where they are not known. Standard deviations are kept in parts, by cause;
+    fields and exports join the parts, and name one alone by the ending ``_noise`` or ``_calibration``.
     """
 
     rig: str

@@ -60,7 +60,8 @@ def test_npz_has_exactly_the_agreed_arrays(session: Path) -> None:
         shapes = {name: arrays[name].shape for name in arrays}
         assert shapes == {
             "vertices_ref": (30, 3), "vertices": (2, 30, 3), "faces": (40, 3), "lambda1": (2, 40), "lambda2": (2, 40),
-            "J": (2, 40), "E": (2, 40, 3, 3), "correlation": (2, 30), "sigma_xyz": (2, 30, 3), "pair": (40,),
+            "J": (2, 40), "E": (2, 40, 3, 3), "correlation": (2, 30), "sigma_xyz": (2, 30, 3),
+            "sigma_displacement": (2, 30, 3), "sigma_lambda": (2, 40, 2), "pair": (40,),
         }  # fmt: skip
         np.testing.assert_array_equal(arrays["vertices"], result.vertices)
         np.testing.assert_array_equal(arrays["faces"], result.faces)
@@ -73,6 +74,90 @@ def test_npz_has_exactly_the_agreed_arrays(session: Path) -> None:
         np.testing.assert_allclose(arrays["J"][1][whole], 1.1, atol=1e-12)
         np.testing.assert_allclose(arrays["E"][1][whole][:, 2, 2], (1.1**2 - 1) / 2, atol=1e-12)
         assert np.isnan(arrays["E"][1][~whole]).all()
+
+
+def with_deviations(calibrated: bool = True) -> Results:
+    """The sheet with standard deviations; those by the calibration are unknown at one point and one triangle."""
+    rng = np.random.default_rng(8)
+    sheet = replace(
+        bent_sheet(), sigma_displacement=rng.uniform(0, 0.01, (2, 30, 3)), sigma_lambda=rng.uniform(0, 1e-3, (2, 40, 2))
+    )
+    if not calibrated:
+        return sheet
+    unsure = {"sigma_calibration": rng.uniform(0, 0.02, (2, 30, 3)),
+              "sigma_displacement_calibration": rng.uniform(0, 0.02, (2, 30, 3)),
+              "sigma_lambda_calibration": rng.uniform(0, 2e-3, (2, 40, 2))}  # fmt: skip
+    for values in unsure.values():
+        values[:, 11] = np.nan
+    return replace(sheet, **unsure)
+
+
+def lay_down(result: Results, path: Path) -> Path:
+    """A session of these results."""
+    (path / "results" / "0001").mkdir(parents=True)
+    write_results(path / "results" / "0001" / "results.h5", result)
+    return path
+
+
+def loaded(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path) as arrays:
+        return dict(arrays)
+
+
+def joined(noise: np.ndarray, calibration: np.ndarray) -> np.ndarray:
+    """Root of the sum of the squares, of the noise alone where the part of the calibration is unknown."""
+    return np.where(np.isnan(calibration), noise, np.sqrt(noise**2 + calibration**2))
+
+
+def test_deviations_in_the_arrays_join_noise_and_calibration(tmp_path: Path) -> None:
+    sheet = with_deviations()
+    wanted = {
+        "sigma_xyz": joined(sheet.sigma_xyz, sheet.sigma_calibration),
+        "sigma_displacement": joined(sheet.sigma_displacement, sheet.sigma_displacement_calibration),
+        "sigma_lambda": joined(sheet.sigma_lambda, sheet.sigma_lambda_calibration),
+        "sigma_calibration": sheet.sigma_calibration,
+    }
+    path = lay_down(sheet, tmp_path / "calibrated")
+    npz, mat = loaded(export(path, "npz")), loadmat(export(path, "mat"))
+    for name, values in wanted.items():
+        np.testing.assert_allclose(npz[name], values, rtol=1e-6, err_msg=name)
+        np.testing.assert_array_equal(mat[name], npz[name], err_msg=name)
+    # Between two steps the part of the calibration is unknown, as it is in a run that calibrates each camera alone.
+    alone = with_deviations(calibrated=False)
+    between = export(path, "npz", tmp_path / "between.npz", Evaluation(previous=True))
+    for out in (between, export(lay_down(alone, tmp_path / "alone"), "npz")):
+        arrays = loaded(out)
+        for name in ("sigma_displacement", "sigma_lambda"):
+            np.testing.assert_allclose(arrays[name], getattr(alone, name), rtol=1e-6, err_msg=name)
+    np.testing.assert_allclose(arrays["sigma_xyz"], alone.sigma_xyz, rtol=1e-6)
+    assert "sigma_calibration" not in arrays
+    arrays = loaded(export(lay_down(bent_sheet(), tmp_path / "unknown"), "npz"))
+    assert np.isnan(arrays["sigma_displacement"]).all()
+    assert np.isnan(arrays["sigma_lambda"]).all()
+
+
+def test_every_format_has_the_same_deviations_under_the_same_names(tmp_path: Path) -> None:
+    sheet = with_deviations()
+    path = lay_down(sheet, tmp_path / "session")
+    moved = joined(sheet.sigma_displacement, sheet.sigma_displacement_calibration)[1]
+    stretch = joined(sheet.sigma_lambda, sheet.sigma_lambda_calibration)[1, :, 1]
+    tables = export(path, "csv")
+    points, faces = (pandas.read_csv(tables / f"{STEPS[1]}-{kind}.csv") for kind in ("points", "faces"))
+    np.testing.assert_allclose(points["sigma_displacement [mm]"], np.linalg.norm(moved, axis=1), rtol=1e-6)
+    by_noise = np.linalg.norm(sheet.sigma_displacement[1], axis=1)
+    np.testing.assert_allclose(points["sigma_displacement_noise [mm]"], by_noise, rtol=1e-6)
+    np.testing.assert_allclose(faces["sigma_lambda2"], stretch, rtol=1e-6)
+    with h5py.File(export(path, "vtkhdf")) as file:
+        group = file["VTKHDF"]
+        np.testing.assert_allclose(group["PointData/sigma_displacement"][30:], moved, rtol=1e-6)
+        np.testing.assert_allclose(group["PointData/sigma_displacement_noise"][30:], by_noise, rtol=1e-6)
+        np.testing.assert_allclose(
+            group["PointData/sigma_displacement_calibration"][30:], sheet.sigma_displacement_calibration[1], rtol=1e-6
+        )
+        np.testing.assert_allclose(group["CellData/sigma_lambda2"][40:], stretch, rtol=1e-6)
+    solid = trimesh.load(export(path, "ply") / f"{STEPS[1]}.ply", process=False)
+    stored = np.ravel(solid.metadata["_ply_raw"]["face"]["data"]["sigma_lambda2"])
+    np.testing.assert_allclose(stored, stretch[~(sheet.faces == LOST).any(axis=1)], rtol=1e-6)
 
 
 def test_mat_counts_from_one(session: Path, tmp_path: Path) -> None:
