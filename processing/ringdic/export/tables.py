@@ -14,17 +14,22 @@ def export_csv(results: EvaluatedResults, out: Path) -> None:
     """Write ``STEP-points.csv`` and ``STEP-faces.csv`` for every step into the folder ``out``.
 
     The first line names the columns with their units; vertices count from 0; what was not measured is empty. The
-    columns ``…_reference`` hold what the step is compared with.
+    columns ``…_reference`` hold what the step is compared with. Each triangle has the centroid of its corners there
+    and the displacement of the centroid.
     """
     for step, name in enumerate(results.steps):
         columns: dict[str, list[tuple[str, NDArray[np.generic]]]] = {"point": [], "face": []}
-        positions = results.positions(step)
+        faces, positions = results.results.faces, results.positions(step)
         before = results.results.reference_positions(step, results.evaluation.previous)
+        centroids, moved = (values[faces].mean(axis=1) for values in (before, positions - before))
+        for i in range(3):
+            columns["face"].append((f"vertex{i + 1}", faces[:, i]))
         for i, axis in enumerate("xyz"):
             columns["point"].append((f"{axis}_reference [mm]", before[:, i]))
             columns["point"].append((f"{axis} [mm]", positions[:, i]))
-        for i in range(3):
-            columns["face"].append((f"vertex{i + 1}", results.results.faces[:, i]))
+            columns["face"].append((f"centroid_{axis}_reference [mm]", centroids[:, i]))
+        for i, axis in enumerate("xyz"):
+            columns["face"].append((f"centroid_displacement_{axis} [mm]", moved[:, i]))
         fields = results.step(step)
         for entry in results.fields:
             unit = f" [{entry.unit}]" if entry.unit else ""

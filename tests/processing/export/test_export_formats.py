@@ -184,6 +184,21 @@ def test_csv_has_a_row_for_every_point_and_face(session: Path, tmp_path: Path) -
     assert float(last["lambda2"]) == pytest.approx(1.1, abs=1e-6)
 
 
+@pytest.mark.parametrize("rigid_motion_removed", [False, True])
+def test_csv_has_centroids_and_their_displacement(session: Path, tmp_path: Path, rigid_motion_removed: bool) -> None:
+    result = bent_sheet()
+    folder = export(session, "csv", tmp_path / "tables", Evaluation(rigid_motion_removed=rigid_motion_removed))
+    faces = pandas.read_csv(folder / f"{STEPS[1]}-faces.csv")
+    centroids = faces[[f"centroid_{axis}_reference [mm]" for axis in "xyz"]].to_numpy()
+    moved = faces[[f"centroid_displacement_{axis} [mm]" for axis in "xyz"]].to_numpy()
+    np.testing.assert_allclose(centroids, result.mesh.centroids, atol=1e-6)
+    whole = ~(result.faces == LOST).any(axis=1)
+    assert np.isnan(moved[~whole]).all()
+    stretched = result.mesh.centroids * [1.0, 1.0, 1.1]
+    wanted = result.motion(1).apply(stretched) if rigid_motion_removed else stretched
+    np.testing.assert_allclose(moved[whole], (wanted - result.mesh.centroids)[whole], atol=1e-6)
+
+
 def test_ply_has_the_measured_surface_with_its_fields(session: Path, tmp_path: Path) -> None:
     folder = export(session, "ply", tmp_path / "ply")
     solid = trimesh.load(folder / f"{STEPS[1]}.ply", process=False)
