@@ -6,22 +6,14 @@ CSV goes to standard output, or to a file; notes go to standard error.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ringdic.cli.console import print_json, say
-from ringdic.cli.options import (
-    AsJson,
-    Reference,
-    Run,
-    Session,
-    SethHill,
-    Window,
-    WithoutRigidMotion,
-    results_of,
-)
+from ringdic.cli.options import AsJson, FamilyChoice, RunChoice, Session, spread_options
 from ringdic.errors import InputError
 
 if TYPE_CHECKING:
@@ -40,7 +32,30 @@ Out = Annotated[Path | None, typer.Option(help="CSV file to write; standard outp
 Within = Annotated[float, typer.Option(metavar="MM", help="How far a position may be from the surface.")]
 
 
+@dataclass(frozen=True)
+class TableOutput:
+    """Options that choose where a table goes: a CSV file, standard output, or standard output as JSON."""
+
+    out: Out = None
+    as_json: AsJson = False
+
+    def give(self, table: Table) -> None:
+        """Write the table, and its notes to standard error. Raises InputError where there is no folder for the file."""
+        if self.out is not None:
+            if not self.out.parent.is_dir():
+                raise InputError(f"{self.out.parent}: no such folder to write into")
+            self.out.write_text(table.to_csv(), encoding="utf-8")
+            say(f"written {self.out}")
+        for note in table.notes:
+            say(note)
+        if self.as_json:
+            print_json(table.to_json())
+        elif self.out is None:
+            typer.echo(table.to_csv(), nl=False)
+
+
 @measure_app.command("point")
+@spread_options
 def point_command(
     session: Session,
     at: Annotated[list[str] | None, typer.Option(metavar="X,Y,Z", help="Position, mm; repeatable.")] = None,
@@ -48,13 +63,9 @@ def point_command(
     face: Annotated[list[int] | None, typer.Option(help="Face by its index from 0; repeatable.")] = None,
     within: Within = 5.0,
     field: Fields = None,
-    run: Run = None,
-    reference: Reference = "first",
-    without_rigid_motion: WithoutRigidMotion = False,
-    window: Window = None,
-    seth_hill: SethHill = None,
-    out: Out = None,
-    as_json: AsJson = False,
+    *,
+    evaluation: FamilyChoice,
+    output: TableOutput,
 ) -> None:
     """Time series at material points: the nearest to positions in the reference, vertices or centroids of faces."""
     from ringdic.measure.place import nearest_place, place_of_face, place_of_vertex
@@ -63,59 +74,57 @@ def point_command(
     positions = [_numbers("--at", text, 3) for text in at or ()]
     if not (positions or vertex or face):
         raise InputError("name a place: --at X,Y,Z, --vertex INDEX or --face INDEX")
-    results = results_of(session, run, reference, without_rigid_motion, window, seth_hill)
+    results = evaluation.results(session)
     mesh = results.results.mesh
     places = [nearest_place(mesh, xyz, within) for xyz in positions]
     places += [place_of_vertex(mesh, index) for index in vertex or ()]
     places += [place_of_face(mesh, index) for index in face or ()]
-    _give(time_series(results, places, field or ()), out, as_json)
+    output.give(time_series(results, places, field or ()))
 
 
 @measure_app.command("extensometer")
+@spread_options
 def extensometer_command(
     session: Session,
     from_: Annotated[str, typer.Option("--from", metavar="X,Y,Z", help="One end in the reference, mm.")],
     to: Annotated[str, typer.Option(metavar="X,Y,Z", help="The other end, mm.")],
     within: Within = 5.0,
-    run: Run = None,
-    reference: Reference = "first",
-    out: Out = None,
-    as_json: AsJson = False,
+    *,
+    choice: RunChoice,
+    output: TableOutput,
 ) -> None:
     """Virtual extensometer: length between two material points at every step, along the surface and straight."""
     from ringdic.measure.extensometer import extensometer
     from ringdic.measure.place import nearest_place
 
     ends = _numbers("--from", from_, 3), _numbers("--to", to, 3)
-    results = results_of(session, run, reference)
+    results = choice.results(session)
     start, end = (nearest_place(results.results.mesh, xyz, within) for xyz in ends)
-    _give(extensometer(results, start, end), out, as_json)
+    output.give(extensometer(results, start, end))
 
 
 @measure_app.command("section")
+@spread_options
 def section_command(
     session: Session,
     z: Annotated[float | None, typer.Option(help="The plane of this height, mm.")] = None,
     theta: Annotated[float | None, typer.Option(help="The half-plane from the axis at this azimuth, degrees.")] = None,
     plane: Annotated[str | None, typer.Option(metavar="X,Y,Z,NX,NY,NZ", help="Point, mm, and normal.")] = None,
     field: Fields = None,
-    run: Run = None,
-    reference: Reference = "first",
-    without_rigid_motion: WithoutRigidMotion = False,
-    window: Window = None,
-    seth_hill: SethHill = None,
-    out: Out = None,
-    as_json: AsJson = False,
+    *,
+    evaluation: FamilyChoice,
+    output: TableOutput,
 ) -> None:
     """Fields along a cut of the reference surface, followed through all steps."""
     from ringdic.measure.section import section
 
     cut = _cut(z, theta, plane)
-    results = results_of(session, run, reference, without_rigid_motion, window, seth_hill)
-    _give(section(results, cut, field or ()), out, as_json)
+    results = evaluation.results(session)
+    output.give(section(results, cut, field or ()))
 
 
 @measure_app.command("region")
+@spread_options
 def region_command(
     session: Session,
     box: Annotated[str | None, typer.Option(metavar="X,Y,Z,X,Y,Z", help="Lower and upper corner, mm.")] = None,
@@ -125,36 +134,32 @@ def region_command(
     ] = None,
     faces: Annotated[str | None, typer.Option(metavar="I,I,…", help="Faces by their indices from 0.")] = None,
     field: Fields = None,
-    run: Run = None,
-    reference: Reference = "first",
-    without_rigid_motion: WithoutRigidMotion = False,
-    window: Window = None,
-    seth_hill: SethHill = None,
-    out: Out = None,
-    as_json: AsJson = False,
+    *,
+    evaluation: FamilyChoice,
+    output: TableOutput,
 ) -> None:
     """Statistics of fields over a part of the reference surface; over all of it unless a part is named."""
     from ringdic.measure.region import region_statistics
 
     part = _region(box, sphere, patch, faces)
-    results = results_of(session, run, reference, without_rigid_motion, window, seth_hill)
-    _give(region_statistics(results, part, field or ()), out, as_json)
+    results = evaluation.results(session)
+    output.give(region_statistics(results, part, field or ()))
 
 
+@spread_options
 def strain_command(
     session: Session,
     window: Annotated[list[float] | None, typer.Option(metavar="MM", help="Width; repeatable. 0: no window.")] = None,
-    run: Run = None,
-    reference: Reference = "first",
-    out: Out = None,
-    as_json: AsJson = False,
+    *,
+    choice: RunChoice,
+    output: TableOutput,
 ) -> None:
     """Study the strain window: strain and its scatter over windows of several widths, without correlating again."""
     from ringdic.measure.window_study import window_study
 
-    results = results_of(session, run, reference)
+    results = choice.results(session)
     widths = window or [0.0, 3.0, 5.0, 8.0, 12.0]
-    _give(window_study(results.results, widths, results.evaluation.previous), out, as_json)
+    output.give(window_study(results.results, widths, results.evaluation.previous))
 
 
 def _cut(z: float | None, theta: float | None, plane: str | None) -> Cut:
@@ -200,17 +205,3 @@ def _numbers(option: str, text: str, count: int) -> tuple[float, ...]:
     if len(values) != count or not all(map(math.isfinite, values)):
         raise InputError(f"{option} {text}: wanted {count} numbers with commas between them")
     return values
-
-
-def _give(table: Table, out: Path | None, as_json: bool) -> None:
-    if out is not None:
-        if not out.parent.is_dir():
-            raise InputError(f"{out.parent}: no such folder to write into")
-        out.write_text(table.to_csv(), encoding="utf-8")
-        say(f"written {out}")
-    for note in table.notes:
-        say(note)
-    if as_json:
-        print_json(table.to_json())
-    elif out is None:
-        typer.echo(table.to_csv(), nl=False)

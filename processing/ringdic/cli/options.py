@@ -1,9 +1,13 @@
-"""Options that several commands share, and the results that they select."""
+"""Options that several commands share, alone and in groups, and the results that they select."""
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -19,17 +23,67 @@ SethHill = Annotated[float | None, typer.Option(metavar="M", help="Strains of th
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 
 
-def results_of(
+@dataclass(frozen=True)
+class RunChoice:
+    """Options that choose a run of a session, and what its steps are compared with."""
+
+    run: Run = None
+    reference: Reference = "first"
+
+    def results(self, session: Path) -> EvaluatedResults:
+        """Read the results of the run for evaluation with these options. Raises InputError where there is none."""
+        return _results(session, **vars(self))
+
+
+@dataclass(frozen=True)
+class EvaluationChoice(RunChoice):
+    """Options that choose a run of a session, and how its fields are evaluated."""
+
+    without_rigid_motion: WithoutRigidMotion = False
+    window: Window = None
+
+
+@dataclass(frozen=True)
+class FamilyChoice(EvaluationChoice):
+    """Options that choose a run of a session, how its fields are evaluated, and one more family of strains."""
+
+    seth_hill: SethHill = None
+
+
+def spread_options(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with each parameter that is a class of options replaced by these options, each by itself.
+
+    command : function with annotations for typer; a parameter may be a dataclass whose fields have such annotations.
+    """
+    signature = inspect.signature(command, eval_str=True)
+    groups: dict[str, Any] = {
+        name: one.annotation for name, one in signature.parameters.items() if is_dataclass(one.annotation)
+    }
+
+    @wraps(command)
+    def spread(**given: Any) -> None:
+        for name, group in groups.items():
+            given[name] = group(**{option.name: given.pop(option.name) for option in fields(group)})
+        command(**given)
+
+    parameters: list[inspect.Parameter] = []
+    for name, parameter in signature.parameters.items():
+        options = inspect.signature(groups[name], eval_str=True).parameters.values() if name in groups else [parameter]
+        parameters += [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
+    spread.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    return spread
+
+
+def _results(
     session: Path,
     run: int | None,
     reference: str,
     without_rigid_motion: bool = False,
     window: float | None = None,
-    exponent: float | None = None,
+    seth_hill: float | None = None,
 ) -> EvaluatedResults:
-    """Read the results of a run for evaluation with the given options. Raises InputError where there is no such run."""
     from ringdic.results.evaluation import Evaluation, evaluate_results
     from ringdic.session.folder import newest_results
 
-    how = Evaluation.of(reference, without_rigid_motion, window, exponent)
+    how = Evaluation.of(reference, without_rigid_motion, window, seth_hill)
     return evaluate_results(newest_results(session, run), how)

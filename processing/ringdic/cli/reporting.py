@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ringdic.cli.console import print_json, say
-from ringdic.cli.options import AsJson, Reference, Run, Session, Window, WithoutRigidMotion, results_of
+from ringdic.cli.options import AsJson, EvaluationChoice, Run, Session, spread_options
 from ringdic.errors import InputError
 from ringdic.progress import Progress, progress_bar
 
@@ -38,6 +38,7 @@ def report_command(
     _tell_written([written], as_json)
 
 
+@spread_options
 def overlay_command(
     session: Session,
     field: FieldName = "lambda2",
@@ -47,10 +48,8 @@ def overlay_command(
     opacity: Opacity = 0.65,
     out: Annotated[Path, typer.Option(help="Folder for the pictures, one PNG a camera.")] = Path("."),
     bar: Annotated[bool, typer.Option(help="Whether to add the colour bar.")] = True,
-    run: Run = None,
-    reference: Reference = "first",
-    without_rigid_motion: WithoutRigidMotion = False,
-    window: Window = None,
+    *,
+    evaluation: EvaluationChoice,
     as_json: AsJson = False,
 ) -> None:
     """Draw a field over the cameras' photographs of a step."""
@@ -59,7 +58,7 @@ def overlay_command(
     from ringdic.pictures.overlay import overlay, photograph, with_bar
     from ringdic.session.folder import open_session
 
-    results = results_of(session, run, reference, without_rigid_motion, window)
+    results = evaluation.results(session)
     scale = _scale(results, field, limits)
     number = _step(results, step)
     captured = open_session(session)
@@ -75,6 +74,7 @@ def overlay_command(
     _tell_written(written, as_json)
 
 
+@spread_options
 def animate_command(
     session: Session,
     out: Annotated[Path, typer.Option(help="The .gif or .mp4 file.")],
@@ -85,10 +85,8 @@ def animate_command(
     seconds: Annotated[float, typer.Option(min=0.02, max=60.0, help="Each step is shown for.")] = 0.8,
     size: Annotated[int, typer.Option(min=64, max=4096, help="Longer side of the picture, px.")] = 720,
     opacity: Opacity = 0.65,
-    run: Run = None,
-    reference: Reference = "first",
-    without_rigid_motion: WithoutRigidMotion = False,
-    window: Window = None,
+    *,
+    evaluation: EvaluationChoice,
     as_json: AsJson = False,
 ) -> None:
     """Animate a field over all steps as GIF or MP4: on one camera's photographs, or on the body seen from a side."""
@@ -98,7 +96,7 @@ def animate_command(
 
     if camera is not None and azimuth is not None:
         raise InputError("--camera shows its photographs, --azimuth the body without them; give one of them")
-    results = results_of(session, run, reference, without_rigid_motion, window)
+    results = evaluation.results(session)
     scale = _scale(results, field, limits)
     if camera is not None:
         frames = overlay_frames(results, open_session(session), camera, scale, size, opacity)
