@@ -14,7 +14,7 @@ from ringdic.arrays import Floats, Pixels
 from ringdic.errors import missing_extra
 from ringdic.mesh.mesh import Mesh
 from ringdic.pictures.scale import Scale, face_colours, on_faces
-from ringdic.pictures.views import from_side, mean_azimuth
+from ringdic.pictures.views import Extent, from_side, mean_azimuth
 from ringdic.results.evaluation import EvaluatedResults
 
 if TYPE_CHECKING:
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 _INNER_SIDE = (0.86, 0.87, 0.89, 1.0)
 _HEIGHT = 900  # px of the painted surface
+_LARGEST = (7.7, 3.9)  # inches, width and height of the picture in a new figure
+_AROUND = (1.7, 0.8)  # inches that labels, title and colour bar take beside and above it
+_FORMS = (0.3, 3.0)  # width over height of the narrowest and of the widest axes: there is room for their labels
 
 
 def draw_over_image(
@@ -45,7 +48,7 @@ def draw_over_image(
     scale : colours, limits and title.
     opacity : of the colours, 0 to 1.
     """
-    axes = _axes(axes)
+    axes = _axes(axes, image.shape[1] / image.shape[0])
     axes.imshow(image, cmap="gray")
     colours = scale.mappable()
     look: dict[str, Any] = {"cmap": colours.cmap, "norm": colours.norm, "alpha": opacity}
@@ -80,13 +83,14 @@ def draw_surface(
     azimuth : direction about z from which the surface is seen, degrees from +x; None takes the side that it faces.
     elevation : angle from which it is seen above the horizontal, degrees.
     """
-    axes = _axes(axes)
     mesh = Mesh(results.positions(step), results.results.faces)
     towards = mean_azimuth(results.results.mesh) if azimuth is None else float(np.radians(azimuth))
     view = from_side(mesh, towards, _HEIGHT, float(np.radians(elevation)))
+    axes = _axes(axes, float(np.clip(view.aspect, *_FORMS)))
     picture = face_colours(view.faces, _on_faces(results, scale, step), scale)
     picture[view.inside] = _INNER_SIDE
     axes.imshow(picture, extent=view.extent, interpolation="antialiased")
+    _widen(axes, view.extent)
     axes.set_xlabel("mm, to the right")
     axes.set_ylabel("mm, upwards")
     axes.set_title(results.steps[step], fontsize="medium", loc="left")
@@ -121,5 +125,19 @@ def _on_faces(results: EvaluatedResults, scale: Scale, step: int) -> Floats:
     return on_faces(results, scale.field, results.step(step).scalar(scale.field), step)
 
 
-def _axes(axes: Axes | None) -> Axes:
-    return pyplot.subplots(layout="constrained")[1] if axes is None else axes
+def _axes(axes: Axes | None, aspect: float) -> Axes:
+    """The axes, or those of a new figure of the form that a picture needs; aspect : its width over its height."""
+    if axes is not None:
+        return axes
+    height = min(_LARGEST[1], _LARGEST[0] / aspect)
+    size = aspect * height + _AROUND[0], height + _AROUND[1]
+    return pyplot.subplots(figsize=size, layout="constrained")[1]
+
+
+def _widen(axes: Axes, extent: Extent) -> None:
+    """Let axes of a very narrow or very flat picture show more than its extent (mm), evenly on both sides."""
+    left, right, low, high = extent
+    width, height = right - left, high - low
+    wider, higher = max(width, _FORMS[0] * height) - width, max(height, width / _FORMS[1]) - height
+    axes.set_xlim(left - 0.5 * wider, right + 0.5 * wider)
+    axes.set_ylim(low - 0.5 * higher, high + 0.5 * higher)

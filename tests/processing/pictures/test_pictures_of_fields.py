@@ -1,15 +1,19 @@
 """Pictures tell what was measured, where it was: against a tube whose geometry and deformation are known."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from matplotlib import pyplot
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 from ringdic.errors import InputError
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.mesh.mesh import Mesh
 from ringdic.pictures.animation import surface_frames, write_animation
+from ringdic.pictures.axes import draw_surface
 from ringdic.pictures.overlay import camera_of, overlay
 from ringdic.pictures.painter import paint
 from ringdic.pictures.scale import Scale, scale_of
@@ -113,6 +117,22 @@ def test_an_overlay_colours_what_the_camera_sees_and_leaves_the_rest_of_the_phot
     np.testing.assert_array_equal(drawn[y, x], 102)
     np.testing.assert_array_equal(drawn[:10], 102)
     assert cosine[np.unique(through_camera(now, camera()))[1:]].min() > 0
+
+
+@pytest.mark.parametrize("form", [(0.2, 0.2, 1.0), (1.0, 1.0, 1.0), (1.0, 1.0, 0.6)])
+def test_a_drawing_of_a_narrow_or_wide_surface_fills_its_figure(form: tuple[float, float, float]) -> None:
+    tube = drawn_tube()
+    seen = EvaluatedResults(replace(tube, vertices_ref=tube.vertices_ref * form, vertices=tube.vertices * form))
+    axes = draw_surface(None, seen, scale_of(seen, "lambda2", (0.7, 1.3)), 0, elevation=0.0)
+    figure = axes.figure
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    assert axes.get_window_extent().height > 0.7 * figure.bbox.height  # the rest are title and labels
+    drawn = (np.asarray(canvas.buffer_rgba())[..., :3] < 250).any(axis=2)
+    pyplot.close(figure)
+    for axis in (0, 1):
+        filled = np.concatenate([[True], drawn.any(axis=axis), [True]])
+        assert np.diff(np.flatnonzero(filled)).max() < 0.12 * len(filled)  # the widest strip of blank paper
 
 
 def test_what_cannot_be_laid_over_is_refused_by_name() -> None:
