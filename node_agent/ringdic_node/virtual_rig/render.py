@@ -7,9 +7,7 @@ is small takes one sample, any other the mean of ``SAMPLES``² samples on a grid
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Callable
-from pathlib import Path
 
 import numba as nb
 import numpy as np
@@ -19,7 +17,8 @@ from ringdic_node.virtual_rig.arrays import Radiance
 from ringdic_node.virtual_rig.body import CYLINDER, approach, body_point
 from ringdic_node.virtual_rig.lens import VirtualCamera, ideal_of_pixel
 from ringdic_node.virtual_rig.rig import paper_rig
-from ringdic_node.virtual_rig.scenes import BoardScene, Scene, Specimen, TargetScene
+from ringdic_node.virtual_rig.room import BLACK, SKIN, STAMP, WHITE, brightness, room_radiance, to_world
+from ringdic_node.virtual_rig.scenes import BoardScene, Scene, SolidSpecimen, Specimen, TargetScene
 from ringdic_node.virtual_rig.scenes import scene as make_scene
 from ringdic_node.virtual_rig.scenes.board import MARGIN, SQUARE, SQUARES
 from ringdic_node.virtual_rig.scenes.damage import BAR, GLARE_PEAK, GLARE_WIDTH, Damage
@@ -30,10 +29,7 @@ SAMPLES = 2
 # mm on the surface: a pixel with a footprint no larger takes one sample. The error of a subset of 41 px is then less
 # than 0.0001 px in the mean and 0.0007 px for each, a fifth of what the sensor's noise makes.
 FINE = 0.2
-# The key under which compiled kernels are kept on disk includes this stamp, so they are rebuilt when any file of the
-# renderer changes (numba itself looks at this file alone).
-STAMP = zlib.crc32(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.rglob("*.py"))))
-_WHITE, _BLACK, _SKIN, _BASE = 0.80, 0.05, 0.30, 0.03  # reflectance times exposure
+_BASE = 0.03  # reflectance times exposure
 _TARGET_TOP, _BASE_RADIUS, _BASE_BOTTOM = 250.0, 66.0, -35.0  # mm
 _PRINT_SPECKLE, _PRINT_DOTS = 0, 1
 _FAR = 400.0  # mm, further than any camera is from the body
@@ -54,6 +50,10 @@ def load_renderer(specimen: str = "limb") -> None:
 
 def radiance(camera: VirtualCamera, scene: Scene) -> Radiance:
     """Noise-free image (height, width) of a scene after the lens, in linear light without unit; 1 saturates."""
+    if isinstance(scene, SolidSpecimen):
+        from ringdic_node.virtual_rig.solid_render import solid_radiance  # compiled only where a solid body is rendered
+
+        return solid_radiance(camera, scene)
     out = np.zeros((camera.height, camera.width), np.float32)
     if isinstance(scene, BoardScene):
         R, t = scene.pose(camera)
@@ -82,37 +82,6 @@ def _widest(scene: Specimen | TargetScene) -> float:
     theta, z = np.meshgrid(np.linspace(0.0, 2.0 * math.pi, 73), np.linspace(-120.0, 370.0, 50))
     xyz = scene.surface.position(theta, z, scene.step)
     return float(np.hypot(xyz[..., 0], xyz[..., 1]).max()) + 1.0
-
-
-@nb.njit(nogil=True)
-def _background(o, d, per):  # type: ignore[no-untyped-def]
-    """Radiance of the background: a dark room with rings of LED strips at the cameras' radius.
-
-    per : width of a pixel at distance 1.
-    """
-    a = d[0] * d[0] + d[1] * d[1]
-    b = o[0] * d[0] + o[1] * d[1]
-    c = o[0] * o[0] + o[1] * o[1] - 380.0 * 380.0
-    t = (-b + math.sqrt(max(b * b - a * c, 0.0))) / a
-    h = o[2] + t * d[2]
-    arc = 380.0 * math.atan2(o[1] + t * d[1], o[0] + t * d[0])
-    wide = t * per
-    value = 0.010 + 0.00002 * max(0.0, 300.0 - abs(h - 60.0))
-    value += 0.02 * (1.0 - covered(-40.0 - h, wide)) * (1.0 + 0.3 * math.sin(0.35 * h + 0.02 * arc))
-    for centre in (-12.0, 40.0, 150.0, 165.0, 215.0):
-        off = abs(h - centre)
-        if off > 50.0:
-            continue
-        value += 0.03 / (1.0 + (max(off - 5.0, 0.0) / 6.0) ** 2)
-        lamp = covered(off - 3.0, wide) * covered(-0.6 - math.sin(0.9 * arc), 0.9 * wide)
-        value = max(value, covered(off - 5.0, wide) * (0.75 + 0.35 * lamp))
-    return value
-
-
-@nb.njit(nogil=True)
-def _lit(cosine):  # type: ignore[no-untyped-def]
-    """Brightness of a white surface lit from all sides. cosine : of the angle between its normal and the ray."""
-    return 0.40 + 0.60 * cosine
 
 
 @nb.njit(nogil=True)
@@ -238,21 +207,21 @@ def _shade(o, d, p, look, seed, marks, theta, z, t, frame, per_x, per_y, samples
     cosine = max(0.02, -(nx * d[0] + ny * d[1] + nz * d[2]) / (size * length))
     ws, wz = _footprint(d, t, frame, per_x, per_y)
     s = (theta - 2.0 * math.pi * math.floor(theta / (2.0 * math.pi))) * RADIUS
-    light = _lit(cosine) * (1.0 - 0.0006 * abs(z - 130.0))
+    light = brightness(cosine) * (1.0 - 0.0006 * abs(z - 130.0))
     if look[0] == _PRINT_DOTS:
         dark = dots(s, z, ws, wz, marks[0])
-        return light * (_WHITE + dark * (_BLACK - _WHITE))
+        return light * (WHITE + dark * (BLACK - WHITE))
     glare = _glare(o, d, t, nx / size, ny / size, nz / size, length, marks[2]) if len(marks[2]) else 0.0
     if p[0] != CYLINDER and not look[1] + 6.0 < z < look[2] - 6.0:
         ragged = 2.0 * math.sin(5.0 * theta) + 1.3 * math.sin(13.0 * theta + 1.0) + 0.6 * math.sin(31.0 * theta)
         low, high = look[1] - 3.0 + 0.5 * ragged, look[2] + 3.0 + 0.5 * ragged
         if z < low or z > high:
-            return glare + light * _SKIN * (1.0 + 0.03 * math.sin(0.8 * z + 3.0 * math.sin(4.0 * theta)))
+            return glare + light * SKIN * (1.0 + 0.03 * math.sin(0.8 * z + 3.0 * math.sin(4.0 * theta)))
     blur = math.sqrt((POINT_SPREAD * samples) ** 2 + 1.0 / 12.0)  # of lens and sample, in widths of a sample
     dark = speckle(s, z, blur * ws, blur * wz, seed) if look[1] < z < look[2] else 0.0
     if dark > 0.0 and len(marks[1]):
         dark *= 1.0 - _worn(s, z, ws + wz, marks[1])
-    return glare + light * (_WHITE + dark * (_BLACK - _WHITE))
+    return glare + light * (WHITE + dark * (BLACK - WHITE))
 
 
 @nb.njit(nogil=True)
@@ -305,13 +274,6 @@ def _before_bars(o, d, t, wide, bars, value):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True)
-def _to_world(R, x, y, d):  # type: ignore[no-untyped-def]
-    """Write the direction (x, y, 1) of the camera's frame, turned to the world frame, to d."""
-    for i in range(3):
-        d[i] = R[0, i] * x + R[1, i] * y + R[2, i]
-
-
-@nb.njit(nogil=True)
 def _render_body(lens, R, o, p, look, seed, marks, out):  # type: ignore[no-untyped-def]
     """Render a body on its base in front of the room.
 
@@ -331,7 +293,7 @@ def _render_body(lens, R, o, p, look, seed, marks, out):  # type: ignore[no-unty
             x, y, xu, xv, yu, yv = ideal_of_pixel(u, v, lens, x, y)
             if u == 0:
                 first_x, first_y = x, y
-            _to_world(R, x, y, straight)
+            to_world(R, x, y, straight)
             beside = _on_cylinder(o, straight, look[5], 0.0, 0.0) < 0.0
             if round_body:
                 near = False
@@ -347,7 +309,7 @@ def _render_body(lens, R, o, p, look, seed, marks, out):  # type: ignore[no-unty
             depth = t if near and look[3] <= z <= look[4] else 0.0
             if beside:  # one sample of the room is enough
                 near = False
-                room = _background(o, straight, SAMPLES * per_x)
+                room = room_radiance(o, straight, SAMPLES * per_x)
                 out[v, u] = _before_bars(o, straight, 0.0, SAMPLES * per_x, marks[3], room)
                 continue
             if near and look[0] == _PRINT_SPECKLE:
@@ -362,7 +324,7 @@ def _render_body(lens, R, o, p, look, seed, marks, out):  # type: ignore[no-unty
             for k in range(SAMPLES * SAMPLES):
                 a = (k % SAMPLES + 0.5) * share - 0.5
                 b = (k // SAMPLES + 0.5) * share - 0.5
-                _to_world(R, x + a * xu + b * xv, y + a * yu + b * yv, d)
+                to_world(R, x + a * xu + b * xv, y + a * yu + b * yv, d)
                 if round_body:
                     theta_k, z_k, t_k, met = _on_round(o, d, p, frame)
                 else:
@@ -389,8 +351,11 @@ def _on_limb_beside(o, d, p, near, theta, z, t, middle, frame):  # type: ignore[
 
 @nb.njit(nogil=True)
 def _behind(o, d, p, per):  # type: ignore[no-untyped-def]
-    """Radiance behind the body: of the base below a cylinder, else of the room."""
+    """Radiance behind the wall of the body: of the top and the base of a cylinder, else of the room."""
     if p[0] == CYLINDER:
+        lid = (_TARGET_TOP + p[4] - o[2]) / d[2] if d[2] < 0.0 else 0.0
+        if lid > 0.0 and (o[0] + lid * d[0] - p[2]) ** 2 + (o[1] + lid * d[1] - p[3]) ** 2 < p[1] * p[1]:
+            return 2.0 * _BASE
         t = _on_cylinder(o, d, _BASE_RADIUS, p[2], p[3])
         if t > 0.0:
             h = o[2] + t * d[2]
@@ -401,7 +366,7 @@ def _behind(o, d, p, per):  # type: ignore[no-untyped-def]
                 x, y = o[0] + t * d[0] - p[2], o[1] + t * d[1] - p[3]
                 if x * x + y * y < _BASE_RADIUS * _BASE_RADIUS:
                     return 2.0 * _BASE
-    return _background(o, d, per)
+    return room_radiance(o, d, per)
 
 
 @nb.njit(nogil=True)
@@ -416,8 +381,8 @@ def _board_sample(x, y, o, R, d, Rb, tb, per_x, per_y):  # type: ignore[no-untyp
         max(abs(bx - SQUARES[0] / 2) - SQUARES[0] / 2, abs(by - SQUARES[1] / 2) - SQUARES[1] / 2) - MARGIN / SQUARE
     )
     if outside > 0.0 or depth < 0.0:
-        _to_world(R, x, y, d)
-        return _background(o, d, per_x), outside
+        to_world(R, x, y, d)
+        return room_radiance(o, d, per_x), outside
     # Footprint of the sample: derivatives of the board's coordinates by x and y.
     across = Rb[0, 0] * x + Rb[1, 0] * y + Rb[2, 0]
     along = Rb[0, 1] * x + Rb[1, 1] * y + Rb[2, 1]
@@ -426,7 +391,7 @@ def _board_sample(x, y, o, R, d, Rb, tb, per_x, per_y):  # type: ignore[no-untyp
     wx = abs(Rb[0, 0] - gx * across) * ux + abs(Rb[1, 0] - gy * across) * uy
     wy = abs(Rb[0, 1] - gx * along) * ux + abs(Rb[1, 1] - gy * along) * uy
     cosine = abs(slope) / math.sqrt(x * x + y * y + 1.0)
-    return _lit(cosine) * (_WHITE + checker(bx, by, wx, wy) * (_BLACK - _WHITE)), outside
+    return brightness(cosine) * (WHITE + checker(bx, by, wx, wy) * (BLACK - WHITE)), outside
 
 
 @nb.njit(nogil=True)

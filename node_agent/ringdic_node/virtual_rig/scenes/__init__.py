@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from ringdic_node.virtual_rig.scenes.board import BoardScene
 from ringdic_node.virtual_rig.scenes.damage import Bar, Damage, SpoiltPatch
+from ringdic_node.virtual_rig.scenes.solid import Solid, SolidMotion, SolidSpecimen
 from ringdic_node.virtual_rig.scenes.specimen import Cylinder, Limb, Specimen
 from ringdic_node.virtual_rig.scenes.target import TargetScene
 
-Scene = BoardScene | TargetScene | Specimen
+Scene = BoardScene | TargetScene | Specimen | SolidSpecimen
 
 __all__ = [
     "Bar",
@@ -16,6 +17,9 @@ __all__ = [
     "Damage",
     "Limb",
     "Scene",
+    "Solid",
+    "SolidMotion",
+    "SolidSpecimen",
     "Specimen",
     "SpoiltPatch",
     "TargetScene",
