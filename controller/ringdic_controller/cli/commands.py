@@ -56,19 +56,34 @@ def controller_command(
 
 
 def validate_command(
-    scale: Annotated[float, typer.Option(min=0.1, max=1.0, help="Size of the images; 1 is 2464 x 3280 px.")] = 1.0,
+    scale: Annotated[
+        float | None,
+        typer.Option(min=0.1, max=1.0, help="Size of the images; 1 is 2464 x 3280 px. [default: 1, bodies 0.3]"),
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder for images, sessions and tables; kept for the next run.")] = Path(
         "ringdic-validate"
     ),
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer board views and steps.")] = False,
-    only: Annotated[list[str] | None, typer.Option(metavar="EXPERIMENT", help="One experiment; repeatable.")] = None,
+    bodies: Annotated[
+        bool, typer.Option("--bodies", help="A gallery of bodies on different rigs, instead of the experiments.")
+    ] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer board views and steps of the experiments.")] = False,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="One experiment, or one body, rig or row of the gallery; repeatable."),
+    ] = None,
     images_only: Annotated[bool, typer.Option("--images-only", help="Render the images and stop.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Repeat the paper's experiments on the virtual rig and compare with the paper's figures."""
-    from ringdic_controller.studies.validate import run_validation
+    if bodies:
+        from ringdic_controller.studies.gallery import run_gallery
 
-    findings = run_validation(out, scale=scale, quick=quick, only=only or (), images_only=images_only)
+        findings = run_gallery(out, scale=0.3 if scale is None else scale, only=only or (), images_only=images_only)
+    else:
+        from ringdic_controller.studies.validate import run_validation
+
+        size = 1.0 if scale is None else scale
+        findings = run_validation(out, scale=size, quick=quick, only=only or (), images_only=images_only)
     if as_json:
         print_json(findings)
 

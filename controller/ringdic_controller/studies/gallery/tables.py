@@ -1,0 +1,102 @@
+"""The gallery's table: on the terminal, as JSON and as a page of Markdown."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ringdic_controller.studies.gallery.comparison import COVERED, SHAPE, SPREAD, RowFigures
+
+AIMS = (
+    f"Aims: at least {100 * COVERED:.0f} % covered of what two cameras see below 60°, no point wrong by more than "
+    f"1 mm, shape at most {SHAPE} σ (RMS), displacements and stretches {SPREAD[0]:.2f} to {SPREAD[1]:.2f} σ (robust)."
+)
+
+
+@dataclass(frozen=True)
+class GalleryEntry:
+    """One row of the gallery as it was measured: its figures, or the sentence by which it was refused."""
+
+    name: str
+    seconds: float
+    figures: RowFigures | None = None
+    refusal: str = ""
+    warnings: tuple[str, ...] = ()
+    picture: str = ""
+
+    @property
+    def missed(self) -> list[str]:
+        """Names of the aims that are not reached."""
+        return ["measured"] if self.figures is None else self.figures.missed
+
+    def cells(self) -> dict[str, str]:
+        """The row of the table."""
+        f = self.figures
+        if f is None:
+            return {**dict.fromkeys(_COLUMNS, ""), "row": self.name, "s": f"{self.seconds:.0f}", "missed": "refused"}
+        values = (
+            self.name,
+            f"{f.seen_cm2:.0f}",
+            f"{100 * f.covered:.1f}",
+            f"{100 * f.covered_later:.1f}",
+            f"{f.points}",
+            f"{f.wrong}",
+            f"{f.shape_mm:.4f}",
+            f"{f.shape.plain:.2f} / {f.shape.robust:.2f}",
+            f"{f.displacement_mm:.4f}",
+            f"{f.displacement.plain:.2f} / {f.displacement.robust:.2f}",
+            f"{f.stretch_rms:.5f}",
+            f"{f.stretches.plain:.2f} / {f.stretches.robust:.2f}",
+            f"{self.seconds:.0f}",
+            ", ".join(f.missed),
+        )
+        return dict(zip(_COLUMNS, values, strict=True))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The row as JSON values; figures that do not exist are null."""
+        values: dict[str, Any] = _jsonable(dataclasses.asdict(self))
+        return {**values, "missed": self.missed}
+
+
+_COLUMNS = (
+    "row", "seen cm²", "covered %", "later %", "points", "wrong", "shape mm", "shape/σ", "displ. mm", "displ./σ",
+    "stretch", "stretch/σ", "s", "missed",
+)  # fmt: skip
+
+
+def _jsonable(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _jsonable(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_jsonable(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write_gallery(folder: Path, entries: Sequence[GalleryEntry], about: Mapping[str, Any]) -> dict[str, Any]:
+    """Write ``gallery.json`` and ``gallery.md`` into a folder; returns what the JSON file holds."""
+    reached = sum(not entry.missed for entry in entries)
+    totals = {**about, "rows": len(entries), "reached": reached, "entries": [entry.to_dict() for entry in entries]}
+    (folder / "gallery.json").write_text(json.dumps(totals, indent=1, ensure_ascii=False), encoding="utf-8")
+    lines = [
+        "# Bodies of the virtual rig, measured at the defaults",
+        "",
+        f"Images of scale {about['scale']}; {reached} of {len(entries)} rows reach all aims. {AIMS}",
+        "Over σ: RMS / robust. Later: covered before and after the motion.",
+        "",
+        "| " + " | ".join(_COLUMNS) + " |",
+        "|" + "---|" * len(_COLUMNS),
+        *("| " + " | ".join(entry.cells().values()) + " |" for entry in entries),
+        "",
+        *(f"- {entry.name}: refused: {entry.refusal}" for entry in entries if entry.refusal),
+        *(f"- {entry.name}: {warning}" for entry in entries for warning in entry.warnings),
+        "",
+        *(f"![{entry.name}]({entry.picture})" for entry in entries if entry.picture),
+        "",
+    ]
+    (folder / "gallery.md").write_text("\n".join(lines), encoding="utf-8")
+    return totals
