@@ -111,9 +111,9 @@ def branches(ends: Sequence[tuple[float, ...]], blend: float) -> Solid:
 
 
 def _plate(distance: float) -> Solid:
-    """A plate of 150 x 210 mm, 6 mm thick, whose front is at a distance from the axis and faces the cameras."""
-    plate = rounded_box((6.0, 150.0, 210.0), 1.0, FACING)
-    off = distance - 3.0
+    """A plate of 150 x 210 mm, 1.5 mm thick, whose front is at a distance from the axis and faces the cameras."""
+    plate = rounded_box((1.5, 150.0, 210.0), 0.5, FACING)
+    off = distance - 0.75
     return Solid(plate.shape, plate.box, plate.turn_deg, (off * math.cos(_FRONT), off * math.sin(_FRONT), MIDDLE[2]))
 
 

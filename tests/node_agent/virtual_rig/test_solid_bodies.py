@@ -156,7 +156,7 @@ def test_images_of_a_plate_that_moves_rigidly_correlate_to_the_true_displacement
     after = SolidSpecimen(plate, SolidMotion(turn_deg=(1.0, -0.7, 1.5), shift=(1.3, -0.8, 1.1)))
     images = [render(camera, scene, seed) for seed, scene in enumerate((SolidSpecimen(plate), after))]
     mask = np.zeros(images[0].shape, dtype=bool)
-    corners = np.array([[3.0, y, z] for y, z in ((-60, -90), (60, -90), (60, 90), (-60, 90))])
+    corners = np.array([[0.75, y, z] for y, z in ((-60, -90), (60, -90), (60, 90), (-60, 90))])
     R, t = plate.pose
     outline = camera.project(corners @ R.T + t)
     mask[:] = cv2.fillConvexPoly(mask.astype(np.uint8), np.rint(outline).astype(np.int32), 1) > 0

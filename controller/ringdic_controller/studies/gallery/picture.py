@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ _DOT = 4.0  # points²
 def draw_row(path: Path, title: str, run: JudgedRun, vertices: Points) -> None:
     """Draw the vertices (N, 3) mm from the front, from behind and from above, with the points of the sample missed."""
     picture = Picture(figsize=(12.0, 4.6), layout="constrained")
-    picture.suptitle(title, fontsize=10)
+    picture.suptitle(textwrap.fill(title, 140), fontsize=9)
     views = picture.subplots(1, 4)
     front, side = np.radians(FACING), np.radians(FACING + 90.0)
     views_of = (("front", front), ("back", front + np.pi), ("from the side", side))

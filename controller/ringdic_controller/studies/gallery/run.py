@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 from ringdic.calibration.calibrated_rig import calibrate_rig
 from ringdic.cli.console import say, show_table
 from ringdic.errors import RingdicError
@@ -33,6 +34,8 @@ from ringdic_controller.studies.gallery.tables import AIMS, GalleryEntry, write_
 from ringdic_controller.studies.validate.folders import make_session
 from ringdic_controller.studies.validate.image_cache import ImageCache, RenderedShot
 
+#: What faults of the program raise: they end a row of the gallery, and the others are still measured.
+_FAULTS = (cv2.error, ValueError, IndexError, ArithmeticError)
 Captures = list[tuple[str, dict[str, RenderedShot]]]
 
 
@@ -59,7 +62,7 @@ def run_gallery(folder: Path, *, scale: float, only: Sequence[str] = (), images_
     if images_only:
         return {"folder": str(folder), "scale": scale, "rows": [row.name for row in rows]}
     totals = write_gallery(folder, entries, {"folder": str(folder), "scale": scale})
-    show_table("Bodies of the virtual rig at the defaults (over σ: RMS / robust)", [entry.cells() for entry in entries])
+    show_table("Bodies of the virtual rig at the defaults; mm", [entry.short_cells() for entry in entries])
     for entry in entries:
         if entry.refusal:
             say(f"{entry.name}: {entry.refusal}")
@@ -108,6 +111,9 @@ class _Gallery:
             run = process_session(session, settings, self._renamed(row.name))
         except RingdicError as error:
             return GalleryEntry(row.name, time.monotonic() - began, refusal=str(error))
+        except _FAULTS as error:
+            sentence = f"a fault of the program: {type(error).__name__}: {' '.join(str(error).split())}"
+            return GalleryEntry(row.name, time.monotonic() - began, refusal=sentence)
         seconds = time.monotonic() - began
         self._tell(row.name, "compared with the truth")
         results = read_results(run / "results.h5")

@@ -57,6 +57,26 @@ class GalleryEntry:
         )
         return dict(zip(_COLUMNS, values, strict=True))
 
+    def short_cells(self) -> dict[str, str]:
+        """The row of a narrower table: the figures that are aimed at, shape as RMS, spreads as robust."""
+        f = self.figures
+        if f is None:
+            return {**dict.fromkeys(_SHORT, ""), "row": self.name, "s": f"{self.seconds:.0f}", "missed": "refused"}
+        values = (
+            self.name,
+            f"{100 * f.covered:.1f}",
+            f"{100 * f.covered_later:.1f}",
+            f"{f.wrong}",
+            f"{f.shape_mm:.3f}",
+            f"{f.shape.plain:.2f}",
+            f"{f.displacement_mm:.3f}",
+            f"{f.displacement.robust:.2f}",
+            f"{f.stretches.robust:.2f}",
+            f"{self.seconds:.0f}",
+            ", ".join(f.missed),
+        )
+        return dict(zip(_SHORT, values, strict=True))
+
     def to_dict(self) -> dict[str, Any]:
         """The row as JSON values; figures that do not exist are null."""
         values: dict[str, Any] = _jsonable(dataclasses.asdict(self))
@@ -67,6 +87,8 @@ _COLUMNS = (
     "row", "seen cm²", "covered %", "later %", "points", "wrong", "shape mm", "shape/σ", "displ. mm", "displ./σ",
     "stretch", "stretch/σ", "s", "missed",
 )  # fmt: skip
+
+_SHORT = ("row", "cov. %", "later", "wrong", "shape", "s/σ", "displ.", "d/σ", "λ/σ", "s", "missed")
 
 
 def _jsonable(value: Any) -> Any:
