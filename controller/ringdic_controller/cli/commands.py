@@ -69,7 +69,9 @@ def validate_command(
     quick: Annotated[bool, typer.Option("--quick", help="Fewer board views and steps of the experiments.")] = False,
     only: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME", help="One experiment, or one body, rig or row of the gallery; repeatable."),
+        typer.Option(
+            metavar="NAME", help="One experiment; or bodies, rigs and rows of the gallery, by commas; repeatable."
+        ),
     ] = None,
     images_only: Annotated[bool, typer.Option("--images-only", help="Render the images and stop.")] = False,
     as_json: AsJson = False,
@@ -78,7 +80,8 @@ def validate_command(
     if bodies:
         from ringdic_controller.studies.gallery import run_gallery
 
-        findings = run_gallery(out, scale=0.3 if scale is None else scale, only=only or (), images_only=images_only)
+        names = [name for each in only or () for name in each.split(",")]
+        findings = run_gallery(out, scale=0.3 if scale is None else scale, only=names, images_only=images_only)
     else:
         from ringdic_controller.studies.validate import run_validation
 

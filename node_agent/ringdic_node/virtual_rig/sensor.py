@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from ringdic_node.virtual_rig.arrays import Image, Radiance
@@ -29,13 +31,13 @@ def srgb_coded(linear: Radiance) -> Radiance:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 
-def blurred(image: Radiance) -> Radiance:
+def blurred(image: Radiance, deviation: float = POINT_SPREAD) -> Radiance:
     """Convolve an image with the lens's point spread, a Gaussian; (height, width), linear light without unit.
 
-    Two passes of a sampled Gaussian; the image is mirrored at its rim.
+    Two passes of a sampled Gaussian; the image is mirrored at its rim. deviation : of the Gaussian, px.
     """
-    reach = 3
-    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / POINT_SPREAD) ** 2)
+    reach = math.ceil(5.0 * deviation)
+    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / deviation) ** 2)
     taps = (taps / taps.sum()).astype(np.float32)
     for axis in (0, 1):
         padded = np.pad(image, [(reach, reach) if i == axis else (0, 0) for i in (0, 1)], mode="reflect")

@@ -17,7 +17,7 @@ from ringdic_node.virtual_rig.arrays import Radiance
 from ringdic_node.virtual_rig.lens import VirtualCamera, ideal_of_pixel
 from ringdic_node.virtual_rig.room import BLACK, SKIN, STAMP, WHITE, brightness, room_radiance, to_world
 from ringdic_node.virtual_rig.scenes.solid import SolidSpecimen
-from ringdic_node.virtual_rig.sensor import POINT_SPREAD
+from ringdic_node.virtual_rig.sensor import POINT_SPREAD, blurred
 from ringdic_node.virtual_rig.solid import box_span, clear_distance, first_hit, shape_gradient, undeformed
 from ringdic_node.virtual_rig.texture import solid_speckle
 
@@ -36,7 +36,7 @@ def solid_radiance(camera: VirtualCamera, scene: SolidSpecimen) -> Radiance:
     look = np.array([*scene.solid.band, float(scene.motion.is_rigid)])
     pose = (camera.R, camera.centre, R.T @ camera.R.T, R.T @ (camera.centre - t))
     _solid_kernel(camera.lens, pose, look, scene.deformed_box(), shape, motion, scene.seed, out)
-    return out
+    return blurred(out, scene.defocus) if scene.defocus > 0.0 else out
 
 
 @nb.njit(nogil=True)

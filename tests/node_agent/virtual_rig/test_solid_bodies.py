@@ -173,6 +173,15 @@ def test_images_of_a_plate_that_moves_rigidly_correlate_to_the_true_displacement
     assert 0.8 < math.sqrt(np.mean((error / sigma) ** 2)) < 1.4
 
 
+def test_an_image_out_of_focus_is_the_sharp_one_blurred() -> None:
+    camera = arc_rig(2, 30.0, 0.1).cameras[0]
+    sharp = radiance(camera, SolidSpecimen(BODIES["limb"]()))
+    soft = radiance(camera, SolidSpecimen(BODIES["limb"](), defocus=1.4))
+    np.testing.assert_allclose(
+        soft, cv2.GaussianBlur(sharp, (15, 15), 1.4, borderType=cv2.BORDER_REFLECT_101), atol=1e-5
+    )
+
+
 def test_a_body_hides_another() -> None:
     camera = paper_rig(12, 0.2).cameras[4]  # at 120°, nearly on the line of both rods
     specimen = SolidSpecimen(BODIES["two-rods"]())

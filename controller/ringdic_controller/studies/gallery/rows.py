@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ringdic.errors import InputError
 from ringdic_node.virtual_rig.bodies import solid_bodies
@@ -15,6 +15,7 @@ from ringdic_controller.studies.validate.image_cache import RenderedShot
 
 BOARDS = 8  # views of the checkerboard a camera
 _SPECKLE_SEED = 12
+_DEFOCUS = 1.375  # px; with the lens's 0.6 px, images are blurred by 1.5 px
 
 #: A deformation with strains of 3 to 5 % and a small rigid motion.
 MODERATE = SolidMotion(
@@ -27,12 +28,16 @@ RIGID = SolidMotion(turn_deg=(1.2, -1.5, 3.0), shift=(1.5, -0.8, 1.2))
 
 @dataclass(frozen=True)
 class GalleryRow:
-    """A body in a rig and its motion from the first image to the second. rig : "ring12", "ring6", "arc4", …"""
+    """A body in a rig and its motion from the first image to the second.
+
+    rig : "ring12", "ring6", "arc4", … variant : added to the row's name. defocus : blur of the images, px.
+    """
 
     body: str
     rig: str
     motion: SolidMotion
     variant: str = ""
+    defocus: float = 0.0
 
     @property
     def name(self) -> str:
@@ -43,7 +48,8 @@ class GalleryRow:
     def specimens(self) -> tuple[SolidSpecimen, SolidSpecimen]:
         """The body before and after its motion."""
         body = solid_bodies()[self.body]()
-        return SolidSpecimen(body, SolidMotion(), _SPECKLE_SEED), SolidSpecimen(body, self.motion, _SPECKLE_SEED)
+        before = SolidSpecimen(body, SolidMotion(), _SPECKLE_SEED, self.defocus)
+        return before, replace(before, motion=self.motion)
 
 
 def gallery_rig(name: str, scale: float) -> VirtualRig:
@@ -75,6 +81,7 @@ def _all_rows() -> list[GalleryRow]:
     ]
     for turn in (10, 20, 40):
         rows.append(GalleryRow("limb", "arc4", SolidMotion(turn_deg=(0.0, 0.0, float(turn))), f"turned-{turn}"))
+    rows.append(GalleryRow("limb", "arc4", MODERATE, "blurred", _DEFOCUS))
     return rows
 
 

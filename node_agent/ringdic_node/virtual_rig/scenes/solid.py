@@ -138,11 +138,16 @@ class SolidMotion:
 
 @dataclass(frozen=True)
 class SolidSpecimen:
-    """A solid body after a motion: the scene that cameras see, and the truth of its material points."""
+    """A solid body after a motion: the scene that cameras see, and the truth of its material points.
+
+    seed : of the speckles. defocus : standard deviation of the Gaussian by which its images are blurred in addition to
+    the lens's point spread, px.
+    """
 
     solid: Solid
     motion: SolidMotion = SolidMotion()
     seed: int = 0
+    defocus: float = 0.0
 
     def moved(self, xyz: Floats) -> Floats:
         """Positions (n, 3) mm after the motion of material points xyz (n, 3) mm."""
