@@ -58,7 +58,7 @@ def controller_command(
 def validate_command(
     scale: Annotated[
         float | None,
-        typer.Option(min=0.1, max=1.0, help="Size of the images; 1 is 2464 x 3280 px. [default: 1, bodies 0.3]"),
+        typer.Option(min=0.1, max=1.0, help="Size of the images, 1 is 2464 x 3280 px; by default 1, for bodies 0.3."),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for images, sessions and tables; kept for the next run.")] = Path(
         "ringdic-validate"
