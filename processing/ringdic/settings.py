@@ -132,7 +132,7 @@ class SurfaceGroup(_Group):
         none.
     """
 
-    method: Literal["pairs", "global"] = "pairs"
+    method: Literal["pairs", "global", "charts"] = "pairs"
     merge: Literal["none", "correlation", "distance", "orientation", "combined"] = "combined"
     radius_mm: float = Field(default=0.0, ge=0)
     reach_mm: float = Field(default=20.0, gt=0)
@@ -175,7 +175,7 @@ class Settings(_Group):
 
     @model_validator(mode="after")
     def _poses_need_many_views(self) -> Settings:
-        if self.calibration.refine_poses and self.surface.method != "global":
+        if self.calibration.refine_poses and self.surface.method == "pairs":
             raise ValueError(
                 "calibration.refine_poses needs surface.method=global: two cameras alone do not tell a camera's motion "
                 "from the surface's"

@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 
 import numba
@@ -72,6 +72,11 @@ class PointMatches:
     def good(self) -> Mask:
         """Whether a point is matched. (n,) bool."""
         return self.status == Status.GOOD
+
+    def part(self, index: Indices | Mask) -> PointMatches:
+        """Matches of some of the points. index : (k,) int, or (n,) bool."""
+        arrays = {each.name: getattr(self, each.name)[index] for each in fields(self) if each.name != "seconds"}
+        return PointMatches(**arrays, seconds=dict(self.seconds))
 
 
 def correlate_points(

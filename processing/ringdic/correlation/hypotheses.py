@@ -108,18 +108,20 @@ def search_hypotheses(
     hypotheses: WarpHypotheses,
     radius: int,
     *,
+    stride: int = 2,
     zncc_min: float = -1.0,
     separation: float = 4.0,
 ) -> BestWarps:
-    """Best of the interpolated warp hypotheses at each point, by ZNCC over every second pixel of a circular subset.
+    """Best of the interpolated warp hypotheses at each point, by ZNCC over the pixels of a circular subset.
 
     image : (h, w) grey levels of the reference; all its pixels count. xy : (n, 2) float64, px, points of it.
     hypotheses : the warps of these points into the current image. radius : px, of the subset.
+    stride : px, spacing of the pixels that are compared.
     zncc_min : points for which a first trial on fewer pixels shows that no warp reaches this ZNCC keep the ZNCC of that
         trial, which saves time. separation : px, by which another warp's displacement must differ to count for the
         second peak.
     """
-    return _search(image, _ANY_PIXEL, (0, 0), current, xy, hypotheses, radius, 2, separation, zncc_min)
+    return _search(image, _ANY_PIXEL, (0, 0), current, xy, hypotheses, radius, stride, separation, zncc_min)
 
 
 def _search(

@@ -108,6 +108,19 @@ class Camera:
         object.__setattr__(self, "P", P)
         object.__setattr__(self, "centre", -np.linalg.solve(P[:, :3], P[:, 3]))
 
+    def reduced(self, factor: int) -> Camera:
+        """The camera of images that are reduced by averaging over squares of ``factor`` pixels.
+
+        A pixel (u, v) of the full image lies at ``((u + ½) / factor - ½, (v + ½) / factor - ½)`` in the reduced one.
+        """
+        S = np.diag([1.0 / factor, 1.0 / factor, 1.0])
+        S[:2, 2] = 0.5 / factor - 0.5
+        size = (self.size[0] // factor, self.size[1] // factor)
+        lens_of_image = None
+        if self.intrinsics is not None:
+            lens_of_image = Intrinsics(S @ self.intrinsics.K, self.intrinsics.distortion, size)
+        return Camera(self.id, S @ self.P, size, lens_of_image)
+
     @property
     def azimuth_deg(self) -> float:
         """Azimuth of the projection centre about the world's +z axis, counted from +x, -180 to 180 degrees."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from ringdic.calibration.calibrated_rig import CalibratedRig, calibrate_rig
 from ringdic.errors import InputError
 from ringdic.jobs.pipeline import match_session
-from ringdic.pairs.merging import MergedSurface, merge
+from ringdic.merging import MergedSurface, merge
 from ringdic.pairs.surfaces import PairSurface
 from ringdic.progress import Report, Stages, silent
 from ringdic.results.writer import write_series

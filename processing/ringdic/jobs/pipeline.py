@@ -129,6 +129,8 @@ def match_session(
         surface = _global_surface(matching)
         series, drift, agreement = InMemorySeries(surface.results), surface.drift, surface.agreement
         more_warnings = surface.warnings
+    elif settings.surface.method == "charts":
+        series, drift, agreement, more_warnings = _charts_surface(matching)
     else:
         pairs, more_warnings = _pair_surfaces(matching)
         series, agreement = pairs_surface(session.rig.name, matching.cameras, pairs, matching.names, settings, merging)
@@ -313,3 +315,30 @@ def _global_surface(matching: _Matching) -> MultiviewSurface:
     shape, tracks = job.outputs()
     matching.stages.at("triangulate", 0.0)
     return surface_of_tracks(session.rig.name, cameras, pairs, matching.names, shape, tracks, settings)
+
+
+def _charts_surface(matching: _Matching) -> tuple[Series, dict[str, Floats], dict[str, Any], list[str]]:
+    """Match all cameras that have a reference image together, as tasks, and triangulate one surface."""
+    from ringdic.charts.series import SurfaceSeries
+    from ringdic.charts.surface import ReferenceSurface
+    from ringdic.charts.tasks import charts_job
+    from ringdic.tasks import read_output
+
+    session, settings, steps = matching.session, matching.settings, matching.steps
+    cameras = [camera for camera in matching.cameras if camera.id in steps[0].images]
+    job = charts_job(session, cameras, steps, settings)
+    matching.run(job.tasks)
+    matching.stages.at("triangulate", 0.0)
+    surface = ReferenceSurface.from_arrays(read_output(job.surface.output))
+    cache = StepCache(work_folder(session.path))
+    series = SurfaceSeries(
+        session.rig.name, cameras, matching.pairs, matching.names, surface, job.matches, settings, cache
+    )
+    import numpy as np
+
+    views = float(np.isfinite(surface.px[..., 0]).sum(axis=0).mean())
+    residual = series.residual.copy()
+    residual[surface.own, np.arange(len(surface.xyz))] = np.nan
+    agreement = {"views": views, "residual_px": float(np.sqrt(np.nanmean(residual**2)))}
+    drift = {camera.id: series.drift[:, k] for k, camera in enumerate(cameras) if np.isfinite(series.drift[0, k])}
+    return series, drift, agreement, series.poses.sentences(matching.names)

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels, Points
+from ringdic.charts.agreement import triangulate_agreeing
+from ringdic.charts.weights import CELL_STEPS, smooth_sigma
 from ringdic.correlation import Status
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.outliers import LostPoint, grid_neighbours, surface_outliers
-from ringdic.multiview.agreement import triangulate_agreeing
 from ringdic.multiview.shape import ReferenceShape
 from ringdic.multiview.tracking import CameraTrack
-from ringdic.multiview.weights import CELL_STEPS, smooth_sigma
 from ringdic.uncertainty.matches import match_uncertainty
 from ringdic.uncertainty.noise import camera_noise
 from ringdic.uncertainty.texture import Texture

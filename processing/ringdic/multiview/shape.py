@@ -19,17 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Image, Indices, Mask, Pixels, Points
+from ringdic.charts.agreement import triangulate_agreeing
+from ringdic.charts.weights import CELL_STEPS, smooth_sigma
 from ringdic.correlation import CorrelationSettings, Status
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.outliers import LostPoint
-from ringdic.multiview.agreement import triangulate_agreeing
 from ringdic.multiview.depth import lay_lattice, px_per_mm, rough_surface
 from ringdic.multiview.lattice import Pieces, SurfaceLattice, evaluate, robust_pieces
 from ringdic.multiview.matching import NodeMatches, ReferenceImages, match_nodes
 from ringdic.multiview.tube import lattice_faces
 from ringdic.multiview.views import visibility
-from ringdic.multiview.weights import CELL_STEPS, smooth_sigma
 from ringdic.sweep.sweep import DepthSearch, search_radii, sweep_depths
 from ringdic.uncertainty.texture import Texture, TextureMap
 

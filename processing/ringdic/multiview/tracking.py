@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ringdic.arrays import Floats, Image, Indices, Mask, Pixels
+from ringdic.charts.step_matching import ImageMatches, match_tracked_points
+from ringdic.charts.tracked_points import TrackedPoints, tracked_points
 from ringdic.correlation import (
     CorrelationSettings,
     Current,
@@ -27,8 +29,6 @@ from ringdic.correlation import (
     search_warps,
 )
 from ringdic.errors import InputError
-from ringdic.multiview.step_matching import ImageMatches, match_tracked_points
-from ringdic.multiview.tracked_points import TrackedPoints, tracked_points
 
 log = logging.getLogger(__name__)
 

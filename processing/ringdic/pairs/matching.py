@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Image, Mask, Pixels
+from ringdic.charts.tracking import CameraPixels
 from ringdic.correlation import CorrelationSettings, Current, Status, grid, prepare_current, prepare_reference
 from ringdic.correlation.start_field import lattice_spacing, match_from_lattice
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
-from ringdic.pairs.tracking import CameraPixels
 from ringdic.sweep.region import lattice_region, within_incidence
 from ringdic.sweep.sweep import SWEEP_SPACING, DepthSearch, search_radii, sweep_depths
 

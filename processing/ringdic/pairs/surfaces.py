@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices
 from ringdic.geometry.camera import Camera
-from ringdic.pairs.merging import MergedSurface, Mismatch, Seam, SurfacePart, merge, mismatches
+from ringdic.merging import MergedSurface, Mismatch, Seam, SurfacePart, merge, mismatches
 from ringdic.pairs.reconstruction import PairMatches, PairShape, PairStep
 from ringdic.results.results import Matches, Results
 from ringdic.results.series import StepCache, median_deviations

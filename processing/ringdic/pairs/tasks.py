@@ -13,20 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from ringdic.arrays import Pixels
+from ringdic.charts.tracking import CameraGrid, CameraMatches, CameraPixels, interpolate_matches
 from ringdic.correlation import CorrelationSettings, Reference, prepare_reference, reference_bytes
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.pairs.matching import PairGrid, StepMatches, Stereo, match_reference, step_matches
-from ringdic.pairs.tracking import (
-    CameraGrid,
-    CameraMatches,
-    CameraPixels,
-    FirstCameraView,
-    SecondCameraView,
-    camera_grid,
-    interpolate_matches,
-    match_camera,
-)
+from ringdic.pairs.tracking import FirstCameraView, SecondCameraView, camera_grid, match_camera
 from ringdic.session.folder import Capture, Session
 from ringdic.session.images import read_mask
 from ringdic.sweep.sweep import DepthSearch

@@ -9,79 +9,34 @@ is the same at every step.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Image, Mask, Pixels
+from ringdic.arrays import Image, Mask, Pixels
+from ringdic.charts.tracking import CameraGrid, CameraMatches
 from ringdic.correlation import (
     CorrelationSettings,
     Current,
     PointMatches,
     Reference,
-    Status,
     correlate_points,
     prepare_current,
     search_warps,
 )
-from ringdic.correlation.lattice_field import interpolate_lattice
 from ringdic.correlation.seeds import flow_start_values
 from ringdic.correlation.start_field import lattice_spacing, match_from_lattice, on_lattice
 
 _START_ZNCC = 0.6  # least ZNCC under the warp by optical flow that makes it a start value
 _ENOUGH = 0.8  # share of the points that must be matched, or start values are sought in other ways
 _SOME = 0.2  # share of the sparse lattice with start values from which the rest can be reached
-_LEAST = 0.02  # least weight of the matched corners about a point for an interpolated value
 _DIGITS = 4  # binary digits after the point of the corners of drawn triangles
 
 #: View of a pair's first camera: region of interest (height, width) and matched points of the grid (n, 2) px.
 FirstCameraView = tuple[Mask, Pixels]
 #: View of a pair's second camera: pixels of the points (n, 2), NaN where not matched, and triangles (m, 3) over them.
 SecondCameraView = tuple[Pixels, NDArray[np.int32]]
-
-
-@dataclass(frozen=True)
-class CameraGrid:
-    """Region of interest and grid of one camera in its reference image, covering the regions of all its pairs.
-
-    region : (height, width) bool. xy : (n, 2) float64, px, points of the grid. step : px, of which they are multiples.
-    """
-
-    region: Mask
-    xy: Pixels
-    step: int
-
-
-@dataclass(frozen=True)
-class CameraMatches:
-    """Matches of the n points of a camera's grid in its image of one step, NaN where lost.
-
-    xy : (n, 2) int, px, the grid. step : px, of the grid. uv : (n, 2) px, displacement. gradient : (n, 2, 2),
-    du_i/dx_j. sigma : (n, 2) px. c_ls : (n,). status : (n,) int, 0 where good.
-    """
-
-    xy: NDArray[np.int32]
-    step: int
-    uv: Pixels
-    gradient: NDArray[np.float32]
-    sigma: NDArray[np.float32]
-    c_ls: NDArray[np.float32]
-    status: NDArray[np.int8]
-
-
-@dataclass(frozen=True)
-class CameraPixels:
-    """Pixels of some points of a camera's reference image in its image of one step, NaN where unknown.
-
-    px : (n, 2) px. sigma : (n, 2) px. c_ls : (n,). status : (n,) int, 0 where good.
-    """
-
-    px: Pixels
-    sigma: Pixels
-    c_ls: Floats
-    status: NDArray[np.int8]
 
 
 def camera_grid(
@@ -129,22 +84,6 @@ def match_camera(reference: Reference, image: Image, grid: CameraGrid, settings:
     )
 
 
-def interpolate_matches(matches: CameraMatches, xy: Pixels) -> CameraPixels:
-    """Interpolate a camera's matches at points of its reference image, to get their pixels in the image of a step.
-
-    xy : (n, 2) float64, px, in the reference image.
-    """
-    values = np.column_stack([matches.uv, matches.gradient.reshape(-1, 4), matches.sigma, matches.c_ls]).astype(
-        np.float64
-    )
-    interpolated, weight = interpolate_lattice(matches.xy, values, matches.step, xy)
-    lost = ~(weight >= _LEAST)
-    interpolated[lost] = np.nan
-    status = np.zeros(len(xy), np.int8)
-    status[lost] = _status_nearby(matches, xy[lost])
-    return CameraPixels(xy + interpolated[:, :2], interpolated[:, 6:8], interpolated[:, 8], status)
-
-
 def track_points(reference: Reference, current: Current, xy: Pixels, settings: CorrelationSettings) -> PointMatches:
     """Match points of a camera's reference image in a later image, with start values from optical flow.
 
@@ -164,16 +103,3 @@ def track_points(reference: Reference, current: Current, xy: Pixels, settings: C
         return matches
     searched = correlate_points(reference, current, xy, settings)
     return searched if searched.good.sum() > matches.good.sum() else matches
-
-
-def _status_nearby(matches: CameraMatches, xy: Pixels) -> NDArray[np.int8]:
-    """Reasons (k,) why points have no pixel in the image: the status of the grid's point nearest to each.
-
-    xy : (k, 2) px, in the reference image.
-    """
-    cells = matches.xy // matches.step
-    status = np.full((matches.xy.max(axis=0, initial=0) // matches.step + 2), Status.NOT_REACHED, np.int8)
-    status[tuple(cells.T)] = np.where(matches.status == Status.GOOD, Status.NOT_REACHED, matches.status)
-    nearest = np.rint(np.nan_to_num(xy, nan=-1.0) / matches.step).astype(np.int64)
-    within: Mask = ((nearest >= 0) & (nearest < status.shape)).all(axis=1)
-    return np.where(within, status[tuple(np.where(within[:, None], nearest, 0).T)], np.int8(Status.NOT_REACHED))

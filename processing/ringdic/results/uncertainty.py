@@ -22,6 +22,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ringdic.arrays import Floats, Indices, Pixels, Points
 from ringdic.calibration.bundle import BundleFit
@@ -30,7 +31,7 @@ from ringdic.geometry.camera import Camera
 from ringdic.results.results import Matches, Results
 from ringdic.results.series import InMemorySeries, join_steps
 from ringdic.settings import settings_of_run
-from ringdic.strain.deformation import Deformation
+from ringdic.strain.deformation import Deformation, deformation
 from ringdic.uncertainty.calibration import (
     CameraCovariance,
     Sensitivity,
@@ -45,6 +46,8 @@ from ringdic.uncertainty.strain import corner_correlations, stretch_sigma
 # The variance that a correlation states, in units of the variance due to noise of one image: it contains the noise of
 # the reference image and that of the interpolated current one.
 _BOTH_IMAGES = 1.0 + INTERPOLATED_NOISE
+# Triangles, about, at which the part of the calibration is computed.
+_SAMPLE = 3000
 # Shift between the pixel coordinates of different reference images, px: their subsets share no pixels.
 _APART = 1e6
 
@@ -101,37 +104,62 @@ class StepUncertainty:
 class _CalibrationUncertainty:
     """Standard deviations due to the covariance of the cameras.
 
+    They vary smoothly over the surface. On a large one they are computed at a sample of the triangles and their
+    corners, and every other triangle and point has those of the nearest one.
+
     tracked : whether each camera tracked the points from the projection of their reference position.
     """
 
     def __init__(self, reference: Results, known: CameraCovariance, tracked: bool) -> None:
         self._known, self._tracked = known, tracked
+        every = max(1, len(reference.faces) // _SAMPLE)
+        self._vertex, corners = np.unique(reference.faces[::every], return_inverse=True)
+        self._faces = corners.reshape(-1, 3)
+        self._middles = reference.mesh.centroids[::every]
         self._at_reference: Sensitivity = position_sensitivity(
-            reference.cameras, reference.vertices_ref, _gain(reference, 0), known
+            reference.cameras, reference.vertices_ref[self._vertex], _gain(reference, 0, self._vertex), known
         )
-        self._position = sensitivity_sigma(self._at_reference)
+        at = reference.vertices_ref[self._vertex]
+        self._position = _from_nearest(at, sensitivity_sigma(self._at_reference), reference.vertices_ref)
 
     def arrays(self, results: Results, deformed: Deformation) -> dict[str, Floats]:
         """The standard deviations at the reference and at the step, by the names of the arrays of `Results`."""
         N, M = len(results.vertices_ref), len(results.faces)
         rows = [(self._position, np.zeros((N, 3)), np.zeros((M, 2)))]
         if len(results.steps) > 1:
-            reference = (results.vertices_ref, self._at_reference)
+            reference, current = results.vertices_ref[self._vertex], results.vertices[1, self._vertex]
             at_step = position_sensitivity(
-                results.cameras, results.vertices[1], _gain(results, 1), self._known,
-                reference if self._tracked else None,
+                results.cameras, current, _gain(results, 1, self._vertex), self._known,
+                (reference, self._at_reference) if self._tracked else None,
             )  # fmt: skip
-            displacement = sensitivity_sigma(at_step - self._at_reference)
-            stretches = stretch_sigma_by_cameras(
-                deformed, results.vertices_ref, results.faces, self._at_reference, at_step
-            )
-            rows.append((sensitivity_sigma(at_step), displacement, stretches))
+            sample = deformation(reference, current, self._faces)
+            stretches = stretch_sigma_by_cameras(sample, reference, self._faces, self._at_reference, at_step)
+            both = np.concatenate([sensitivity_sigma(at_step), sensitivity_sigma(at_step - self._at_reference)], axis=1)
+            of_points = _from_nearest(reference, both, results.vertices_ref)
+            of_triangles = _from_nearest(self._middles, stretches, results.mesh.centroids)
+            of_points[~np.isfinite(results.vertices[1]).all(axis=1)] = np.nan
+            of_triangles[~np.isfinite(deformed.J)] = np.nan
+            rows.append((of_points[:, :3], of_points[:, 3:], of_triangles))
         names = ("sigma_calibration", "sigma_displacement_calibration", "sigma_lambda_calibration")
         return {name: np.stack(values) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
 
 
-def _gain(results: Results, step: int) -> Floats:
-    """Gain from the pixels of each camera to the positions at a step, (C, N, 3, 2) mm a px."""
+def _from_nearest(at: Points, values: Floats, xyz: Points) -> Floats:
+    """Values (n, k) at positions xyz (n, 3) mm: those of the nearest of the positions ``at`` (m, 3) mm that has some.
+
+    values : (m, k), NaN where there are none.
+    """
+    known = np.flatnonzero(np.isfinite(values).all(axis=1))
+    if not len(known):
+        return np.full((len(xyz), values.shape[1]), np.nan)
+    return np.asarray(values[known[cKDTree(at[known]).query(xyz)[1]]])
+
+
+def _gain(results: Results, step: int, vertex: Indices) -> Floats:
+    """Gain from the pixels of each camera to the positions of some vertices at a step, (C, k, 3, 2) mm a px.
+
+    vertex : (k,) indices.
+    """
     index = {camera.id: k for k, camera in enumerate(results.cameras)}
     sigma = np.full((len(results.cameras), len(results.vertices_ref), 2), np.nan)
     for matches in results.matches:
@@ -140,7 +168,7 @@ def _gain(results: Results, step: int) -> Floats:
             # The points of a pair are triangulated with equal weights.
             weight = 1.0 if len(matches.cameras) == 2 else matches.sigma[step, view, used]
             sigma[index[id_], matches.vertex[used]] = weight
-    return position_gain(results.cameras, results.vertices[step], sigma)
+    return position_gain(results.cameras, results.vertices[step, vertex], sigma[:, vertex])
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +45,7 @@ class CameraCovariance:
         if self.parameters.shape != (size, size):
             raise ValueError("a covariance of cameras has sixteen parameters a camera")
 
-    @property
+    @cached_property
     def root(self) -> Floats:
         """Root R (16 K, S) of the covariance, R Rᵀ, in the units of the parameters (px, rad, mm); S = 16 K.
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from ringdic.charts.agreement import triangulate_agreeing
 from ringdic.correlation import CorrelationSettings
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.mesh.mesh import Mesh
 from ringdic.mesh.topology import holes, inconsistent_edges, is_closed_tube, non_manifold_vertices
-from ringdic.multiview.agreement import triangulate_agreeing
 from ringdic.multiview.lattice import Pieces, SurfaceLattice, fit_pieces
 from ringdic.multiview.motion import Motion
 from ringdic.multiview.shape import reference_shape

@@ -10,12 +10,12 @@ from types import MappingProxyType
 import numpy as np
 
 from ringdic.arrays import Floats, Indices, Mask, Points
+from ringdic.merging.fill import fill
+from ringdic.merging.mismatch import Mismatch, mismatches
+from ringdic.merging.overlap import MEASURES, badness, close_pairs, cover, peel, regrow
+from ringdic.merging.stitch import stitch
 from ringdic.mesh.mesh import Mesh
 from ringdic.mesh.topology import face_neighbours, pieces, without_pinches
-from ringdic.pairs.merging.fill import fill
-from ringdic.pairs.merging.mismatch import Mismatch, mismatches
-from ringdic.pairs.merging.overlap import MEASURES, badness, close_pairs, cover, peel, regrow
-from ringdic.pairs.merging.stitch import stitch
 
 #: Weights of the measures of each heuristic.
 HEURISTICS: Mapping[str, Mapping[str, float]] = MappingProxyType(

@@ -1,7 +1,7 @@
 """Standard deviations levelled over an image."""
 
 import numpy as np
-from ringdic.multiview.weights import smooth_sigma
+from ringdic.charts.weights import smooth_sigma
 
 
 def test_what_scatters_from_point_to_point_is_levelled_and_what_is_smooth_is_kept() -> None:

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from ringdic.merging import Mismatch, mismatches
 from ringdic.mesh.mesh import Mesh
-from ringdic.pairs.merging import Mismatch, mismatches
 
 
 def bowl(shift: float, outwards: float = 0.0, noise: float = 0.0, size: float = 40.0, seed: int = 0) -> Mesh:

@@ -3,7 +3,7 @@
 Every border vertex is considered in its own tangent plane: the Delaunay triangles of its neighbourhood that touch it
 are its star. A triangle is accepted when it is in the stars of all three of its corners, overlaps none of the existing
 triangles, crosses none of their borders and has no edge longer than the bridge. Where the stars do not agree (four
-points on a circle, a border that is not Delaunay) the gap is left to :mod:`ringdic.pairs.merging.fill`.
+points on a circle, a border that is not Delaunay) the gap is left to :mod:`ringdic.merging.fill`.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from collections import Counter
 import numpy as np
 
 from ringdic.arrays import Floats, Indices
+from ringdic.merging.stars import stars
 from ringdic.mesh.mesh import Mesh
 from ringdic.mesh.nearest import cubes
-from ringdic.pairs.merging.stars import stars
 
 _SAME_SIDE = 0.2  # least cosine between the normals of vertices of one side of the body
 THINNEST = 0.1  # least height of a new triangle over its longest edge: a thinner one has no usable normal or strain

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels
+from ringdic.charts.tracked_points import TrackedPoints, robust_quadratics
 from ringdic.correlation import (
     CorrelationSettings,
     Current,
@@ -31,7 +32,6 @@ from ringdic.correlation import (
 )
 from ringdic.correlation.quadratic import QuadraticFit
 from ringdic.correlation.seeds import flow_start_values
-from ringdic.multiview.tracked_points import TrackedPoints, robust_quadratics
 
 _LOOSE = 5e-3  # px, tolerance of the first of two passes
 _PATIENCE = 10  # iterations of the first of two passes

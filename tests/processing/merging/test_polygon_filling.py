@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from ringdic.merging.fill import fill, simple_loops
 from ringdic.mesh.mesh import Mesh
-from ringdic.pairs.merging.fill import fill, simple_loops
 
 UP = np.array([0.0, 0.0, 1.0])
 

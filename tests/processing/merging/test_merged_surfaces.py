@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from ringdic.merging import HEURISTICS, MergedSurface, Seam, SurfacePart, merge
 from ringdic.mesh.mesh import Mesh
 from ringdic.mesh.topology import (
     Kind,
@@ -15,7 +16,6 @@ from ringdic.mesh.topology import (
     overlap_area,
     pieces,
 )
-from ringdic.pairs.merging import HEURISTICS, MergedSurface, Seam, SurfacePart, merge
 
 RADIUS = 40.0
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from ringdic.pairs.merging.stars import delaunay_ring
+from ringdic.merging.stars import delaunay_ring
 from scipy.spatial import Delaunay
 
 

@@ -16,10 +16,10 @@ import numpy as np
 import scipy
 
 from ringdic.arrays import Floats, Indices, Mask
+from ringdic.merging import kernels
 from ringdic.mesh.mesh import Mesh
 from ringdic.mesh.nearest import away_from_other_labels, cubes
 from ringdic.mesh.projection import Projector, triangle_spheres
-from ringdic.pairs.merging import kernels
 
 #: Measures of how bad a triangle is, each relative to its median over the overlaps.
 MEASURES = ("correlation", "distance", "orientation", "margin")

@@ -1,0 +1,349 @@
+"""The surface at every step: each camera's pixels triangulated from all views, one step at a time.
+
+Points are tracked in each camera against its own reference image, from where the camera shows the reference position,
+so an error of that position cancels in the displacement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.arrays import Floats, Indices, Mask, Pixels, Points
+from ringdic.calibration.refined_cameras import RefinedCameras
+from ringdic.charts.agreement import triangulate_agreeing
+from ringdic.charts.chart import texture_of
+from ringdic.charts.surface import ReferenceSurface
+from ringdic.charts.tracking import CameraMatches, interpolate_matches
+from ringdic.charts.weights import CELL_STEPS, smooth_sigma
+from ringdic.correlation import Status
+from ringdic.geometry.camera import Camera
+from ringdic.geometry.outliers import LostPoint, surface_outliers
+from ringdic.geometry.triangulation import reprojection_residuals
+from ringdic.mesh.mesh import Mesh
+from ringdic.results.results import Matches, Results
+from ringdic.results.series import StepCache, median_deviations
+from ringdic.settings import Settings
+from ringdic.strain.deformation import deformation
+from ringdic.uncertainty.matches import match_uncertainty
+from ringdic.uncertainty.noise import camera_noise
+from ringdic.uncertainty.position import (
+    along_surface,
+    covariance,
+    position_gain,
+    reference_covariance,
+    step_covariance,
+)
+from ringdic.uncertainty.strain import corner_correlations, stretch_sigma
+
+_LEAST_SIGMA = 1e-3  # px, lower limit of a match's standard deviation
+
+#: Function of a camera's index and a step from 1 on; returns the matches of its grid, None where it has no image.
+MatchesOfStep = Callable[[int, int], CameraMatches | None]
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """The k points of the surface that one camera sees.
+
+    vertex : (k,) indices of the points. px : (k, 2) px, where the camera shows their reference positions, from which
+    they are tracked.
+    """
+
+    vertex: Indices
+    px: Pixels
+
+
+def camera_views(cameras: Sequence[Camera], surface: ReferenceSurface) -> list[CameraView]:
+    """The points of a surface that each camera sees."""
+    views = []
+    for camera, px in zip(cameras, surface.px, strict=True):
+        vertex = np.flatnonzero(np.isfinite(px[:, 0]))
+        views.append(CameraView(vertex, camera.project(surface.xyz[vertex])))
+    return views
+
+
+@dataclass(frozen=True)
+class SurfaceStep:
+    """The surface at one step: N points, C cameras.
+
+    xyz : (N, 3) mm, NaN where lost. px : (C, N, 2) px, NaN where a camera has no match. sigma : (C, N, 2) px, as the
+    correlation states it. weight : (C, N, 2) px, standard deviations by which the views were weighted, NaN for a view
+    that was not used. c_ls : (C, N). status : (N,), 0 measured. camera_status : (C, N), of the matches. chi2, degrees :
+    (N,). residual : (C,) px, mean vertical residual of each camera.
+    """
+
+    xyz: Points
+    px: Pixels
+    sigma: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    c_ls: NDArray[np.float32]
+    status: NDArray[np.int8]
+    camera_status: NDArray[np.int8]
+    chi2: Floats
+    degrees: Indices
+    residual: Floats
+
+
+class SurfaceSeries:
+    """Series of results of a surface that all cameras measure together.
+
+    Parameters
+    ----------
+    rig : its name.
+    cameras : the C cameras.
+    pairs : ids of neighbouring cameras.
+    names : (F,) of the steps, the reference first.
+    surface : at the reference.
+    matches : function that returns the matches of a camera at a step.
+    settings : of the run.
+    cache : for the points in space of every step.
+    """
+
+    def __init__(
+        self, rig: str, cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]], names: Sequence[str],
+        surface: ReferenceSurface, matches: MatchesOfStep, settings: Settings, cache: StepCache,
+    ) -> None:  # fmt: skip
+        self.names, self.surface, self._cameras = tuple(names), surface, tuple(cameras)
+        self._settings, self._cache = settings, cache
+        self._views = camera_views(cameras, surface)
+        self._textures = [texture_of(surface.texture[k, view.vertex]) for k, view in enumerate(self._views)]
+        self.poses = RefinedCameras(cameras)
+        refine = self.poses if settings.calibration.refine_poses else None
+        self.drift = np.full((len(self.names), len(cameras)), np.nan)
+        residual = reprojection_residuals(cameras, surface.xyz, surface.px)
+        self.residual = residual
+        with np.errstate(invalid="ignore"):
+            self.drift[0] = [np.nanmean(one[:, 1]) if np.isfinite(one).any() else np.nan for one in residual]
+        c_ls: list[list[Floats]] = [[] for _ in cameras]
+        for k in range(1, len(self.names)):
+            step = self._measure(k, matches, refine)
+            cache.put(k, step)
+            self.drift[k] = self.drift[0] + step.residual
+            for c, view in enumerate(self._views):
+                c_ls[c].append(_sample(step.c_ls[c, view.vertex]))
+        self._grey_noise = [
+            camera_noise(float(surface.grey_noise[c]), np.array(rows), _sample(self._textures[c].contrast))
+            if rows and len(self._views[c].vertex)
+            else float(surface.grey_noise[c])
+            for c, rows in enumerate(c_ls)
+        ]
+        self.reference = self._reference(rig, pairs)
+        self._prepare_uncertainty()
+
+    def _measure(self, k: int, matches: MatchesOfStep, refine: RefinedCameras | None) -> SurfaceStep:
+        """Triangulate the points of step k from all cameras."""
+        n, count = len(self.surface.xyz), len(self._cameras)
+        px, sigma, weight = (np.full((count, n, 2), np.nan) for _ in range(3))
+        c_ls = np.full((count, n), np.nan)
+        status = np.full((count, n), Status.NOT_REACHED, np.int8)
+        cell, sigma_max = CELL_STEPS * self._settings.correlation.step_px, self._settings.surface.sigma_max_px
+        for c, view in enumerate(self._views):
+            one = matches(c, k) if len(view.vertex) else None
+            if one is None:
+                continue
+            pixels = interpolate_matches(one, view.px)
+            with np.errstate(invalid="ignore"):
+                uncertain = (pixels.status == 0) & (pixels.sigma > sigma_max).any(axis=1)
+            own = np.where(uncertain, LostPoint.UNCERTAIN, pixels.status).astype(np.int8)
+            good = own == 0
+            status[c, view.vertex] = own
+            px[c, view.vertex[good]] = pixels.px[good]
+            sigma[c, view.vertex[good]] = pixels.sigma[good]
+            c_ls[c, view.vertex[good]] = pixels.c_ls[good]
+            weight[c, view.vertex[good]] = smooth_sigma(
+                view.px[good], np.maximum(pixels.sigma[good], _LEAST_SIGMA), cell
+            )
+        cameras = self._cameras if refine is None else refine(k, px, weight)
+        points, used = triangulate_agreeing(cameras, px, weight)
+        enough = np.isfinite(px[..., 0]).sum(axis=0) >= 2
+        lost: Mask = np.asarray(~np.isfinite(points.xyz).all(axis=1))
+        why = np.where(enough, LostPoint.RESIDUAL, status.max(axis=0))
+        overall = np.where(lost, why, 0).astype(np.int8)
+        moved = np.where(lost[:, None], np.nan, points.xyz - self.surface.xyz)
+        overall[surface_outliers(self.surface.neighbours, moved)] = LostPoint.SURFACE
+        measured = overall == 0
+        used &= measured
+        xyz = np.where(measured[:, None], points.xyz, np.nan)
+        residual = np.full(count, np.nan)
+        for c, camera in enumerate(cameras):
+            at = np.flatnonzero(used[c])
+            if len(at):
+                residual[c] = float(np.mean((px[c, at] - camera.project(xyz[at]))[:, 1]))
+        return SurfaceStep(
+            xyz, px, sigma.astype(np.float32), np.where(used[..., None], weight, np.nan).astype(np.float32),
+            c_ls.astype(np.float32), overall, status, np.where(measured, points.chi2, np.nan),
+            np.where(measured, points.degrees, 0), residual,
+        )  # fmt: skip
+
+    def _reference(self, rig: str, pairs: Sequence[tuple[str, str]]) -> Results:
+        """The results of the reference alone, without standard deviations."""
+        surface = self.surface
+        facing, vertex_pair = _facing_pairs(self._cameras, pairs, surface)
+        corners = vertex_pair[surface.faces]
+        n = len(surface.xyz)
+        return Results(
+            rig=rig,
+            steps=self.names[:1],
+            cameras=self._cameras,
+            pairs=facing,
+            vertices_ref=surface.xyz,
+            vertices=surface.xyz[None],
+            faces=surface.faces,
+            pair=np.where((corners == corners[:, :1]).all(axis=1), corners[:, 0], -1),
+            vertex_pair=vertex_pair,
+            correlation=surface.c_ls[None],
+            sigma_xyz=np.full((1, n, 3), np.nan),
+            status=np.zeros((1, n), np.int8),
+            matches=tuple(
+                Matches(
+                    cameras=(camera.id,),
+                    xy=surface.px[c, view.vertex],
+                    px=view.px[None, None],
+                    c_ls=np.zeros((1, len(view.vertex))),
+                    sigma=surface.sigma[c, view.vertex][None, None],
+                    status=np.zeros((1, len(view.vertex)), np.int8),
+                    vertex=view.vertex,
+                )
+                for c, (camera, view) in enumerate(zip(self._cameras, self._views, strict=True))
+                if len(view.vertex)
+            ),
+            settings=self._settings.to_toml(),
+            chi2=(surface.chi2 / np.where(surface.degrees > 0, surface.degrees, 1))[None],
+        )
+
+    def _prepare_uncertainty(self) -> None:
+        """Compute what the standard deviations of all steps share, and complete the reference with its own."""
+        surface, cameras = self.surface, self._cameras
+        group = self._settings.correlation
+        normals = Mesh(surface.xyz, surface.faces).vertex_normals
+        # The noise is better known from the images in time than from the flat parts of one image.
+        self._image_noise = surface.noise * np.sqrt(np.array(self._grey_noise) / surface.grey_noise)[:, None, None]
+        self._label = along_surface(cameras, surface.own, surface.xyz, normals)
+        self._gain = position_gain(cameras, surface.xyz, surface.sigma)
+        px = np.full_like(surface.px, np.nan)
+        for c, view in enumerate(self._views):
+            px[c, view.vertex] = view.px
+        self._correlation = corner_correlations(px, surface.faces, group.radius_px, group.order)
+        sigma = _root(reference_covariance(self._gain, self._image_noise, surface.own, self._label))
+        n, m = len(surface.xyz), len(surface.faces)
+        self.reference = replace(
+            self.reference, sigma_xyz=sigma[None], sigma_displacement=np.zeros((1, n, 3)),
+            sigma_lambda=np.zeros((1, m, 2)),
+        )  # fmt: skip
+
+    @property
+    def noise(self) -> list[Floats]:
+        """For each of the matches, (F, 1) px: medians of the standard deviations at each step."""
+        rows = [np.full((len(self.names), 1), np.nan) for _ in self.reference.matches]
+        for row, one in zip(rows, self.reference.matches, strict=True):
+            row[0] = median_deviations(one.sigma[0], one.status[0])
+        return rows
+
+    def without_matches(self) -> SurfaceSeries:
+        """The series without the matches in the images."""
+        self.reference = replace(self.reference, matches=())
+        return self
+
+    def at(self, step: int) -> Results:
+        """Results of the reference and of a later step; for step 0 those of the reference alone."""
+        if not step:
+            return self.reference
+        one: SurfaceStep = self._cache.get(step)
+        reference, surface = self.reference, self.surface
+        noise, total = self._pixel_sigma(one)
+        gain = position_gain(self._cameras, one.xyz, one.weight.astype(float))
+        half = noise / np.sqrt(2.0)  # the share of either image
+        displacement = _root(covariance(gain, noise))
+        position = _root(step_covariance((self._gain, gain), self._image_noise, (half, half), surface.own, self._label))
+        strains = deformation(surface.xyz, one.xyz, surface.faces)
+        stretches = stretch_sigma(strains, surface.xyz, surface.faces, gain, self._correlation, noise)
+        lost = ~np.isfinite(one.xyz).all(axis=1)
+        position[lost], displacement[lost] = np.nan, np.nan
+        stretches[~np.isfinite(strains.J)] = np.nan
+        used = np.isfinite(one.weight[..., 0])
+        c_ls = np.fmax.reduce(np.where(used, one.c_ls, np.nan), axis=0)
+        chi2 = one.chi2 / np.where(one.degrees > 0, one.degrees, 1)
+
+        def both(name: str, values: NDArray[Any]) -> NDArray[Any]:
+            return np.stack([getattr(reference, name)[0], values])
+
+        return replace(
+            reference,
+            steps=(self.names[0], self.names[step]),
+            vertices=both("vertices", one.xyz),
+            correlation=both("correlation", c_ls),
+            sigma_xyz=both("sigma_xyz", position),
+            status=both("status", one.status),
+            sigma_displacement=both("sigma_displacement", displacement),
+            sigma_lambda=both("sigma_lambda", stretches),
+            chi2=both("chi2", chi2),
+            matches=tuple(self._matches(each, one, total, used) for each in reference.matches),
+        )
+
+    def _pixel_sigma(self, step: SurfaceStep) -> tuple[Floats, Floats]:
+        """Standard deviations (C, N, 2) px of the displacements in each camera: due to noise, and due to all causes."""
+        noise, total = np.full(step.px.shape, np.nan), np.full(step.px.shape, np.nan)
+        for c, (view, texture) in enumerate(zip(self._views, self._textures, strict=True)):
+            if not len(view.vertex):
+                continue
+            variance = self._grey_noise[c]
+            parts = match_uncertainty(
+                step.sigma[c, view.vertex].astype(float), step.c_ls[c, view.vertex].astype(float),
+                (texture, texture), (variance, variance),
+            )  # fmt: skip
+            noise[c, view.vertex] = np.hypot(parts.reference, parts.current)
+            total[c, view.vertex] = np.hypot(noise[c, view.vertex], parts.systematic)
+        return noise, total
+
+    def _matches(self, reference: Matches, step: SurfaceStep, total: Floats, used: Mask) -> Matches:
+        """Matches of one camera at the reference and at a step; good ones that contradict other cameras are marked."""
+        c = [camera.id for camera in self._cameras].index(reference.cameras[0])
+        vertex = reference.vertex
+        status = step.camera_status[c, vertex]
+        status = np.where((status == 0) & ~used[c, vertex], LostPoint.RESIDUAL, status).astype(np.int8)
+        return replace(
+            reference,
+            px=np.stack([reference.px[0], step.px[c, vertex][None]]),
+            c_ls=np.stack([reference.c_ls[0], step.c_ls[c, vertex]]),
+            sigma=np.stack([reference.sigma[0], total[c, vertex][None]]),
+            status=np.stack([reference.status[0], status]),
+        )
+
+
+def _facing_pairs(
+    cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]], surface: ReferenceSurface
+) -> tuple[tuple[tuple[str, str], ...], Indices]:
+    """Pair of cameras that face each point most squarely, of those that measured it.
+
+    Returns the pairs of camera ids, with pairs that are not listed in the rig appended, and the index (N,) of each
+    point's pair among them.
+    """
+    normals = Mesh(surface.xyz, surface.faces).vertex_normals
+    squarely = np.stack([camera.incidence_cosine(surface.xyz, normals) for camera in cameras])
+    squarely = np.where(np.isfinite(surface.px[..., 0]) & np.isfinite(squarely), squarely, -2.0)
+    best = np.sort(np.argsort(-squarely, axis=0)[:2], axis=0)
+    listed = [(first, second) for first, second in pairs]
+    index = {frozenset(pair): k for k, pair in enumerate(listed)}
+    vertex_pair = np.empty(len(surface.xyz), np.int64)
+    for a, b in np.unique(best, axis=1).T:
+        pair = (cameras[a].id, cameras[b].id)
+        if frozenset(pair) not in index:
+            index[frozenset(pair)] = len(listed)
+            listed.append(pair)
+        vertex_pair[(best[0] == a) & (best[1] == b)] = index[frozenset(pair)]
+    return tuple(listed), vertex_pair
+
+
+def _root(covariances: Floats) -> Floats:
+    """Standard deviations (n, 3) of covariances (n, 3, 3)."""
+    return np.sqrt(np.einsum("nii->ni", covariances))
+
+
+def _sample(values: NDArray[Any]) -> NDArray[Any]:
+    """Every so manieth of values (n,), about two thousand, of which a median is taken."""
+    return values[:: max(1, len(values) // 2000)]

@@ -1,0 +1,172 @@
+"""Which camera faces a part of the surface most squarely, and which others see it.
+
+Both are told from the depth maps of all cameras: a point of one map is seen by another camera where that camera's own
+map shows the same depth, or none; where it shows a smaller depth, something stands before the point.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ringdic.arrays import Image, Mask, Pixels, Points, Vectors
+from ringdic.charts.depth_map import DepthMap
+from ringdic.charts.patches import depths
+from ringdic.geometry.camera import Camera
+from ringdic.sweep.region import contrast
+
+_REACH = 1.5  # steps of a map's lattice within which its nearest place tells the depth of a pixel
+_SAME = 0.5  # steps of the lattice, in mm on the surface, within which two depths agree
+_STRONG = 0.5  # slope of a textured pixel, in units of the usual contrast of the chart
+_GAP = 0.6  # subset radii, half the largest gap between speckles
+_OVERLAP = 2  # steps of the lattice by which a chart exceeds the part that its camera faces most squarely
+
+
+@dataclass(frozen=True)
+class ChartPlan:
+    """What one camera measures: n places of its depth map, and the cameras in which the surface about each is matched.
+
+    inside : (n,) bool, places of the chart. sees : (n, C) bool, cameras that see the place, without the camera itself.
+    """
+
+    inside: Mask
+    sees: Mask
+
+
+def plan_chart(
+    k: int, cameras: Sequence[Camera], maps: Sequence[DepthMap], incidence_deg: float, partners: Sequence[int]
+) -> ChartPlan:
+    """Determine the part of the surface that a camera faces most squarely, with a margin round it.
+
+    Parameters
+    ----------
+    k : index of the camera.
+    cameras : the C cameras.
+    maps : their depth maps.
+    incidence_deg : degrees, largest angle of incidence of a view that is used.
+    partners : indices of the cameras that it may be matched with.
+    """
+    view = _MapViews(cameras[k], maps[k])
+    limit = math.cos(math.radians(incidence_deg))
+    own = cameras[k].incidence_cosine(view.xyz, view.normals)
+    squarest = np.full(len(view.xyz), -1.0)
+    sees = np.zeros((len(view.xyz), len(cameras)), bool)
+    for c in partners:
+        cosine = cameras[c].incidence_cosine(view.xyz, view.normals)
+        same, hidden = _MapViews(cameras[c], maps[c]).compare(view.xyz, view.step_mm)
+        squarest = np.maximum(squarest, np.where(same, cosine, -1.0))
+        sees[:, c] = (cosine > limit) & ~hidden & _inside(cameras[c], view.xyz)
+    usable = (own > limit) & sees.any(axis=1)
+    return ChartPlan(_dilated(maps[k], usable & (own >= squarest)) & usable, sees)
+
+
+class _MapViews:
+    """Points and normals of a depth map, and a comparison of other points with it."""
+
+    def __init__(self, camera: Camera, depth_map: DepthMap) -> None:
+        self.camera, self.map = camera, depth_map
+        patches = depth_map.patches
+        self.xyz: Points = patches.points(camera, np.zeros((1, 2)))[:, 0]
+        self.normals: Vectors = patches.normals(camera)
+        self._tree = cKDTree(patches.px) if len(patches.px) else None
+
+    @property
+    def step_mm(self) -> float:
+        """Spacing of the lattice on a surface that faces the camera, mm."""
+        if not len(self.xyz):
+            return 0.0
+        px = self.map.patches.px[:1]
+        angle = np.linalg.norm(self.camera.ray(px + np.array([self.map.spacing, 0.0])) - self.camera.ray(px))
+        return float(np.median(np.linalg.norm(self.xyz - self.camera.centre, axis=1)) * angle)
+
+    def compare(self, xyz: Points, step_mm: float) -> tuple[Mask, Mask]:
+        """Which points (n, 3) mm the map shows at the same depth, and before which it shows something nearer."""
+        same, hidden = np.zeros(len(xyz), bool), np.zeros(len(xyz), bool)
+        if self._tree is None or not len(xyz):
+            return same, hidden
+        px = self.camera.project(xyz)
+        distance, index = self._tree.query(px, distance_upper_bound=_REACH * self.map.spacing)
+        near = np.flatnonzero(np.isfinite(distance))
+        index = index[near]
+        patches = self.map.patches
+        offset = px[near] - patches.px[index]
+        inverse = patches.inverse_depth[index] + np.sum(patches.gradient[index] * offset, axis=1)
+        depth = depths(self.camera, xyz[near])
+        with np.errstate(divide="ignore"):
+            nearer = depth - 1.0 / inverse
+        slant = np.maximum(self.camera.incidence_cosine(self.xyz[index], self.normals[index]), 0.2)
+        tolerance = _SAME * step_mm / slant
+        same[near] = np.abs(nearer) < tolerance
+        hidden[near] = nearer > 3.0 * tolerance
+        return same, hidden
+
+
+def _inside(camera: Camera, xyz: Points) -> Mask:
+    """Points (n, 3) mm that project into a camera's image, (n,)."""
+    px = camera.project(xyz)
+    return np.asarray(((px >= 0) & (px <= np.array(camera.size) - 1)).all(axis=1))
+
+
+def _dilated(depth_map: DepthMap, chosen: Mask) -> Mask:
+    """Places (n,) of a map within the overlap of chosen ones."""
+    cell = np.rint(depth_map.patches.px / depth_map.spacing).astype(np.int64)
+    picture = np.zeros(cell.max(axis=0, initial=0) + 1, np.uint8)
+    picture[tuple(cell[chosen].T)] = 1
+    grown = cv2.dilate(picture, np.ones((2 * _OVERLAP + 1,) * 2, np.uint8))
+    return np.asarray(grown[tuple(cell.T)] > 0)
+
+
+def chart_region(grey: Image, depth_map: DepthMap, inside: Mask, radius: int) -> Mask:
+    """Region of a chart in its camera's reference image: the textured pixels about its places.
+
+    Beyond the rim of the depth map it exceeds the chart's places by two steps of the lattice, since matches reach
+    farther on the fine grid; texture tells where the surface really ends.
+
+    grey : (height, width) grey levels. depth_map : of the camera. inside : (n,) places that belong to the chart.
+    radius : px, of the subsets. Returns (height, width) bool.
+    """
+    spacing, px = depth_map.spacing, depth_map.patches.px
+    region = np.zeros(grey.shape, bool)
+    if not inside.any():
+        return region
+    cells = _cells(depth_map, inside)
+    half, reach = spacing // 2 + 1, spacing
+    left, top = np.maximum(np.floor(cells.min(axis=0)).astype(int) - half - reach, 0)
+    right, bottom = np.ceil(cells.max(axis=0)).astype(int) + half + reach
+    part = grey[top:bottom, left:right]
+    mask = np.zeros(part.shape, np.uint8)
+    for x, y in np.rint(cells).astype(int) - (left, top):
+        mask[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1] = 1
+    closed = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((2 * reach + 1,) * 2, np.uint8))) > 0
+    level = float(np.median(contrast(grey, px[inside], radius)))
+    region[top:bottom, left:right] = closed & _textured_pixels(part, _STRONG * level, radius)
+    return region
+
+
+def _cells(depth_map: DepthMap, inside: Mask) -> Pixels:
+    """Places (k, 2) px of a chart, and textured places without a depth within the overlap of them."""
+    spacing = depth_map.spacing
+    known, textured = depth_map.patches.px, depth_map.textured
+    taken = {tuple(cell) for cell in np.rint(known / spacing).astype(int).tolist()}
+    free = [tuple(cell) not in taken for cell in np.rint(textured / spacing).astype(int).tolist()]
+    beyond = textured[np.array(free, bool)]
+    if not len(beyond):
+        return known[inside]
+    distance = cKDTree(known[inside]).query(beyond, distance_upper_bound=1.5 * _OVERLAP * spacing)[0]
+    return np.concatenate([known[inside], beyond[np.isfinite(distance)]])
+
+
+def _textured_pixels(grey: Image, least: float, radius: int) -> Mask:
+    """Pixels of a textured surface: those of steep grey levels, and the gaps between them. least : grey levels a px."""
+    level = grey.astype(np.float32)
+    slope = cv2.magnitude(
+        cv2.Sobel(level, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(level, cv2.CV_32F, 0, 1, scale=0.125)
+    )
+    size = 2 * round(_GAP * radius) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    return np.asarray(cv2.morphologyEx((slope > least).astype(np.uint8), cv2.MORPH_CLOSE, kernel) > 0)
