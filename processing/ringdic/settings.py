@@ -118,8 +118,9 @@ class CalibrationGroup(_Group):
 class SurfaceGroup(_Group):
     """Settings of the surface: how it is reconstructed from the matches, and where in space it is searched for.
 
-    method : the surfaces of the camera pairs side by side (pairs), or one lattice of points over the surface, each
-        measured by all cameras that see it (global).
+    method : the surfaces of the camera pairs side by side (pairs); one lattice of points over the surface, each
+        measured by all cameras that see it (global); or each camera's grid over the part that it faces most squarely,
+        each point measured by all cameras that see it, for bodies of any shape (charts).
     merge : how the pairs' surfaces become one: which triangles of an overlap are removed first, those worst by
         correlation, by distance to the other surfaces, by orientation against theirs, or by all of these and the
         nearness to the border (combined); none leaves the surfaces one over the other.

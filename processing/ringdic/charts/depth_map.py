@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -140,9 +141,8 @@ def measure_depths(
     textured = _textured(grey, places, settings.radius, settings.texture_min)
     if mask is None:
         places = places[textured]
-    reference = prepare_reference(grey, _about(places, settings, grey.shape), settings)
-    search = _DepthSearch(images, k, reference, places, space)
-    for partner in partners:
+    search = _DepthSearch(images, k, places, space)
+    for partner in partners if len(places) else ():
         search.match(partner)
     return search.result()
 
@@ -172,13 +172,19 @@ def _about(places: Pixels, settings: CorrelationSettings, shape: tuple[int, ...]
 class _DepthSearch:
     """State of the search of depth at the textured places of a camera's image."""
 
-    def __init__(self, images: DepthImages, k: int, reference: Reference, places: Pixels, space: DepthRange) -> None:
+    def __init__(self, images: DepthImages, k: int, places: Pixels, space: DepthRange) -> None:
         n = len(places)
-        self.images, self.k, self.reference, self.settings = images, k, reference, images.settings
+        self.images, self.k, self.settings = images, k, images.settings
         self.places, self.space = places, space
         self.camera = images.cameras[k]
         self.patches = Patches(places, np.full(n, np.nan), np.full((n, 2), np.nan), np.zeros((n, 3)))
         self.sigma, self.zncc = np.full(n, np.nan), np.full(n, -1.0)
+
+    @cached_property
+    def reference(self) -> Reference:
+        """The camera's image as a reference image, in the box about the places."""
+        grey = self.images.current(self.k).image
+        return prepare_reference(grey, _about(self.places, self.settings, grey.shape), self.settings)
 
     @property
     def known(self) -> Mask:

@@ -32,6 +32,7 @@ from ringdic.correlation import (
 )
 from ringdic.correlation.quadratic import Neighbourhoods
 from ringdic.geometry.camera import Camera
+from ringdic.geometry.outliers import LostPoint
 from ringdic.geometry.triangulation import triangulate
 
 _WINDOW = 2.7  # steps of the lattice about a place, of the neighbours from which its curvature is computed
@@ -62,7 +63,9 @@ class ChartMatches:
     status: NDArray[np.int8]
 
 
-def match_chart(images: ChartImages, k: int, depth_map: DepthMap, plan: ChartPlan, mask: Mask | None) -> ChartMatches:
+def match_chart(
+    images: ChartImages, k: int, depth_map: DepthMap, plan: ChartPlan, mask: Mask | None, incidence_deg: float = 65.0
+) -> ChartMatches:
     """Match a chart's grid from its own camera in all cameras that see it.
 
     Parameters
@@ -72,11 +75,13 @@ def match_chart(images: ChartImages, k: int, depth_map: DepthMap, plan: ChartPla
     depth_map : of that camera.
     plan : places of the depth map that belong to the chart, and the cameras that see them.
     mask : (height, width) bool, drawn by the user; None: the region follows from the places.
+    incidence_deg : degrees, largest angle of incidence of a view that is used.
     """
     camera, settings = images.cameras[k], images.settings
-    region = chart_region(images.image(k), depth_map, plan.inside, settings.radius)
-    region = region if mask is None else region & mask
-    xy, faces = grid(region, settings.step)
+    region, of_points = chart_region(images.image(k), depth_map, plan.inside, settings.radius)
+    if mask is not None:
+        region, of_points = region & mask, of_points & mask
+    xy, faces = grid(of_points, settings.step)
     partners = np.flatnonzero(plan.sees[plan.inside].any(axis=0))
     cameras = np.concatenate([[k], partners]).astype(np.int64)
     count, n = len(cameras), len(xy)
@@ -103,7 +108,21 @@ def match_chart(images: ChartImages, k: int, depth_map: DepthMap, plan: ChartPla
     for slot, view in enumerate(views, start=1):
         index, matches = view.second_pass(xy, stencil, settings)
         _enter(out, slot, index, matches)
+    _drop_oblique(out, [images.cameras[c] for c in cameras], refined, incidence_deg)
     return out
+
+
+def _drop_oblique(out: ChartMatches, cameras: Sequence[Camera], patches: Patches, incidence_deg: float) -> None:
+    """Drop the views of points that a camera sees more obliquely than a limit, and points that their own camera does.
+
+    out : matches in the C cameras. patches : about the points.
+    """
+    xyz, normals = patches.points(cameras[0], np.zeros((1, 2)))[:, 0], patches.normals(cameras[0])
+    with np.errstate(invalid="ignore"):
+        oblique = [camera.incidence_cosine(xyz, normals) < np.cos(np.radians(incidence_deg)) for camera in cameras]
+    for slot in range(1, len(cameras)):
+        lost = (oblique[slot] | oblique[0]) & (out.status[slot] == Status.GOOD)
+        out.px[slot, lost], out.status[slot, lost] = np.nan, LostPoint.OBLIQUE
 
 
 def _enter(out: ChartMatches, slot: int, index: Indices, matches: PointMatches | None) -> None:

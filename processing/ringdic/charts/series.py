@@ -221,15 +221,13 @@ class SurfaceSeries:
         surface, cameras = self.surface, self._cameras
         group = self._settings.correlation
         normals = Mesh(surface.xyz, surface.faces).vertex_normals
-        # The noise is better known from the images in time than from the flat parts of one image.
-        self._image_noise = surface.noise * np.sqrt(np.array(self._grey_noise) / surface.grey_noise)[:, None, None]
         self._label = along_surface(cameras, surface.own, surface.xyz, normals)
         self._gain = position_gain(cameras, surface.xyz, surface.sigma)
         px = np.full_like(surface.px, np.nan)
         for c, view in enumerate(self._views):
             px[c, view.vertex] = view.px
         self._correlation = corner_correlations(px, surface.faces, group.radius_px, group.order)
-        sigma = _root(reference_covariance(self._gain, self._image_noise, surface.own, self._label))
+        sigma = _root(reference_covariance(self._gain, surface.scatter, surface.own, self._label))
         n, m = len(surface.xyz), len(surface.faces)
         self.reference = replace(
             self.reference, sigma_xyz=sigma[None], sigma_displacement=np.zeros((1, n, 3)),
@@ -259,7 +257,7 @@ class SurfaceSeries:
         gain = position_gain(self._cameras, one.xyz, one.weight.astype(float))
         half = noise / np.sqrt(2.0)  # the share of either image
         displacement = _root(covariance(gain, noise))
-        position = _root(step_covariance((self._gain, gain), self._image_noise, (half, half), surface.own, self._label))
+        position = _root(step_covariance((self._gain, gain), surface.scatter, (half, half), surface.own, self._label))
         strains = deformation(surface.xyz, one.xyz, surface.faces)
         stretches = stretch_sigma(strains, surface.xyz, surface.faces, gain, self._correlation, noise)
         lost = ~np.isfinite(one.xyz).all(axis=1)

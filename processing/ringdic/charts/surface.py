@@ -31,8 +31,8 @@ class ReferenceSurface:
 
     xyz : (N, 3) mm, world frame. faces : (M, 3), normals outwards. own : (N,) index of the camera whose chart a point
     belongs to, in whose image it lies on a whole pixel. px : (C, N, 2) px, NaN for a camera that was not used. sigma :
-    (C, N, 2) px, standard deviation due to all causes, smoothed over the image. noise : (C, N, 2) px, due to the noise
-    of each image alone. texture : (C, N, 5), of `Chart`. grey_noise : (C,), variance of each camera's noise, grey
+    (C, N, 2) px, standard deviation due to all causes, smoothed over the image. scatter : (C, N, 2) px, that of
+    each match alone. texture : (C, N, 5), of `Chart`. grey_noise : (C,), variance of each camera's noise, grey
     levels², NaN where it took no part. chi2, degrees : (N,), of the triangulation. c_ls : (N,), the largest over the
     cameras. neighbours : (N, 4, 2), of `grid_neighbours`. lost : (K, 2), status and number of the points of charts
     that were lost. mismatch : (P, 7), of every two charts that overlap.
@@ -43,7 +43,7 @@ class ReferenceSurface:
     own: Indices
     px: Pixels
     sigma: Pixels
-    noise: Pixels
+    scatter: Pixels
     texture: NDArray[np.float32]
     grey_noise: Floats
     chi2: Floats
@@ -98,7 +98,7 @@ def reference_surface(
     for chart in charts:
         grey_noise[chart.cameras] = chart.grey_noise
     return ReferenceSurface(
-        joined("xyz"), number[merged.faces], joined("own"), joined("px", 1), joined("sigma", 1), joined("noise", 1),
+        joined("xyz"), number[merged.faces], joined("own"), joined("px", 1), joined("sigma", 1), joined("scatter", 1),
         joined("texture", 1), grey_noise, joined("chi2"), joined("degrees"), joined("c_ls"), number[neighbours],
         np.stack([status, count], axis=1),
     )  # fmt: skip
@@ -113,7 +113,7 @@ class _MeasuredChart:
     own: Indices
     px: Pixels
     sigma: Pixels
-    noise: Pixels
+    scatter: Pixels
     texture: NDArray[np.float32]
     chi2: Floats
     degrees: Indices
@@ -132,9 +132,9 @@ def _measure(cameras: Sequence[Camera], k: int, chart: Chart, step: int, sigma_m
         uncertain: Mask = np.asarray((sigma > sigma_max).any(axis=2))
     uncertain[0] = False  # its pixel defines the point
     px = np.where(uncertain[..., None] | ~np.isfinite(sigma), np.nan, chart.px)
-    sigma = np.stack([smooth_sigma(at, one, CELL_STEPS * step) for at, one in zip(px, sigma, strict=True)])
+    smooth = np.stack([smooth_sigma(at, one, CELL_STEPS * step) for at, one in zip(px, sigma, strict=True)])
     n = len(chart.xy)
-    points, used = triangulate_agreeing(own, px, sigma, np.zeros(n, np.int64))
+    points, used = triangulate_agreeing(own, px, smooth, np.zeros(n, np.int64))
     status = _status(chart, px, uncertain, points.xyz)
     xyz = np.where((status == 0)[:, None], points.xyz, np.nan)
     neighbours = grid_neighbours(chart.xy, step)
@@ -152,8 +152,8 @@ def _measure(cameras: Sequence[Camera], k: int, chart: Chart, step: int, sigma_m
 
     c_ls = np.max(np.where(used, chart.c_ls, -np.inf), axis=0, initial=-np.inf)
     return _MeasuredChart(
-        xyz[rows], number[faces], np.full(len(rows), k), everywhere(px), everywhere(sigma),
-        everywhere(chart.noise.astype(float)), everywhere(chart.texture), points.chi2[rows], points.degrees[rows],
+        xyz[rows], number[faces], np.full(len(rows), k), everywhere(px), everywhere(smooth),
+        everywhere(sigma), everywhere(chart.texture), points.chi2[rows], points.degrees[rows],
         c_ls[rows].astype(float), number[neighbours[rows]], status[status != 0],
     )  # fmt: skip
 

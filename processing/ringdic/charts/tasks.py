@@ -186,7 +186,7 @@ def chart_task(files: _ReferenceFiles, k: int, incidence: float, *, inputs: tupl
     maps = [_depth_map(camera.id, read_output(path)) for camera, path in zip(cameras, inputs, strict=True)]
     plan = plan_chart(k, cameras, maps, incidence, files.views.partners[k])
     images = ChartImages(cameras, files.image, files.correlation)
-    matches = match_chart(images, k, maps[k], plan, files.mask(k))
+    matches = match_chart(images, k, maps[k], plan, files.mask(k), incidence)
     noise = np.array([maps[c].grey_noise for c in matches.cameras])
     chart = chart_with_uncertainty(images, matches, noise)
     return {**chart.arrays(), "points": np.array(int(np.isfinite(chart.px[..., 0]).sum()))}

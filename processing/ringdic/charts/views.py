@@ -24,6 +24,7 @@ _REACH = 1.5  # steps of a map's lattice within which its nearest place tells th
 _SAME = 0.5  # steps of the lattice, in mm on the surface, within which two depths agree
 _STRONG = 0.5  # slope of a textured pixel, in units of the usual contrast of the chart
 _GAP = 0.6  # subset radii, half the largest gap between speckles
+_LEAST_CONTRAST = 0.3  # close to a point, of the usual one: a subset beyond the last speckles is ill determined
 _OVERLAP = 2  # steps of the lattice by which a chart exceeds the part that its camera faces most squarely
 
 
@@ -114,6 +115,8 @@ def _inside(camera: Camera, xyz: Points) -> Mask:
 
 def _dilated(depth_map: DepthMap, chosen: Mask) -> Mask:
     """Places (n,) of a map within the overlap of chosen ones."""
+    if not chosen.any():
+        return chosen
     cell = np.rint(depth_map.patches.px / depth_map.spacing).astype(np.int64)
     picture = np.zeros(cell.max(axis=0, initial=0) + 1, np.uint8)
     picture[tuple(cell[chosen].T)] = 1
@@ -121,19 +124,21 @@ def _dilated(depth_map: DepthMap, chosen: Mask) -> Mask:
     return np.asarray(grown[tuple(cell.T)] > 0)
 
 
-def chart_region(grey: Image, depth_map: DepthMap, inside: Mask, radius: int) -> Mask:
+def chart_region(grey: Image, depth_map: DepthMap, inside: Mask, radius: int) -> tuple[Mask, Mask]:
     """Region of a chart in its camera's reference image: the textured pixels about its places.
 
     Beyond the rim of the depth map it exceeds the chart's places by two steps of the lattice, since matches reach
     farther on the fine grid; texture tells where the surface really ends.
 
     grey : (height, width) grey levels. depth_map : of the camera. inside : (n,) places that belong to the chart.
-    radius : px, of the subsets. Returns (height, width) bool.
+    radius : px, of the subsets.
+    Returns two masks (height, width): pixels that subsets may contain, and those about which points may lie, since
+    there is texture close by.
     """
     spacing, px = depth_map.spacing, depth_map.patches.px
-    region = np.zeros(grey.shape, bool)
+    region, of_points = np.zeros(grey.shape, bool), np.zeros(grey.shape, bool)
     if not inside.any():
-        return region
+        return region, of_points
     cells = _cells(depth_map, inside)
     half, reach = spacing // 2 + 1, spacing
     left, top = np.maximum(np.floor(cells.min(axis=0)).astype(int) - half - reach, 0)
@@ -143,9 +148,10 @@ def chart_region(grey: Image, depth_map: DepthMap, inside: Mask, radius: int) ->
     for x, y in np.rint(cells).astype(int) - (left, top):
         mask[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1] = 1
     closed = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((2 * reach + 1,) * 2, np.uint8))) > 0
-    level = float(np.median(contrast(grey, px[inside], radius)))
-    region[top:bottom, left:right] = closed & _textured_pixels(part, _STRONG * level, radius)
-    return region
+    textured, close = _textured_pixels(part, float(np.median(contrast(grey, px[inside], radius))), radius)
+    region[top:bottom, left:right] = closed & textured
+    of_points[top:bottom, left:right] = closed & textured & close
+    return region, of_points
 
 
 def _cells(depth_map: DepthMap, inside: Mask) -> Pixels:
@@ -161,12 +167,18 @@ def _cells(depth_map: DepthMap, inside: Mask) -> Pixels:
     return np.concatenate([known[inside], beyond[np.isfinite(distance)]])
 
 
-def _textured_pixels(grey: Image, least: float, radius: int) -> Mask:
-    """Pixels of a textured surface: those of steep grey levels, and the gaps between them. least : grey levels a px."""
+def _textured_pixels(grey: Image, usual: float, radius: int) -> tuple[Mask, Mask]:
+    """Pixels of a textured surface, that is those of steep grey levels and the gaps between them, and pixels with
+    texture close by, both as masks of the image's shape.
+
+    usual : contrast of the surface, grey levels a px. radius : px, of the subsets.
+    """
     level = grey.astype(np.float32)
-    slope = cv2.magnitude(
-        cv2.Sobel(level, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(level, cv2.CV_32F, 0, 1, scale=0.125)
-    )
+    along_x, along_y = (cv2.Sobel(level, cv2.CV_32F, *order, scale=0.125) for order in ((1, 0), (0, 1)))
+    square = along_x * along_x + along_y * along_y
     size = 2 * round(_GAP * radius) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-    return np.asarray(cv2.morphologyEx((slope > least).astype(np.uint8), cv2.MORPH_CLOSE, kernel) > 0)
+    steep = (square > (_STRONG * usual) ** 2).astype(np.uint8)
+    textured = np.asarray(cv2.morphologyEx(steep, cv2.MORPH_CLOSE, kernel)) > 0
+    mean = np.asarray(cv2.blur(square, (size, size)))
+    return textured, mean > (_LEAST_CONTRAST * usual) ** 2

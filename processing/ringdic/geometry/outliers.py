@@ -20,6 +20,7 @@ class LostPoint(IntEnum):
     RESIDUAL = 16  # the lines of sight miss one another
     SURFACE = 17  # off the surface that its neighbours form
     UNCERTAIN = 18  # matched, but with too large a standard deviation in an image
+    OBLIQUE = 19  # matched, but seen too obliquely
 
 
 def crossing_outliers(residuals: Pixels, factor: float = 8.0, floor: float = 0.3) -> Mask:
