@@ -70,7 +70,7 @@ def test_the_correlation_understands_its_group() -> None:
         ("calibration.skew=perhaps", ["calibration.skew", "true or false"]),
         ("calibration.print_error_mm=-0.1", ["calibration.print_error_mm", "-0.1"]),
         ("surface.curvature=guess", ["surface.curvature", "'geometry' or 'none'", "guess"]),
-        ("surface.method=magic", ["surface.method", "'pairs' or 'global'", "magic"]),
+        ("surface.method=magic", ["surface.method", "'pairs', 'global' or 'charts'", "magic"]),
         ("strain.window_mm=-1", ["strain.window_mm", "greater than or equal to 0", "-1"]),
         ("calibration.refine_poses=true", ["calibration.refine_poses needs surface.method=global"]),
         ("strain=5", ["group.name=value"]),

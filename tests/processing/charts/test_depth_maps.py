@@ -11,6 +11,7 @@ from ringdic.charts.plane_sweep import DepthRange
 from ringdic.charts.views import ChartPlan, plan_chart
 from ringdic.correlation import CorrelationSettings
 from ringdic.geometry.camera import Camera, Intrinsics
+from ringdic.geometry.outliers import LostPoint
 from ringdic.geometry.triangulation import triangulate
 from ringdic_node.virtual_rig.render import render
 from ringdic_node.virtual_rig.rig import paper_rig
@@ -95,30 +96,34 @@ def test_the_slants_of_a_depth_map_are_those_of_the_limb(maps: list[DepthMap]) -
 
 
 def test_each_camera_gets_what_it_faces_most_squarely(maps: list[DepthMap], plans: list[ChartPlan]) -> None:
-    """Charts overlap by two steps of the lattice and leave nothing out between neighbours."""
+    """The cameras stand at 0, 30 and 60°; charts exceed their share by two steps of the lattice, 9 mm or 9°."""
+    azimuth = []
     for k, (depth_map, plan) in enumerate(zip(maps, plans, strict=True)):
-        xyz = places(k, depth_map)
-        azimuth = np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0]))[plan.inside]
-        nearest = np.abs(azimuth[:, None] - [0.0, 30.0, 60.0]).argmin(axis=1)
-        assert (nearest == k).mean() > 0.5
-        assert np.percentile(np.abs(azimuth - 30.0 * k)[nearest != k], 90) < 35.0
-        assert plan.inside.any()
+        xyz = places(k, depth_map)[plan.inside]
+        azimuth.append(np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])))
         assert not plan.sees[:, k].any()
-    assert plans[1].sees[plans[1].inside][:, [0, 2]].all(axis=1).mean() > 0.9
+    assert np.percentile(azimuth[0], 95) < 15.0 + 14.0
+    assert np.percentile(np.abs(azimuth[1] - 30.0), 95) < 15.0 + 14.0
+    assert np.percentile(azimuth[2], 5) > 45.0 - 14.0
+    assert np.histogram(np.concatenate(azimuth), np.arange(-20.0, 81.0, 10.0))[0].min() > 20
+    assert plans[1].sees[plans[1].inside][:, [0, 2]].all(axis=1).mean() > 0.6
 
 
 def test_a_chart_is_matched_without_the_bias_of_flat_subsets(middle: ChartMatches, figures: Callable) -> None:
-    """With the measured curvature held, the points lie on the limb to a few hundredths of a pixel (0.3 mm)."""
+    """With the measured curvature held, the points lie on the limb to a few hundredths of a pixel (0.3 mm).
+
+    Flat subsets of 10 px between neighbouring cameras are biased by 0.03 px, 0.02 mm inwards.
+    """
+    sure = np.nanmax(middle.sigma, axis=(0, 2)) < 0.05
     xyz = triangulate([CAMERAS[c] for c in middle.cameras], middle.px)
     known = np.isfinite(xyz).all(axis=1)
-    distance = LIMB.material_coordinates(xyz[known])[2]
-    inner = np.abs(distance) < 1.0
-    rms, bias = float(np.sqrt(np.mean(distance[inner] ** 2))), float(np.median(distance))
-    figures("chart of a limb at 0.3 scale: distance from the surface, RMS", f"{rms:.4f} mm", "≤ 0.02")
+    distance = LIMB.material_coordinates(xyz[known & sure])[2]
+    scatter, bias = 1.4826 * float(np.median(np.abs(distance))), float(np.median(distance))
+    figures("chart of a limb at 0.3 scale: distance from the surface, robust", f"{scatter:.4f} mm", "≤ 0.006")
     figures("chart of a limb at 0.3 scale: bias", f"{bias:+.4f} mm", "≤ 0.003")
     assert known.mean() > 0.97
-    assert inner.all()
-    assert rms <= 0.02
+    assert np.abs(distance).max() < 1.0
+    assert scatter <= 0.006
     assert abs(bias) <= 0.003
 
 
@@ -135,3 +140,20 @@ def test_an_image_without_texture_gives_no_depth(images: list[np.ndarray]) -> No
     )
     assert len(depths.patches.px) == 0
     assert len(depths.textured) == 0
+
+
+def test_a_view_more_oblique_than_the_limit_is_not_used(
+    images: list[np.ndarray], maps: list[DepthMap], plans: list[ChartPlan]
+) -> None:
+    chart = match_chart(ChartImages(CAMERAS, lambda k: images[k], SETTINGS), 1, maps[1], plans[1], None, 45.0)
+    theta, z, _ = LIMB.material_coordinates(triangulate([CAMERAS[c] for c in chart.cameras], chart.px))
+    known = np.isfinite(theta)
+    tangents = LIMB.tangents(theta[known], z[known], 0)
+    normals = np.cross(tangents[:, 0], tangents[:, 1])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    xyz = LIMB.position(theta[known], z[known], 0)
+    for slot, c in enumerate(chart.cameras):
+        used = np.isfinite(chart.px[slot, known, 0])
+        incidence = np.degrees(np.arccos(CAMERAS[c].incidence_cosine(xyz, normals)[used]))
+        assert np.percentile(incidence, 98) < 48.0  # the normal of a measured surface is good to 3°, not at its rim
+    assert (chart.status == LostPoint.OBLIQUE).any()

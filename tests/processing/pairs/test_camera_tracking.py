@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from ringdic.charts.tracking import CameraMatches, interpolate_matches
 from ringdic.correlation import CorrelationSettings, Status, prepare_reference
 from ringdic.correlation.lattice_field import interpolate_lattice
-from ringdic.pairs.tracking import CameraMatches, camera_grid, interpolate_matches, match_camera
+from ringdic.pairs.tracking import camera_grid, match_camera
 
 STEP = 10
 RNG = np.random.default_rng(3)

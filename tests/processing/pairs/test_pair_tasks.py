@@ -24,6 +24,7 @@ SCALE, STEPS = 0.2, 3  # of the session
 SMALL = ["correlation.radius_px=12", "correlation.step_px=8"]
 SETTINGS = load_settings(None, SMALL)
 GLOBAL = load_settings(None, [*SMALL, "surface.method=global"])
+CHARTS = load_settings(None, [*SMALL, "surface.method=charts"])
 
 
 class Counted:
@@ -68,13 +69,15 @@ def same(first: Results, second: Results) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "count"), [(SETTINGS, 1 + 2 * (STEPS - 1)), (GLOBAL, 1 + 2)], ids=["pairs", "global"]
+    ("settings", "count"),
+    [(SETTINGS, 1 + 2 * (STEPS - 1)), (GLOBAL, 1 + 2), (CHARTS, 5 + 2 * (STEPS - 1))],
+    ids=["pairs", "global", "charts"],
 )
 def test_an_interrupted_job_makes_only_what_is_missing_and_the_same_results(
     session: Path, settings: Settings, count: int
 ) -> None:
     # Pairs: the reference, and each step of each camera. All cameras together: the shape, and each camera's block of
-    # steps.
+    # steps. Charts: a depth map and a chart of each camera, the surface, and each step of each camera.
     interrupted, resumed, whole = Counted(stop_after=2), Counted(), Counted()
     with pytest.raises(KeyboardInterrupt):
         process_session(session, settings, executor=interrupted)

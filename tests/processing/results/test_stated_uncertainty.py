@@ -12,6 +12,7 @@ from tempfile import gettempdir
 
 import numpy as np
 import pytest
+from ringdic.charts.tracking import CameraGrid, CameraPixels, interpolate_matches
 from ringdic.correlation import CorrelationSettings, prepare_reference
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.multiview.motion import Motion
@@ -21,7 +22,7 @@ from ringdic.pairs.matching import PairGrid, StepMatches, Stereo, match_referenc
 from ringdic.pairs.reconstruction import pair_shape
 from ringdic.pairs.surfaces import pairs_surface
 from ringdic.pairs.surfaces import reconstruct_pair as follow_pair
-from ringdic.pairs.tracking import CameraGrid, CameraPixels, camera_grid, interpolate_matches, match_camera
+from ringdic.pairs.tracking import camera_grid, match_camera
 from ringdic.results.results import Results
 from ringdic.results.series import StepCache, join_steps
 from ringdic.results.uncertainty import add_uncertainty
