@@ -12,7 +12,8 @@ matches them. The room knows images, masks and points only: no camera, no calibr
 ``neighbours``     neighbours of points, and outliers and extrapolations judged from them
 ``quadratic``      least-squares quadratics of any field over the neighbours of each point
 ``refinement``     inverse-compositional Gauss-Newton of many points, by the compiled ``kernels``
-``kernels``        the iteration of one subset, on ``subset``, ``interpolation``, ``warps`` and ``lanes``
+``kernels``        the iteration of one subset, on ``subset``, ``level_sums``, ``interpolation``, ``warps``, ``lanes``
+``parallel``       kernels on several threads
 ``spline``         B-spline coefficients and gradients of an image, by the compiled ``filters``
 ``bench``          speed of the correlation on this machine, against the limits of its processor by ``machine``
 ``command``        the correlation of two image files

@@ -10,12 +10,12 @@ import numba as nb
 import numpy as np
 
 from ringdic.correlation.interpolation import FAST
-from ringdic.correlation.lanes import LANES, load, load_one, pointer, ramp, store
+from ringdic.correlation.lanes import INNER, LANES, load, load_one, pointer, ramp, store
 
 _U = np.uint64
 _L = np.uint64(LANES)
 _BLOCK = 4 * LANES  # columns whose sums are in registers at once
-_COLUMNS = 64  # columns that one thread takes at a time: 2000 rows of them are half a megabyte
+COLUMNS = 64  # columns that one thread takes at a time: 2000 rows of them are half a megabyte
 
 
 @nb.njit(cache=True, nogil=True)
@@ -26,7 +26,7 @@ def mirror_index(at, count):  # type: ignore[no-untyped-def]
     return at
 
 
-@nb.njit(nogil=True, cache=True, fastmath=FAST)
+@nb.njit(nogil=True, cache=True, fastmath=FAST, **INNER)
 def _block(source, first, stride, taps, count, out, to):  # type: ignore[no-untyped-def]
     """Sums over ``count`` taps for _BLOCK neighbouring positions.
 
@@ -45,7 +45,7 @@ def _block(source, first, stride, taps, count, out, to):  # type: ignore[no-unty
     store(out, to + _L + _L + _L, d)
 
 
-@nb.njit(nogil=True, cache=True)
+@nb.njit(nogil=True, cache=True, **INNER)
 def _line(row, begin, line):  # type: ignore[no-untyped-def]
     """Fill line (m,) with a row of an image from column ``begin`` on, mirrored beyond its border."""
     if begin >= 0 and begin + len(line) <= len(row):
@@ -57,29 +57,28 @@ def _line(row, begin, line):  # type: ignore[no-untyped-def]
             line[k] = row[mirror_index(begin + k, len(row))]
 
 
-@nb.njit(nogil=True, cache=True, parallel=True)
-def separable_filter(image, along_x, along_y, left, top, out):  # type: ignore[no-untyped-def]
-    """Filter a box of an image along x and along y.
+@nb.njit(nogil=True, cache=True)
+def separable_filter(begin, end, image, along_x, along_y, left, top, out):  # type: ignore[no-untyped-def]
+    """Filter some columns of a box of an image along x and along y.
 
-    image : (h, w); along_x, along_y : taps, odd in number, centred on the pixel; left, top : the box's first pixel; out
-        :
-    (rows, columns), filled. Columns are taken a few at a time, so that what is filtered along x is still in the cache
-    when it is filtered along y.
+    begin, end : of the columns, in blocks of COLUMNS, the end exclusive; image : (h, w); along_x, along_y : taps, odd
+    in number, centred on the pixel; left, top : the box's first pixel; out : (rows, columns), filled. Columns are taken
+    a few at a time, so that what is filtered along x is still in the cache when it is filtered along y.
     """
     rows, width = out.shape
     reach_x, reach_y = len(along_x) // 2, len(along_y) // 2
-    for block in nb.prange((width + _COLUMNS - 1) // _COLUMNS):
-        first = block * _COLUMNS
-        line, spare = np.empty(_COLUMNS + 2 * reach_x, out.dtype), np.empty(_COLUMNS, out.dtype)
-        part = np.empty((rows + 2 * reach_y, _COLUMNS), out.dtype)
+    for block in range(begin, end):
+        first = block * COLUMNS
+        line, spare = np.empty(COLUMNS + 2 * reach_x, out.dtype), np.empty(COLUMNS, out.dtype)
+        part = np.empty((rows + 2 * reach_y, COLUMNS), out.dtype)
         for i in range(len(part)):
             _line(image[mirror_index(top - reach_y + i, image.shape[0])], left + first - reach_x, line)
-            for j in range(0, _COLUMNS, _BLOCK):
+            for j in range(0, COLUMNS, _BLOCK):
                 _block(pointer(line), _U(j), _U(1), pointer(along_x), len(along_x), pointer(part[i]), _U(j))
-        whole = first + _COLUMNS <= width
+        whole = first + COLUMNS <= width
         for i in range(rows):
             to = out[i, first:] if whole else spare
-            for j in range(0, _COLUMNS, _BLOCK):
-                _block(pointer(part[i]), _U(j), _U(_COLUMNS), pointer(along_y), len(along_y), pointer(to), _U(j))
+            for j in range(0, COLUMNS, _BLOCK):
+                _block(pointer(part[i]), _U(j), _U(COLUMNS), pointer(along_y), len(along_y), pointer(to), _U(j))
             if not whole:
                 out[i, first:] = spare[: width - first]

@@ -14,11 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels
+from ringdic.correlation.lanes import INNER
+from ringdic.correlation.parallel import in_ranges
 from ringdic.correlation.prepared import Current, Reference
 
 _MANY = 16  # warps per point from which on a first trial on fewer pixels pays
 _THINNED = 2  # stride of the first trial, in strides of the final one
 _DOUBT = 0.3  # error of the first trial's ZNCC: three standard deviations for 80 pixels of unrelated texture
+_LEAST = 16  # points that are worth a thread
 _ANY_PIXEL = np.zeros((0, 0), bool)  # in place of a mask: all pixels count
 
 
@@ -143,7 +146,9 @@ def _search(
     """
     n = len(xy)
     best = BestWarps(np.full((n, 6), np.nan), np.full(n, -1.0), np.full(n, -1.0), np.zeros(n, np.int64))
-    _best_warps(
+    in_ranges(
+        _best_warps,
+        n,
         image,
         mask,
         corner[0],
@@ -160,6 +165,7 @@ def _search(
         best.zncc,
         best.second_peak,
         best.index,
+        least=_LEAST,
     )
     return best
 
@@ -167,7 +173,7 @@ def _search(
 _FAST = {"contract", "reassoc", "arcp", "nsz"}
 
 
-@nb.njit(cache=True, nogil=True, fastmath=_FAST)
+@nb.njit(cache=True, nogil=True, fastmath=_FAST, **INNER)
 def _pixels(grey, mask, left_of_mask, top_of_mask, jx, iy, off_x, off_y, radius, stride, px):  # type: ignore[no-untyped-def]
     """Pixels of a circular subset that lie in the mask, every ``stride``-th each way.
 
@@ -192,7 +198,7 @@ def _pixels(grey, mask, left_of_mask, top_of_mask, jx, iy, off_x, off_y, radius,
     return n, math.sqrt(square)
 
 
-@nb.njit(cache=True, nogil=True, fastmath=_FAST)
+@nb.njit(cache=True, nogil=True, fastmath=_FAST, **INNER)
 def _positions(shape, x0, y0, warp, px, n, radius, nearest, at, share):  # type: ignore[no-untyped-def]
     """Positions of n pixels of a subset in the current image under a warp; false where one lies outside the image.
 
@@ -227,7 +233,7 @@ def _positions(shape, x0, y0, warp, px, n, radius, nearest, at, share):  # type:
     return True
 
 
-@nb.njit(cache=True, nogil=True, fastmath=_FAST)
+@nb.njit(cache=True, nogil=True, fastmath=_FAST, **INNER)
 def _grey_levels(image, columns, n, nearest, at, share, level):  # type: ignore[no-untyped-def]
     """Grey levels of a flat image at n positions, into level (n,): of the nearest pixel, or interpolated bilinearly.
 
@@ -247,7 +253,7 @@ def _grey_levels(image, columns, n, nearest, at, share, level):  # type: ignore[
         level[m] = g + share[1, m] * (h - g)
 
 
-@nb.njit(cache=True, nogil=True, fastmath=_FAST)
+@nb.njit(cache=True, nogil=True, fastmath=_FAST, **INNER)
 def _zncc(image, shape, x0, y0, warp, px, n, norm, radius, nearest, at, share, level):  # type: ignore[no-untyped-def]
     """ZNCC of a subset of n pixels px (3, n) with the flat current image under a warp (6,).
 
@@ -267,7 +273,7 @@ def _zncc(image, shape, x0, y0, warp, px, n, norm, radius, nearest, at, share, l
     return s_fg / (norm * math.sqrt(variance)) if variance > 1e-9 * (n + s_gg) else -1.0
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, **INNER)
 def _interpolate_knots(knots, place, warp):  # type: ignore[no-untyped-def]
     """Fill the warp (6,) that lies at a coordinate among the knots (J, 6)."""
     at = int(place)
@@ -278,12 +284,12 @@ def _interpolate_knots(knots, place, warp):  # type: ignore[no-untyped-def]
             warp[c] += share * (knots[at + 1, c] - knots[at, c])
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
+@nb.njit(cache=True, nogil=True, fastmath=_FAST)
 def _best_warps(  # type: ignore[no-untyped-def]
-    grey, mask, left_of_mask, top_of_mask, image, xy, knots, knot_coordinates, radius, stride, separation, zncc_min,
-    best, zncc, second_peak, index,
+    first, last, grey, mask, left_of_mask, top_of_mask, image, xy, knots, knot_coordinates,
+    radius, stride, separation, zncc_min, best, zncc, second_peak, index,
 ):  # fmt: skip
-    """Find the best of each point's K warps; fills best (n, 6), zncc, second_peak and index (n,).
+    """Find the best of each point's K warps; fills best (n, 6), zncc, second_peak and index (n,) from first to last.
 
     grey, image : the whole reference and current images; xy : (n, 2) px in the reference; mask : (h, w) bool of the box
     whose corner is given, or empty. From ``_MANY`` warps on, all of them are first compared on a quarter of the pixels
@@ -291,7 +297,7 @@ def _best_warps(  # type: ignore[no-untyped-def]
     score; the others are compared bilinearly on all pixels.
     """
     count, flat = len(knot_coordinates), image.ravel()
-    for k in nb.prange(xy.shape[0]):
+    for k in range(first, last):
         x0, y0 = xy[k, 0], xy[k, 1]
         jx, iy = math.floor(x0 + 0.5), math.floor(y0 + 0.5)
         most = (2 * (radius // stride) + 1) ** 2

@@ -25,6 +25,7 @@ import numba as nb
 import numpy as np
 
 from ringdic.correlation.lanes import (
+    INNER,
     LANES,
     WINDOW,
     absolute,
@@ -46,7 +47,7 @@ REACH_OF_WINDOW = WINDOW - 1 - 5  # px that a vector's positions may span so tha
 _F, _U = np.float32, np.uint64
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _cubic(t):  # type: ignore[no-untyped-def]
     """Weights of the cubic B-spline at the taps -1 … 2 for a fraction t, times 6."""
     s, t2 = _F(1) - t, t * t
@@ -54,7 +55,7 @@ def _cubic(t):  # type: ignore[no-untyped-def]
     return s2 * s, t2 * (_F(3) * t - _F(6)) + _F(4), s2 * (_F(3) * s - _F(6)) + _F(4), t2 * t
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _quintic(t):  # type: ignore[no-untyped-def]
     """Weights of the quintic B-spline at the taps -2 … 3 for a fraction t, times 120.
 
@@ -71,7 +72,7 @@ def _quintic(t):  # type: ignore[no-untyped-def]
     return a, outer + v, inner - u, inner + u, outer - v, f
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _cubic_across(t):  # type: ignore[no-untyped-def]
     """Weights of the cubic B-spline at five taps for t in [0, 2), which may lie in either of two pixel intervals."""
     k, zero = t >= _F(1), _F(0)
@@ -79,7 +80,7 @@ def _cubic_across(t):  # type: ignore[no-untyped-def]
     return blend(k, zero, a), blend(k, a, b), blend(k, b, c), blend(k, c, d), blend(k, d, zero)
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _quintic_across(t):  # type: ignore[no-untyped-def]
     """Weights of the quintic B-spline at seven taps for t in [0, 2), which may lie in either of two pixel intervals."""
     k, zero = t >= _F(1), _F(0)
@@ -88,19 +89,19 @@ def _quintic_across(t):  # type: ignore[no-untyped-def]
     return first, second, third, blend(k, c, d), blend(k, d, e), blend(k, e, f), blend(k, f, zero)
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def maximum(one, other):  # type: ignore[no-untyped-def]
     """The larger of two vectors ``one`` and ``other``, lane by lane."""
     return blend(one >= other, one, other)
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _positive(t):  # type: ignore[no-untyped-def]
     """Each lane of t, or 0 where it is negative."""
     return blend(t >= _F(0), t, _F(0))
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _cubic_at(t):  # type: ignore[no-untyped-def]
     """Cubic B-spline at any distance t, times 6."""
     a = absolute(t)
@@ -108,7 +109,7 @@ def _cubic_at(t):  # type: ignore[no-untyped-def]
     return two * two * two - _F(4) * (one * one * one)
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _quintic_at(t):  # type: ignore[no-untyped-def]
     """Quintic B-spline at any distance t, times 120."""
     a = absolute(t)
@@ -117,7 +118,7 @@ def _quintic_at(t):  # type: ignore[no-untyped-def]
     return three2 * three2 * three - _F(6) * (two2 * two2 * two) + _F(15) * (one2 * one2 * one)
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _cubic_slope(t):  # type: ignore[no-untyped-def]
     """Derivative by t of the weights of ``_cubic``."""
     s = _F(1) - t
@@ -126,7 +127,7 @@ def _cubic_slope(t):  # type: ignore[no-untyped-def]
     return a, b, -a - b - d, d
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _quintic_slope(t):  # type: ignore[no-untyped-def]
     """Derivative by t of the weights of ``_quintic``."""
     s, t2 = _F(1) - t, t * t
@@ -137,25 +138,25 @@ def _quintic_slope(t):  # type: ignore[no-untyped-def]
     return a, b, c, d, -a - b - c - d - f, f
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _row4(c, p, w):  # type: ignore[no-untyped-def]
     """Weighted sum of 4 taps of a row, w their weights."""
     return w[0] * load(c, p) + w[1] * load(c, p + _U(1)) + w[2] * load(c, p + _U(2)) + w[3] * load(c, p + _U(3))
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _row5(c, p, w):  # type: ignore[no-untyped-def]
     """Weighted sum of 5 taps of a row, w their weights."""
     return _row4(c, p, w) + w[4] * load(c, p + _U(4))
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _row6(c, p, w):  # type: ignore[no-untyped-def]
     """Weighted sum of 6 taps of a row, w their weights."""
     return _row5(c, p, w) + w[5] * load(c, p + _U(5))
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _row7(c, p, w):  # type: ignore[no-untyped-def]
     """Weighted sum of 7 taps of a row, w their weights."""
     return _row6(c, p, w) + w[6] * load(c, p + _U(6))
@@ -164,7 +165,7 @@ def _row7(c, p, w):  # type: ignore[no-untyped-def]
 def _make_sum(row: Any, taps: int) -> Any:
     """Compile the weighted sum over a number of rows, each with the taps of ``row``."""
 
-    @nb.njit(forceinline=True, fastmath=FAST)
+    @nb.njit(forceinline=True, fastmath=FAST, **INNER)
     def spline(c, p, stride, wx, wy):  # type: ignore[no-untyped-def]
         out = wy[0] * row(c, p, wx) + wy[1] * row(c, p + stride, wx)
         out += wy[2] * row(c, p + _U(2) * stride, wx) + wy[3] * row(c, p + _U(3) * stride, wx)
@@ -183,8 +184,8 @@ _c44, _c54, _c45, _c55 = _make_sum(_row4, 4), _make_sum(_row5, 4), _make_sum(_ro
 _q66, _q76, _q67, _q77 = _make_sum(_row6, 6), _make_sum(_row7, 6), _make_sum(_row6, 7), _make_sum(_row7, 7)
 
 
-@nb.njit(fastmath=FAST, nogil=True, cache=True)
-def _wide(c, p, stride, tx, sx, qx, ty, sy, qy, rows, quintic, g):  # type: ignore[no-untyped-def]
+@nb.njit(fastmath=FAST, nogil=True, cache=True, **INNER)
+def _wide(c, p, stride, tx, sx, qx, ty, sy, qy, rows, cubic, g):  # type: ignore[no-untyped-def]
     """Interpolate pixels that lie within 32 coefficients of a row, taps picked by permutation, into LANES numbers at g.
 
     rows : how many rows of coefficients the pixels reach over, besides those of the taps.
@@ -193,7 +194,7 @@ def _wide(c, p, stride, tx, sx, qx, ty, sy, qy, rows, quintic, g):  # type: igno
     x, y = e * (e * qx + sx) + tx + e, e * (e * qy + sy) + ty
     whole = floor(x)
     out, t = ramp(c) * _F(0), x - whole
-    if quintic:
+    if cubic is None:
         w, row = _quintic(t), y + _F(2)
         for _ in range(rows + _U(6)):
             taps = w[0] * lookup(c, p, whole) + w[1] * lookup(c, p, whole + _F(1)) + w[2] * lookup(c, p, whole + _F(2))
@@ -212,8 +213,8 @@ def _wide(c, p, stride, tx, sx, qx, ty, sy, qy, rows, quintic, g):  # type: igno
     store(g, _U(0), out)
 
 
-@nb.njit(fastmath=FAST, nogil=True, cache=True)
-def _scattered(c, p, stride, tx, sx, qx, ty, sy, qy, quintic, g):  # type: ignore[no-untyped-def]
+@nb.njit(fastmath=FAST, nogil=True, cache=True, **INNER)
+def _scattered(c, p, stride, tx, sx, qx, ty, sy, qy, cubic, g):  # type: ignore[no-untyped-def]
     """Interpolate pixels anywhere, one after the other, into LANES numbers at g."""
     for lane in range(LANES):
         e = _F(lane)
@@ -221,7 +222,7 @@ def _scattered(c, p, stride, tx, sx, qx, ty, sy, qy, quintic, g):  # type: ignor
         i, j = math.floor(y), math.floor(x)
         first = _U(np.int64(p) + np.int64(lane) + np.int64(i) * np.int64(stride) + np.int64(j))
         out = x * _F(0)
-        if quintic:
+        if cubic is None:
             wx, wy = _quintic(x - _F(j)), _quintic(y - _F(i))
             for k in range(6):
                 for m in range(6):
@@ -234,56 +235,63 @@ def _scattered(c, p, stride, tx, sx, qx, ty, sy, qy, quintic, g):  # type: ignor
         store_one(g, lane, out)
 
 
-@nb.njit(nogil=True, cache=True)
-def _general(c, p, stride, case, tx, sx, qx, ty, sy, qy, quintic, g):  # type: ignore[no-untyped-def]
+@nb.njit(nogil=True, cache=True, **INNER)
+def _general(c, p, stride, case, tx, sx, qx, ty, sy, qy, cubic, g):  # type: ignore[no-untyped-def]
     """Interpolate by ``_wide`` or ``_scattered``, as the case demands."""
     if case == SCATTERED:
-        _scattered(c, p, stride, tx, sx, qx, ty, sy, qy, quintic, g)
+        _scattered(c, p, stride, tx, sx, qx, ty, sy, qy, cubic, g)
     else:
-        _wide(c, p, stride, tx, sx, qx, ty, sy, qy, _U(case - WIDE), quintic, g)
+        _wide(c, p, stride, tx, sx, qx, ty, sy, qy, _U(case - WIDE), cubic, g)
 
 
-def make_interpolation(quintic: bool) -> Any:
+def make_interpolation(quintic: bool) -> tuple[Any, Any]:
     """Compile the interpolation with a cubic or a quintic B-spline.
 
-    The function that it returns gives the grey levels of LANES pixels of the current image, for any of the cases.
+    The functions that it returns give the grey levels of LANES pixels of the current image, in the scale of the
+    weights: the first one for case 0, the second for all others.
     """
     weights, across = (_quintic, _quintic_across) if quintic else (_cubic, _cubic_across)
+    cubic = None if quintic else True
     still, over_x, over_y, over = (_q66, _q76, _q67, _q77) if quintic else (_c44, _c54, _c45, _c55)
 
-    @nb.njit(forceinline=True, fastmath=FAST)
-    def interpolate(c, p, stride, case, tx, sx, qx, ty, sy, qy, spare):  # type: ignore[no-untyped-def]
-        """Grey levels of LANES pixels of the current image, in the scale of the weights.
+    @nb.njit(forceinline=True, fastmath=FAST, **INNER)
+    def inside(c, p, stride, tx, sx, qx, ty, sy, qy):  # type: ignore[no-untyped-def]
+        """Grey levels of LANES pixels whose fractions all lie in [0, 1). p : index of the first tap of lane 0."""
+        e = ramp(c)
+        x, y = e * (e * qx + sx) + tx, e * (e * qy + sy) + ty
+        return still(c, p, stride, weights(x), weights(y))
+
+    @nb.njit(forceinline=True, fastmath=FAST, **INNER)
+    def crossing(c, p, stride, case, tx, sx, qx, ty, sy, qy, spare):  # type: ignore[no-untyped-def]
+        """Grey levels of LANES pixels whose fractions do not all lie in [0, 1).
 
         p : index of the first tap of lane 0 for t in [0, 1). case : what the lanes cross, as ``_locate_vectors`` of the
             kernels computes it. spare : pointer to LANES numbers of scratch.
         """
         e = ramp(c)
         x, y = e * (e * qx + sx) + tx, e * (e * qy + sy) + ty
-        if case == 0:
-            g = still(c, p, stride, weights(x), weights(y))
-        elif case == ACROSS_X:
+        if case == ACROSS_X:
             g = over_x(c, p, stride, across(x), weights(y))
         elif case == ACROSS_Y:
             g = over_y(c, p, stride, weights(x), across(y))
         elif case == ACROSS_X + ACROSS_Y:
             g = over(c, p, stride, across(x), across(y))
         else:
-            _general(c, p, stride, case, tx, sx, qx, ty, sy, qy, quintic, spare)
+            _general(c, p, stride, case, tx, sx, qx, ty, sy, qy, cubic, spare)
             g = load(spare, _U(0))
         return g
 
-    return interpolate
+    return inside, crossing
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
-def value_and_gradient(c, p, stride, tx, ty, quintic):  # type: ignore[no-untyped-def]
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
+def value_and_gradient(c, p, stride, tx, ty, cubic):  # type: ignore[no-untyped-def]
     """Grey level f and its derivatives ∂f/∂x and ∂f/∂y of LANES pixels of a row with the same fractions of position.
 
     c : pointer to the coefficients, rows ``stride`` apart. p : index of the pixel to the upper left of the first one.
-    tx, ty : fractions of the positions, in px. quintic : whether the spline is of degree 5, else 3.
+    tx, ty : fractions of the positions, in px. cubic : True for a spline of degree 3, None for degree 5.
     """
-    if quintic:
+    if cubic is None:
         p -= _U(2) * stride + _U(2)
         wx, wy, sx, sy = _quintic(tx), _quintic(ty), _quintic_slope(tx), _quintic_slope(ty)
         f = _q66(c, p, stride, wx, wy) * _F(1 / 14400)

@@ -9,10 +9,12 @@ are six. Criterion: zero-mean normalised sum of squared differences; scheme: Bak
 
 Structure. A subset is packed once into vectors of LANES pixels of one row (``subset``): the grey level f and its
 gradient, zero for pixels outside the subset or the mask, so that a circle and a mask cost nothing. An iteration first
-computes the position of every vector in the current image (``_locate_vectors``). One pass over the vectors then
-interpolates the grey levels g (``interpolation``) and adds them to all the sums that a step needs (``_accumulate``); no
-value of a pixel is stored. The Hessian comes from the moments Σ q dx^i dy^k of products q of the gradients; no
-steepest-descent image is stored either.
+computes the position of every vector in the current image (``_locate_vectors``). Then it interpolates the grey levels g
+(``interpolation``) and adds them to all the sums that a step needs (``level_sums``). The Hessian comes from the moments
+Σ q dx^i dy^k of products q of the gradients; no steepest-descent image is stored.
+
+Variants. The order and the degree are given by types: ``second`` is True or None, and so is ``cubic``. The compiler
+leaves out what only a value other than None needs, and compiles the functions anew for each of the combinations in use.
 
 Precision. With float32 images, fractions of pixels resolve 1e-7 px; f and g are taken about a level near their mean;
 lanes are summed in single precision over a strip of the subset, everything after that in double. With float64 images
@@ -25,7 +27,6 @@ The page ``docs/pages/kernels.md`` says why it is built so and what each part ga
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numba as nb
 import numpy as np
@@ -37,29 +38,23 @@ from ringdic.correlation.interpolation import (
     REACH_OF_WINDOW,
     SCATTERED,
     WIDE,
-    make_interpolation,
     maximum,
 )
 from ringdic.correlation.lanes import (
     BITS,
+    INNER,
     LANES,
     blend,
     floor,
-    lane_sum,
     load,
-    mask_from_bits,
     pointer,
-    ramp,
     store,
     store_integers,
 )
+from ringdic.correlation.level_sums import sum_levels
 from ringdic.correlation.spline import PAD
 from ringdic.correlation.subset import (
-    GX,
-    GY,
     MOMENTS,
-    REF,
-    add_to_row,
     centre_level,
     moments,
     normal_matrix,
@@ -82,7 +77,7 @@ _SAMPLE = 4  # points of a chunk that must have made two steps before another ma
 _SIMILAR = 2.0  # largest 1 - ZNCC of a point that may stop after one step, times the mean of those points
 _JUDGED_FROM = 6  # steps from which on a point is given up that will not converge in the steps left
 _SPAN = 3  # steps over which the speed of convergence is then judged
-_CHUNK = 64  # points that share their scratch memory
+CHUNK = 64  # points among which a start value is handed on
 _RELIABLE = 0.9  # least ZNCC of a match that the next point may start from
 _PAD = PAD
 
@@ -128,13 +123,13 @@ def _locate_vectors(fx, fy, p, corner, n, place, cell):  # type: ignore[no-untyp
         store(shape, v + step + step + step, sy)
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _minimum(one, other):  # type: ignore[no-untyped-def]
     """The smaller of two vectors, lane by lane."""
     return blend(one >= other, other, one)
 
 
-@nb.njit(nogil=True, cache=True)
+@nb.njit(nogil=True, cache=True, **INNER)
 def _clearly_inside(shape, x, y, p, reach):  # type: ignore[no-untyped-def]
     """Whether all pixels within ``reach`` of the centre certainly lie inside the current image.
 
@@ -147,7 +142,7 @@ def _clearly_inside(shape, x, y, p, reach):  # type: ignore[no-untyped-def]
     return x0 > reach_x and y0 > reach_y and x0 + reach_x < last_x and y0 + reach_y < last_y
 
 
-@nb.njit(nogil=True, cache=True)
+@nb.njit(nogil=True, cache=True, **INNER)
 def _all_pixels_inside(shape, x, y, p, corner, bits):  # type: ignore[no-untyped-def]
     """Whether the pixels of the subset lie in the current image, and the other lanes of its vectors in the padding.
 
@@ -166,87 +161,7 @@ def _all_pixels_inside(shape, x, y, p, corner, bits):  # type: ignore[no-untyped
     return True
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
-def _by_power(at, row, x, q0, q1, q2, second):  # type: ignore[no-untyped-def]
-    """Add a strip's sums of q φ to three rows of scratch, to six for second order; q_k : Σ q dy^k of each lane."""
-    qx = q0 * x
-    add_to_row(at, row, q0)
-    add_to_row(at, row + 1, qx)
-    add_to_row(at, row + 2, q1)
-    if second:
-        add_to_row(at, row + 3, _F(0.5) * (qx * x))
-        add_to_row(at, row + 4, q1 * x)
-        add_to_row(at, row + 5, _F(0.5) * q2)
-
-
-def _make_pass(quintic: bool, second: bool) -> Any:
-    """Compile the pass over a subset for one degree of the spline and one order of the shape functions."""
-    interpolate = make_interpolation(quintic)
-
-    @nb.njit(fastmath=FAST, nogil=True)
-    def accumulate(  # type: ignore[no-untyped-def]
-        coef, stride, origin, place, cell, bend, px, bits, corner, strips, level, scratch, sums
-    ):  # fmt: skip
-        """Interpolate the subset in the current image, g about ``level``, and sum what a step needs.
-
-        coef : flat coefficients; origin : index of the centre's first tap; place, cell : of the vectors; bend : (2,),
-        their quadratic terms; px, bits, corner, strips : the packed subset; scratch : (17, LANES). sums : (16,),
-        filled: Σg, Σg², Σfg, unused, then Σ g ∂f/∂x φ_k (6) and Σ g ∂f/∂y φ_k (6) with φ = 1 dx dy dx²/2 dxdy dy²/2.
-        """
-        ref, gx, gy = pointer(px[REF]), pointer(px[GX]), pointer(px[GY])
-        c, at_sum, spare, qx, qy = pointer(coef), pointer(scratch), pointer(scratch[16]), bend[0], bend[1]
-        scratch[:] = 0.0
-        for s in range(strips.shape[0] - 1):
-            sg = sgg = sfg = a0 = a1 = a2 = b0 = b1 = b2 = ramp(c) * _F(0)
-            for v in range(_U(strips[s]), _U(strips[s + 1])):
-                at, y = v * _L, corner[1, v]
-                p = _U(origin + np.int64(cell[1, v]) * np.int64(stride) + np.int64(cell[0, v]))
-                tx, sx, ty, sy = place[0, v], place[1, v], place[2, v], place[3, v]
-                g = interpolate(c, p, stride, cell[2, v], tx, sx, qx, ty, sy, qy, spare)
-                g = blend(mask_from_bits(bits[v]), g - level, _F(0))
-                sg += g
-                sgg += g * g
-                sfg += g * load(ref, at)
-                ga, gb = g * load(gx, at), g * load(gy, at)
-                a0 += ga
-                b0 += gb
-                a1 += ga * y
-                b1 += gb * y
-                if second:
-                    a2 += ga * (y * y)
-                    b2 += gb * (y * y)
-            x = ramp(c) + corner[0, strips[s]]
-            add_to_row(at_sum, 0, sg)
-            add_to_row(at_sum, 1, sgg)
-            add_to_row(at_sum, 2, sfg)
-            _by_power(at_sum, 4, x, a0, a1, a2, second)
-            _by_power(at_sum, 10, x, b0, b1, b2, second)
-        for k in range(16):
-            if k < 3 or k in (4, 5, 6, 10, 11, 12) or (second and k > 3):
-                sums[k] = lane_sum(load(at_sum, _U(k) * _L))
-
-    return accumulate
-
-
-_cubic_first, _cubic_second = _make_pass(False, False), _make_pass(False, True)
-_quintic_first, _quintic_second = _make_pass(True, False), _make_pass(True, True)
-
-
-@nb.njit(nogil=True, cache=True)
-def _accumulate(quintic, second, *given):  # type: ignore[no-untyped-def]
-    """Run the pass over a subset that is compiled for this degree and order."""
-    if quintic:
-        if second:
-            _quintic_second(*given)
-        else:
-            _quintic_first(*given)
-    elif second:
-        _cubic_second(*given)
-    else:
-        _cubic_first(*given)
-
-
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, **INNER)
 def _step(H, sums, sum_J, sum_fJ, mean_g, ratio, terms, b, d):  # type: ignore[no-untyped-def]
     """Increment d (12,) of the parameters from the sums of one pass; returns by how much it lowers the sum of squares.
 
@@ -264,16 +179,16 @@ def _step(H, sums, sum_J, sum_fJ, mean_g, ratio, terms, b, d):  # type: ignore[n
     return gain
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, **INNER)
 def _step_square(d, radius):  # type: ignore[no-untyped-def]
     """Mean square displacement, px², of the subset's rim under an increment d (12,)."""
     r2 = float(radius * radius)
-    first = d[1] ** 2 + d[2] ** 2 + d[7] ** 2 + d[8] ** 2
-    second = d[3] ** 2 + d[5] ** 2 + d[9] ** 2 + d[11] ** 2 + 4 * (d[4] ** 2 + d[10] ** 2)
-    return d[0] ** 2 + d[6] ** 2 + r2 * first + 0.25 * r2 * r2 * second
+    first = d[1] * d[1] + d[2] * d[2] + d[7] * d[7] + d[8] * d[8]
+    second = d[3] * d[3] + d[5] * d[5] + d[9] * d[9] + d[11] * d[11] + 4 * (d[4] * d[4] + d[10] * d[10])
+    return d[0] * d[0] + d[6] * d[6] + r2 * first + 0.25 * r2 * r2 * second
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, **INNER)
 def _next_step_square(step_square, previous, second, unlike, convergence):  # type: ignore[no-untyped-def]
     """Predicted square of the next step's length, from the squares of the last step and of the one before (0 for none).
 
@@ -295,10 +210,10 @@ def _next_step_square(step_square, previous, second, unlike, convergence):  # ty
     return step_square * min(_SLOWER * shrinkage, 1.0) ** 2
 
 
-@nb.njit(forceinline=True, nogil=True)
+@nb.njit(forceinline=True, nogil=True, **INNER)
 def _refine_point(  # type: ignore[no-untyped-def]
     image, gx, gy, coef_ref, stride_ref, mask, shape_ref, coef, shape, x_ref, y_ref, x_cur, y_cur, p,
-    corner, corner_f, offset, uncut, strips, radius, terms, quintic, tolerance, max_iterations, texture, noise,
+    corner, corner_f, offset, uncut, strips, radius, second, cubic, tolerance, max_iterations, texture, noise,
     cache, cached, cache_row, convergence, px, bits, place, cell, bend, lanes, H, moment, vectors, A, B,
 ):  # fmt: skip
     """Refine the parameters p (12,) of one subset in place by IC-GN.
@@ -313,16 +228,15 @@ def _refine_point(  # type: ignore[no-untyped-def]
     One function of more than a screen on purpose: it is inlined into the loop over the points (a call would hand over
     some forty arrays, a twentieth of a point's time), and its parts share nearly all of their variables.
     """
-    n, size, second, kind = corner.shape[1], 2 * terms, terms == 6, px.dtype.type
+    n, terms, kind = corner.shape[1], 3 if second is None else 6, px.dtype.type
+    size = 2 * terms
     sums, sum_J, sum_fJ, b, d = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4]
     d[:] = 0.0
     column, row = math.floor(x_ref), math.floor(y_ref)
     level = centre_level(image, shape_ref, x_ref, y_ref)
     direct = x_ref == column and y_ref == row and well_inside(shape_ref, x_ref, y_ref, radius)
     if not direct:
-        pack(
-            image, gx, gy, coef_ref, stride_ref, mask, shape_ref, x_ref, y_ref, radius, quintic, corner, uncut, px, bits
-        )
+        pack(image, gx, gy, coef_ref, stride_ref, mask, shape_ref, x_ref, y_ref, radius, cubic, corner, uncut, px, bits)
     at_centre = row * shape_ref[1] + column
     if cache_row >= 0 and cached[cache_row]:
         if direct:
@@ -348,9 +262,9 @@ def _refine_point(  # type: ignore[no-untyped-def]
             write_cache(cache[cache_row], size, H, sum_J, sum_fJ, mean_f, norm_f, pixels)
             cached[cache_row] = True
 
-    stride, first_tap = _U(shape[1]), 2 if quintic else 1
+    stride, first_tap = _U(shape[1]), 2 if cubic is None else 1
     rounding = _ROUNDING if px.itemsize == 4 else 0.0
-    about = (level + mean_f) * (14400.0 if quintic else 36.0)  # in the scale of the interpolated g
+    about = (level + mean_f) * (14400.0 if cubic is None else 36.0)  # in the scale of the interpolated g
     status, zncc, iterations, previous = NO_CONVERGENCE, np.nan, 0, 0.0
     limit, earlier = tolerance * tolerance, (np.inf, np.inf)
     for _ in range(max_iterations):
@@ -364,8 +278,8 @@ def _refine_point(  # type: ignore[no-untyped-def]
         origin = (row + _PAD - first_tap) * shape[1] + column + _PAD - first_tap
         bend[0], bend[1] = 0.5 * p[3], 0.5 * p[9]
         about = float(kind(about))
-        _accumulate(
-            quintic, second,
+        sum_levels(
+            cubic, second,
             coef, stride, origin, place, cell, bend, px, bits, corner_f, strips, kind(about), lanes, sums,
         )  # fmt: skip
         mean_g = sums[0] / pixels
@@ -379,7 +293,11 @@ def _refine_point(  # type: ignore[no-untyped-def]
         step_square = _step_square(d, radius)
         if not step_square < 4.0 * radius * radius:
             break
-        if not (compose_inverse(p, d, A, B) if second else compose_inverse_affine(p, d)):
+        if second is not None:
+            composed = compose_inverse(p, d, A, B)
+        else:
+            composed = compose_inverse_affine(p, d)
+        if not composed:
             break
         next_square = _next_step_square(step_square, previous, iterations == 2, 1.0 - zncc, convergence)
         if next_square < limit or 0.0 < previous <= step_square < rounding * rounding:
@@ -402,7 +320,7 @@ def _refine_point(  # type: ignore[no-untyped-def]
     return status, zncc, iterations, sigma_u, scatter * math.sqrt(variance(H, b, size, terms))
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, **INNER)
 def _start_from_previous(source, offset, reach, p):  # type: ignore[no-untyped-def]
     """Replace the start values p (12,) by another point's match, extrapolated by an offset (2,) px, if the two agree.
 
@@ -418,10 +336,11 @@ def _start_from_previous(source, offset, reach, p):  # type: ignore[no-untyped-d
         q[at + 1] += xx * dx + xy * dy
         q[at + 2] += xy * dx + yy * dy
     if abs(q[0] - p[0]) < 1.0 and abs(q[6] - p[6]) < 1.0:
-        p[:] = q
+        for k in range(12):
+            p[k] = q[k]
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, **INNER)
 def _scratch(rows, columns, kind):  # type: ignore[no-untyped-def]
     """Scratch array (rows, columns) of the type of ``kind``, aligned to 64 bytes.
 
@@ -432,22 +351,24 @@ def _scratch(rows, columns, kind):  # type: ignore[no-untyped-def]
     return raw[skip : skip + rows * columns].reshape(rows, columns)
 
 
-@nb.njit(cache=True, nogil=True, parallel=True)
+@nb.njit(cache=True, nogil=True)
 def refine_points(  # type: ignore[no-untyped-def]
-    image, gx, gy, coef_ref, mask, origin_ref, coef, origin_cur, xy, order, parameters, known,
-    radius, circle, terms, quintic, tolerance, max_iterations, texture, noise, neighbour_reach,
+    first, last, image, gx, gy, coef_ref, mask, origin_ref, coef, origin_cur, xy, order, parameters, known,
+    radius, circle, second, cubic, tolerance, max_iterations, texture, noise, neighbour_reach,
     cache, cached, cache_row, status, zncc, iterations, sigma,
 ):  # fmt: skip
-    """IC-GN of many subsets in parallel, in independent chunks, so that results do not depend on the number of threads.
+    """IC-GN of the points of some chunks. These are independent: results do not depend on the number of threads.
 
     Parameters
     ----------
+    first, last : of the chunks of CHUNK points in ``order``, the last one exclusive.
     image, gx, gy, mask : (h, w), grey levels, their gradient and the mask of the reference's crop at origin_ref (x, y).
     coef_ref : padded coefficients of that crop. coef : padded coefficients of the current image's crop at origin_cur.
     xy : (n, 2) px, points. order : (n,), the order in which they are taken.
     parameters : (n, 12), start values, replaced by the results. known : (n,) bool, points to refine.
     radius, circle : of the subset, px, and whether it is a circle or a square.
-    terms : free parameters of each displacement, 3 or 6. quintic : whether the spline is of degree 5, else 3.
+    second : True for shape functions of second order, None for first. cubic : True for a spline of degree 3, None for
+        degree 5.
     tolerance : px, of a step's effect on the subset's rim. max_iterations : after which a point is given up.
     texture : least root-mean-square gradient. noise : standard deviation of the grey levels, 0 to take it from the
         residual.
@@ -461,16 +382,17 @@ def refine_points(  # type: ignore[no-untyped-def]
     flat_ref, flat, n = coef_ref.ravel(), coef.ravel(), corner.shape[1]
     m = (n + LANES - 1) // LANES * LANES
     corner_f = np.zeros((2, m), coef.dtype)
-    corner_f[:, :n] = corner
+    for v in range(n):
+        corner_f[0, v], corner_f[1, v] = corner[0, v], corner[1, v]
     offset = corner[1] * image.shape[1] + corner[0]
     image_, gx_, gy_, mask_ = image.ravel(), gx.ravel(), gy.ravel(), mask.ravel()
-    for chunk in nb.prange((xy.shape[0] + _CHUNK - 1) // _CHUNK):
-        px, place, lanes = _scratch(3, n * LANES, flat), _scratch(4, m, flat), _scratch(MOMENTS, LANES, flat)
-        bits, cell, bend = np.empty(n, BITS), np.empty((3, m), np.int32), np.empty(2, coef.dtype)
-        H, moment, vectors = np.empty((2 * terms, 2 * terms)), np.empty((7, 15)), np.empty((5, 16))
-        A, B = np.empty((6, 6)), np.empty((6, 6))
+    px, place, lanes = _scratch(4, n * LANES, flat), _scratch(4, m, flat), _scratch(MOMENTS, LANES, flat)
+    bits, cell, bend = np.empty(n, BITS), np.empty((3, m), np.int32), np.empty(2, coef.dtype)
+    H, moment, vectors = np.empty((12, 12)), np.empty((7, 15)), np.empty((5, 16))
+    A, B = np.empty((6, 6)), np.empty((6, 6))
+    for chunk in range(first, last):
         before, convergence = -1, np.zeros(3)
-        for k in order[chunk * _CHUNK : (chunk + 1) * _CHUNK]:
+        for k in order[chunk * CHUNK : (chunk + 1) * CHUNK]:
             if known[k]:
                 if before >= 0:
                     _start_from_previous(parameters[before], xy[k] - xy[before], neighbour_reach, parameters[k])
@@ -478,7 +400,7 @@ def refine_points(  # type: ignore[no-untyped-def]
                     image_, gx_, gy_, flat_ref, _U(coef_ref.shape[1]), mask_, image.shape, flat, coef.shape,
                     xy[k, 0] - origin_ref[0], xy[k, 1] - origin_ref[1], xy[k, 0] - origin_cur[0],
                     xy[k, 1] - origin_cur[1], parameters[k], corner, corner_f, offset, uncut, strips,
-                    radius, terms, quintic, tolerance, max_iterations, texture, noise,
+                    radius, second, cubic, tolerance, max_iterations, texture, noise,
                     cache, cached, cache_row[k], convergence,
                     px, bits, place, cell, bend, lanes, H, moment, vectors, A, B,
                 )  # fmt: skip

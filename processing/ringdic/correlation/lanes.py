@@ -33,9 +33,11 @@ def _avx512() -> bool:
 
 _AVX512 = _avx512()
 LANES = 16 if _AVX512 and get_host_cpu_name() != "znver4" else 8
+FEW_REGISTERS = not _AVX512  # 16 vector registers; with AVX-512 there are 32
 WINDOW = 32  # numbers that ``lookup`` reaches
 BITS = np.uint16 if LANES == 16 else np.uint8  # one bit a lane
 _BITS = types.uint16 if LANES == 16 else types.uint8
+INNER: Any = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # kernels that only kernels call compile faster so
 intrinsic: Any = extending.intrinsic  # typed Any: its declared type hides the arguments of the functions it defines
 _FLAGS = ("contract", "reassoc", "arcp", "nsz")  # sums may be reordered; NaN is respected
 _INDEX = ir.VectorType(ir.IntType(32), LANES)

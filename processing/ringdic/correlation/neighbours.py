@@ -13,6 +13,8 @@ import numpy as np
 import scipy
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels
+from ringdic.correlation.lanes import INNER
+from ringdic.correlation.parallel import in_ranges
 
 COUNT = 8
 _AROUND = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
@@ -20,6 +22,7 @@ _MOST_CELLS = 64  # per point, of a grid that neighbours are read from; those of
 _MIN_DEVIATION = 0.5  # px; smaller deviations from the neighbours are never outliers
 _MAX_SCATTER_RATIO = 8.0  # deviation of an outlier, in standard deviations of all deviations
 _MIN_ISLAND = 4  # points of the smallest group that remains
+_LEAST = 1000  # points that are worth a thread
 
 
 def point_neighbours(xy: Pixels, step: float) -> Indices:
@@ -87,7 +90,7 @@ def inconsistent_points(
     -------
     bad : (n,) bool.
     """
-    _deviations(xy, parameters, good, near, stale, deviation)
+    in_ranges(_deviations, len(xy), xy, parameters, good, near, stale, deviation, least=_LEAST)
     stale[:] = False
     known = np.isfinite(deviation)
     scatter = 1.4826 * np.median(deviation[known]) if known.any() else 0.0
@@ -95,10 +98,13 @@ def inconsistent_points(
     bad = known & (deviation > limit)
     if bad.any():
         return bad
-    return _islands(xy, parameters, good, near, 2.0 * limit, _MIN_ISLAND)
+    islands = np.zeros(len(xy), bool)
+    if _has_large_group(xy, parameters, good, near, 2.0 * limit, 4 * _MIN_ISLAND):
+        in_ranges(_islands, len(xy), xy, parameters, good, near, 2.0 * limit, _MIN_ISLAND, islands, least=_LEAST)
+    return islands
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, **INNER)
 def _extrapolate_displacement(xy, parameters, source, target, at):  # type: ignore[no-untyped-def]
     """Displacement along x (at 0) or y (at 6) at one point, extrapolated from another."""
     dx, dy, p, s = xy[target, 0] - xy[source, 0], xy[target, 1] - xy[source, 1], parameters, source
@@ -106,13 +112,13 @@ def _extrapolate_displacement(xy, parameters, source, target, at):  # type: igno
     return p[s, at] + p[s, at + 1] * dx + p[s, at + 2] * dy + curved
 
 
-@nb.njit(cache=True, nogil=True, parallel=True)
-def _deviations(xy, parameters, good, near, stale, deviation):  # type: ignore[no-untyped-def]
+@nb.njit(cache=True, nogil=True)
+def _deviations(first, last, xy, parameters, good, near, stale, deviation):  # type: ignore[no-untyped-def]
     """Fill deviation (n,) px, the distance of good points from the median of their neighbours' extrapolations.
 
-    NaN without any. Only points that are stale (n,) or have a stale neighbour are computed.
+    NaN without any. Only points from ``first`` to ``last`` that are stale (n,) or have a stale neighbour are computed.
     """
-    for k in nb.prange(len(xy)):
+    for k in range(first, last):
         changed = stale[k]
         for slot in range(near.shape[1]):
             changed |= near[k, slot] >= 0 and stale[near[k, slot]]
@@ -133,7 +139,7 @@ def _deviations(xy, parameters, good, near, stale, deviation):  # type: ignore[n
             deviation[k] = math.hypot(parameters[k, 0] - u, parameters[k, 6] - v)
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, **INNER)
 def _median(values, count):  # type: ignore[no-untyped-def]
     """Median of the first ``count`` values, without sorting and without branches that a processor cannot predict."""
     low, high = 0.0, 0.0
@@ -146,7 +152,7 @@ def _median(values, count):  # type: ignore[no-untyped-def]
     return 0.5 * (low + high)
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, **INNER)
 def _agree(xy, parameters, one, other, limit):  # type: ignore[no-untyped-def]
     """Whether one of two points lies within ``limit`` px of where the other's extrapolation puts it."""
     for source, target in ((one, other), (other, one)):
@@ -157,7 +163,7 @@ def _agree(xy, parameters, one, other, limit):  # type: ignore[no-untyped-def]
     return False
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, **INNER)
 def _connected_count(xy, parameters, good, near, limit, k, members, max_count):  # type: ignore[no-untyped-def]
     """Number of good points in the connected group of point k, ``max_count`` if there are more.
 
@@ -180,24 +186,22 @@ def _connected_count(xy, parameters, good, near, limit, k, members, max_count): 
     return count
 
 
-@nb.njit(cache=True, nogil=True, parallel=True)
-def _islands(xy, parameters, good, near, limit, min_count):  # type: ignore[no-untyped-def]
-    """Good points (n,) in connected groups of fewer than ``min_count``.
-
-    None if no group has at least four times as many points.
-    """
-    out, many, max_count = np.zeros(len(xy), np.bool_), False, 4 * min_count
-    members = np.empty(max_count, np.int64)
+@nb.njit(cache=True, nogil=True)
+def _has_large_group(xy, parameters, good, near, limit, count):  # type: ignore[no-untyped-def]
+    """Whether some connected group has at least ``count`` good points."""
+    members = np.empty(count, np.int64)
     for k in range(len(xy)):
-        many = good[k] and _connected_count(xy, parameters, good, near, limit, k, members, max_count) == max_count
-        if many:
-            break
-    if not many:
-        return out
-    for k in nb.prange(len(xy)):
-        few = np.empty(min_count, np.int64)
+        if good[k] and _connected_count(xy, parameters, good, near, limit, k, members, count) == count:
+            return True
+    return False
+
+
+@nb.njit(cache=True, nogil=True)
+def _islands(first, last, xy, parameters, good, near, limit, min_count, out):  # type: ignore[no-untyped-def]
+    """Fill out (n,), from ``first`` to ``last``: good points in connected groups of fewer than ``min_count``."""
+    few = np.empty(min_count, np.int64)
+    for k in range(first, last):
         out[k] = good[k] and _connected_count(xy, parameters, good, near, limit, k, few, min_count) < min_count
-    return out
 
 
 def local_affine_fit(
@@ -225,7 +229,7 @@ def local_affine_fit(
     return out
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, **INNER)
 def _nearest_rings(good, near, k, count, seen, stamp):  # type: ignore[no-untyped-def]
     """Indices of good points around point k, ring by ring of neighbours, until there are at least ``count``.
 

@@ -15,10 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels
+from ringdic.correlation.lanes import INNER
+from ringdic.correlation.parallel import in_ranges
 from ringdic.correlation.warps import cholesky, solve_cholesky
 
 _MIN_NEIGHBOURS = 10  # for six coefficients, the point itself included
 _MIN_SIGMA = 0.3  # least uncertainty that counts, as a share of the median: bounds the weight of a single point
+_LEAST = 200  # points that are worth a thread
 _RIDGE = 1e-10  # share of the trace added to the diagonal: points on a line give a large sigma, not a singular matrix
 
 
@@ -78,7 +81,7 @@ class Neighbourhoods:
         weight = _weights(known, sigma)
         measured = np.ascontiguousarray(np.where(known[:, None], values, 0.0).T)
         c, scatter = np.full((n, k, 6), np.nan), np.full((n, 6), np.nan)
-        _fit(self.xy, self._first, self._members, self.window, weight, measured, c, scatter)
+        in_ranges(_fit, n, self.xy, self._first, self._members, self.window, weight, measured, c, scatter, least=_LEAST)
         with np.errstate(invalid="ignore", divide="ignore"):
             own = weight * scatter[:, 0] ** 2
             leave_one_out = np.where(known[:, None], (values - c[..., 0]) / (1.0 - own)[:, None], np.nan)
@@ -136,7 +139,8 @@ class LowerQuartiles:
         values : (m,) float64, in any unit. Returns (n,) in that unit, NaN where no value is known.
         """
         out = np.full(len(self._first) - 1, np.nan)
-        _quartiles(self._first, self._members, np.ascontiguousarray(values, dtype=np.float64), out)
+        given = np.ascontiguousarray(values, dtype=np.float64)
+        in_ranges(_quartiles, len(out), self._first, self._members, given, out, least=_LEAST)
         return out
 
 
@@ -168,7 +172,7 @@ def _within(centres, xy, window, cell, columns, by_cell, starts):  # type: ignor
     return first, members
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, **INNER)
 def _normal_matrix(xy, i, members, window, weight, M):  # type: ignore[no-untyped-def]
     """Fill the lower half of the normal matrix M (6, 6) of the neighbours of point i, lengths in units of the window.
 
@@ -206,7 +210,7 @@ def _normal_matrix(xy, i, members, window, weight, M):  # type: ignore[no-untype
     return count
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, **INNER)
 def _right_side(xy, i, members, window, weight, values, b):  # type: ignore[no-untyped-def]
     """Fill the right side b (6,) of the normal equations of point i from the weighted values (n,)."""
     b0 = b1 = b2 = b3 = b4 = b5 = 0.0
@@ -223,15 +227,15 @@ def _right_side(xy, i, members, window, weight, values, b):  # type: ignore[no-u
     b[0], b[1], b[2], b[3], b[4], b[5] = b0, b1, b2, 0.5 * b3, b4, 0.5 * b5
 
 
-@nb.njit(cache=True, nogil=True, parallel=True)
-def _fit(xy, first, members, window, weight, values, c, scatter):  # type: ignore[no-untyped-def]
-    """Fit the quadratics at all points: c (n, k, 6), lengths in units of the window, and scatter (n, 6).
+@nb.njit(cache=True, nogil=True)
+def _fit(begin, end, xy, first, members, window, weight, values, c, scatter):  # type: ignore[no-untyped-def]
+    """Fit the quadratics at the points from ``begin`` to ``end``: fills c (n, k, 6) and scatter (n, 6).
 
-    scatter : square roots of the diagonal of the inverse normal matrix. values : (k, n). weight : (n,), 0 where not
-        measured.
+    Lengths are in units of the window. scatter : square roots of the diagonal of the inverse normal matrix.
+    values : (k, n). weight : (n,), 0 where not measured.
     """
-    k, n = values.shape
-    for i in nb.prange(n):
+    k = len(values)
+    for i in range(begin, end):
         about = members[first[i] : first[i + 1]]
         M, e = np.empty((6, 6)), np.empty(6)
         if _normal_matrix(xy, i, about, window, weight, M) < _MIN_NEIGHBOURS:
@@ -251,10 +255,10 @@ def _fit(xy, first, members, window, weight, values, c, scatter):  # type: ignor
             scatter[i, p] = math.sqrt(e[p])
 
 
-@nb.njit(cache=True, nogil=True, parallel=True)
-def _quartiles(first, members, values, out):  # type: ignore[no-untyped-def]
-    """Fill out (n,) with the lower quartile of the finite values in each neighbourhood."""
-    for i in nb.prange(len(out)):
+@nb.njit(cache=True, nogil=True)
+def _quartiles(begin, end, first, members, values, out):  # type: ignore[no-untyped-def]
+    """Fill out (n,), from ``begin`` to ``end``, with the lower quartile of the finite values in each neighbourhood."""
+    for i in range(begin, end):
         about = values[members[first[i] : first[i + 1]]]
         about = about[np.isfinite(about)]
         if len(about):

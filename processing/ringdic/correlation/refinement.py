@@ -14,6 +14,7 @@ import numpy as np
 
 from ringdic.arrays import Floats, Indices, Pixels
 from ringdic.correlation import kernels
+from ringdic.correlation.parallel import in_ranges
 from ringdic.correlation.prepared import Current, Reference
 from ringdic.correlation.settings import CorrelationSettings
 from ringdic.correlation.status import Status
@@ -137,7 +138,9 @@ def _refine(
     iterations = np.zeros(n, np.int64)
     between = bool(np.any(xy != np.rint(xy)))
     subsets, row = cache or (SubsetCache(0, settings.order), np.full(n, -1))
-    kernels.refine_points(
+    in_ranges(
+        kernels.refine_points,
+        -(-n // kernels.CHUNK),
         reference.grey,
         *reference.gradient,
         reference.coef if between else np.zeros((1, 1), settings.precision),
@@ -151,8 +154,8 @@ def _refine(
         known,
         settings.radius,
         settings.subset == "circle",
-        3 if settings.order == 1 else 6,
-        settings.degree == 5,
+        True if settings.order == 2 else None,
+        True if settings.degree == 3 else None,
         settings.tolerance,
         settings.max_iterations,
         settings.texture_min * reference.grey_range / 255.0,

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats
-from ringdic.correlation.filters import separable_filter
+from ringdic.correlation.filters import COLUMNS, separable_filter
+from ringdic.correlation.parallel import in_ranges
 
 Levels = NDArray[np.floating]
 Box = tuple[int, int, int, int]
@@ -60,7 +61,7 @@ def coefficients(image: NDArray, degree: int, box: Box | None = None, precision:
     kind = np.dtype(precision or image.dtype)
     taps = prefilter_taps(degree, kind.char).astype(kind)
     out = np.empty((y1 - y0 + 2 * PAD, x1 - x0 + 2 * PAD), kind)
-    separable_filter(image, taps, taps, x0 - PAD, y0 - PAD, out)
+    in_ranges(separable_filter, -(-out.shape[1] // COLUMNS), image, taps, taps, x0 - PAD, y0 - PAD, out)
     return out
 
 
@@ -77,6 +78,6 @@ def gradients(
     kind = np.dtype(precision or image.dtype)
     slope, one = gradient_taps(degree, kind.char).astype(kind), np.ones(1, kind)
     along_x, along_y = np.empty((y1 - y0, x1 - x0), kind), np.empty((y1 - y0, x1 - x0), kind)
-    separable_filter(image, slope, one, x0, y0, along_x)
-    separable_filter(image, one, slope, x0, y0, along_y)
+    in_ranges(separable_filter, -(-along_x.shape[1] // COLUMNS), image, slope, one, x0, y0, along_x)
+    in_ranges(separable_filter, -(-along_y.shape[1] // COLUMNS), image, one, slope, x0, y0, along_y)
     return along_x, along_y

@@ -20,6 +20,8 @@ import numpy as np
 from ringdic.correlation.interpolation import FAST, value_and_gradient
 from ringdic.correlation.lanes import (
     BITS,
+    FEW_REGISTERS,
+    INNER,
     LANES,
     bit_count,
     blend,
@@ -35,7 +37,7 @@ from ringdic.correlation.lanes import (
 )
 from ringdic.correlation.spline import PAD
 
-REF, GX, GY = range(3)  # rows of a packed subset
+REF, GX, GY, GREY = range(4)  # rows of a packed subset: f, its gradient, and g where registers are few
 MOMENTS = 72  # rows of scratch for ``moments``
 _F, _U = np.float32, np.uint64
 _L = np.uint64(LANES)
@@ -60,7 +62,8 @@ def template(radius, circle):  # type: ignore[no-untyped-def]
         vectors = 0
         for s in range(count):
             left = s * LANES - radius - slack
-            vectors += np.sum((half >= left) & (-half < left + LANES))
+            for wide in half:
+                vectors += wide >= left and -wide < left + LANES
         if vectors < best:
             best, shift = vectors, slack
     corner, bits = np.empty((2, best), np.int64), np.zeros(best, BITS)
@@ -78,16 +81,17 @@ def template(radius, circle):  # type: ignore[no-untyped-def]
     return corner, bits, strips
 
 
-@nb.njit(fastmath=FAST, nogil=True, cache=True)
+@nb.njit(fastmath=FAST, nogil=True, cache=True, **INNER)
 def pack(  # type: ignore[no-untyped-def]
-    image, gx, gy, coef, stride, mask, shape, x, y, radius, quintic, corner, uncut, px, bits
+    image, gx, gy, coef, stride, mask, shape, x, y, radius, cubic, corner, uncut, px, bits
 ):  # fmt: skip
     """Pack a subset whose centre lies between pixels, or that lies at the border of the crop.
 
     Fills px (3, LANES n) with f about a level and its gradient, and bits (n,) with the pixels of ``uncut`` (n,) inside
     the mask. image, gx, gy, mask : flat (h w,), of the given shape (h, w). coef : flat coefficients, rows ``stride``
-    apart, from which f and its gradient are interpolated at a fractional centre (x, y). radius, quintic, corner : of
-    the subset, the spline and the template. For other subsets ``moments`` does this on the way.
+    apart, from which f and its gradient are interpolated at a fractional centre (x, y). radius, corner : of the subset
+    and the template. cubic : True for a spline of degree 3, None for degree 5. For other subsets ``moments`` does this
+    on the way.
     """
     height, width = shape
     jx, iy = math.floor(x), math.floor(y)
@@ -116,7 +120,7 @@ def pack(  # type: ignore[no-untyped-def]
         if between:
             i, j = min(max(i, -_OUT), height), min(max(j, -_OUT), width)
             first = _U((i + _PAD) * np.int64(stride) + j + _PAD)
-            here_f, here_x, here_y = value_and_gradient(c, first, stride, tx, ty, quintic)
+            here_f, here_x, here_y = value_and_gradient(c, first, stride, tx, ty, cubic)
         else:
             here_f, here_x, here_y = load(f, at), load(fx, at), load(fy, at)
         store(f, at, blend(w, here_f - level, _F(0)))
@@ -124,7 +128,7 @@ def pack(  # type: ignore[no-untyped-def]
         store(fy, at, blend(w, here_y, _F(0)))
 
 
-@nb.njit(fastmath=FAST, nogil=True, cache=True)
+@nb.njit(fastmath=FAST, nogil=True, cache=True, **INNER)
 def pack_interior(image, gx, gy, mask, at_centre, offset, level, uncut, px, bits):  # type: ignore[no-untyped-def]
     """Pack a subset whose centre is a pixel and that lies inside the crop: fills px (3, LANES n) and bits (n,).
 
@@ -142,7 +146,7 @@ def pack_interior(image, gx, gy, mask, at_centre, offset, level, uncut, px, bits
         store(fy, at, blend(w, load(slope_y, begin), _F(0)))
 
 
-@nb.njit(forceinline=True)
+@nb.njit(forceinline=True, **INNER)
 def well_inside(shape, x, y, radius):  # type: ignore[no-untyped-def]
     """Whether all vectors of the subset lie inside the crop, with a row of pixels to spare.
 
@@ -152,7 +156,7 @@ def well_inside(shape, x, y, radius):  # type: ignore[no-untyped-def]
     return jx >= reach and jx + reach < shape[1] and iy >= radius and iy + radius < shape[0] - 1
 
 
-@nb.njit(forceinline=True)
+@nb.njit(forceinline=True, **INNER)
 def centre_level(image, shape, x, y):  # type: ignore[no-untyped-def]
     """Grey level that is subtracted from f: that of the pixel at or next to the centre.
 
@@ -162,13 +166,13 @@ def centre_level(image, shape, x, y):  # type: ignore[no-untyped-def]
     return image[row * shape[1] + column]
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def add_to_row(at, row, value):  # type: ignore[no-untyped-def]
     """Add a vector ``value`` to a row of scratch that begins ``at`` a pointer."""
     store(at, _U(row) * _L, load(at, _U(row) * _L) + value)
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _by_power(at, row, x, q0, q1):  # type: ignore[no-untyped-def]
     """Add a strip's sums of q, q dx and q dy to three rows of scratch.
 
@@ -179,7 +183,7 @@ def _by_power(at, row, x, q0, q1):  # type: ignore[no-untyped-def]
     add_to_row(at, row + 2, q1)
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _by_second_power(at, row, x, q0, q1, q2):  # type: ignore[no-untyped-def]
     """Add a strip's sums of q dx², q dx dy and q dy² to three rows of scratch; q_k : Σ q dy^k of each lane."""
     add_to_row(at, row, q0 * (x * x))
@@ -187,7 +191,7 @@ def _by_second_power(at, row, x, q0, q1, q2):  # type: ignore[no-untyped-def]
     add_to_row(at, row + 2, q2)
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _by_high_power(at, row, x, q0, q1, q2, q3, q4):  # type: ignore[no-untyped-def]
     """Add a strip's sums of q dx^i dy^k, i + k = 3 and 4, to nine rows of scratch; q_k : Σ q dy^k of each lane.
 
@@ -206,7 +210,7 @@ def _by_high_power(at, row, x, q0, q1, q2, q3, q4):  # type: ignore[no-untyped-d
     add_to_row(at, row + 8, q4)
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _first_and_second(last, s0, s1, s2):  # type: ignore[no-untyped-def]
     """Σ q dy and Σ q dy² of a strip from running sums: s0 of q, s1 of s0, s2 of s1, row by row up to ``last`` - 1.
 
@@ -216,7 +220,7 @@ def _first_and_second(last, s0, s1, s2):  # type: ignore[no-untyped-def]
     return e1 - s1, (e1 - s1 - s1) * last + (s2 + s2 - s1)
 
 
-@nb.njit(forceinline=True, fastmath=FAST)
+@nb.njit(forceinline=True, fastmath=FAST, **INNER)
 def _third_and_fourth(last, s0, s1, s2, s3, s4):  # type: ignore[no-untyped-def]
     """Σ q dy³ and Σ q dy⁴ of a strip from running sums s0 … s4, each of the one before, row by row up to ``last`` - 1.
 
@@ -238,7 +242,7 @@ def _make_moments(second: bool, direct: bool) -> Any:
     its twenty-three sums in registers, which needs them as variables of one function.
     """
 
-    @nb.njit(fastmath=FAST, nogil=True)
+    @nb.njit(fastmath=FAST, nogil=True, **INNER)
     def sums(  # type: ignore[no-untyped-def]
         image, gx, gy, mask, at_centre, offset, level, uncut, px, bits, corner, strips, scratch, out
     ):  # fmt: skip
@@ -286,7 +290,7 @@ def _make_moments(second: bool, direct: bool) -> Any:
                     e2 += fy * yy
                     g2 += kx * yy
                     h2 += ky * yy
-                else:
+                elif not FEW_REGISTERS:
                     a0 += fx * fx
                     b0 += fx * fy
                     c0 += fy * fy
@@ -308,6 +312,7 @@ def _make_moments(second: bool, direct: bool) -> Any:
                 _by_second_power(at_sum, 27, x, e0, e1, e2)
                 _by_second_power(at_sum, 33, x, g0, g1, g2)
                 _by_second_power(at_sum, 39, x, h0, h1, h2)
+            if second or FEW_REGISTERS:
                 a3 = a4 = b3 = b4 = c3 = c4 = zero
                 for v in range(_U(strips[s]), _U(strips[s + 1])):
                     fx, fy = load(ref_x, v * _L), load(ref_y, v * _L)
@@ -320,12 +325,14 @@ def _make_moments(second: bool, direct: bool) -> Any:
                     a2 += a1
                     b2 += b1
                     c2 += c1
-                    a3 += a2
-                    b3 += b2
-                    c3 += c2
-                    a4 += a3
-                    b4 += b3
-                    c4 += c3
+                    if second:
+                        a3 += a2
+                        b3 += b2
+                        c3 += c2
+                        a4 += a3
+                        b4 += b3
+                        c4 += c3
+            if second:
                 a3, a4 = _third_and_fourth(last, a0, a1, a2, a3, a4)
                 b3, b4 = _third_and_fourth(last, b0, b1, b2, b3, b4)
                 c3, c4 = _third_and_fourth(last, c0, c1, c2, c3, c4)
@@ -358,25 +365,21 @@ _first, _second = _make_moments(False, True), _make_moments(True, True)
 _packed_first, _packed_second = _make_moments(False, False), _make_moments(True, False)
 
 
-@nb.njit(nogil=True, cache=True)
+@nb.njit(nogil=True, cache=True, **INNER)
 def moments(direct, second, *given):  # type: ignore[no-untyped-def]
     """Moments Σ q dx^i dy^k of a subset, up to second power, for second order up to fourth.
 
     Their order is 1 x y xx xy yy xxx xxy xyy yyy xxxx xxxy xxyy xyyy yyyy.
 
     direct : the subset is packed on the way, as by ``pack_interior``; else px and bits are as ``pack`` left them.
-    second : whether the shape functions are of second order. given : the arguments of the compiled ``sums``, among them
-    scratch (MOMENTS, LANES) and out (7, 15), which is filled: rows q = gx², gx gy, gy², gx, gy, f gx, f gy.
+    second : True for shape functions of second order, None for first. given : the arguments of the compiled ``sums``,
+    among them scratch (MOMENTS, LANES) and out (7, 15), which is filled: rows q = gx², gx gy, gy², gx, gy, f gx, f gy.
 
     Returns Σ f, Σ f² and the number of pixels.
     """
-    if direct:
-        if second:
-            return _second(*given)
-        return _first(*given)
-    if second:
-        return _packed_second(*given)
-    return _packed_first(*given)
+    if second is not None:
+        return _second(*given) if direct else _packed_second(*given)
+    return _first(*given) if direct else _packed_first(*given)
 
 
 # φ = 1 dx dy dx²/2 dxdy dy²/2: exponents of dx and dy, and factor.
@@ -384,7 +387,7 @@ _EX, _EY = np.array([0, 1, 0, 2, 1, 0]), np.array([0, 0, 1, 0, 1, 2])
 _FACTOR = np.array([1.0, 1.0, 1.0, 0.5, 1.0, 0.5])
 
 
-@nb.njit(nogil=True, cache=True)
+@nb.njit(nogil=True, cache=True, **INNER)
 def normal_matrix(sums, mean, terms, H, sum_J, sum_fJ):  # type: ignore[no-untyped-def]
     """Normal matrix H = Σ JᵀJ (2 terms, 2 terms), ΣJ and Σ (f − mean) J from the moments; J = (∂f/∂x φ, ∂f/∂y φ).
 
@@ -402,7 +405,7 @@ def normal_matrix(sums, mean, terms, H, sum_J, sum_fJ):  # type: ignore[no-untyp
         sum_fJ[terms + a] = _FACTOR[a] * sums[6, a] - mean * sum_J[terms + a]
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, **INNER)
 def write_cache(cache, size, H, sum_J, sum_fJ, mean_f, norm_f, pixels):  # type: ignore[no-untyped-def]
     """Write the sums that do not depend on the current image into cache, a row of ``width_of_subset`` numbers.
 
@@ -419,7 +422,7 @@ def write_cache(cache, size, H, sum_J, sum_fJ, mean_f, norm_f, pixels):  # type:
             at += 1
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, **INNER)
 def read_cache(cache, size, H, sum_J, sum_fJ):  # type: ignore[no-untyped-def]
     """Read H (size, size), sum_J and sum_fJ (size,) from cache, a row that ``write_cache`` filled.
 

@@ -11,10 +11,12 @@ import math
 import numba as nb
 import numpy as np
 
+from ringdic.correlation.lanes import INNER
+
 _U = np.uint64
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@nb.njit(cache=True, nogil=True, error_model="numpy", **INNER)
 def cholesky(H, n):  # type: ignore[no-untyped-def]
     """Cholesky factor of the symmetric matrix H (n, n), in place.
 
@@ -36,7 +38,7 @@ def cholesky(H, n):  # type: ignore[no-untyped-def]
     return True
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, **INNER)
 def solve_cholesky(L, b, n):  # type: ignore[no-untyped-def]
     """Solve L Lᵀ x = b for x (n,), in place of b; L (n, n) as ``cholesky`` leaves it."""
     for i in range(_U(n)):
@@ -51,7 +53,7 @@ def solve_cholesky(L, b, n):  # type: ignore[no-untyped-def]
         b[i] = total * L[i, i]
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, **INNER)
 def variance(L, y, n, which):  # type: ignore[no-untyped-def]
     """Diagonal element (which, which) of the inverse matrix (L Lᵀ)⁻¹, L (n, n) as ``cholesky`` leaves it.
 
@@ -67,7 +69,7 @@ def variance(L, y, n, which):  # type: ignore[no-untyped-def]
     return total
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@nb.njit(cache=True, nogil=True, error_model="numpy", **INNER)
 def _warp_matrix(p, M):  # type: ignore[no-untyped-def]
     """Fill M (6, 6), the matrix of a warp p (12,) that acts on (x², xy, y², x, y, 1) (Gao et al. 2015).
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from ringdic.arrays import Floats, Pixels, Points
 from ringdic.correlation import WarpHypotheses
+from ringdic.correlation.parallel import in_ranges
 from ringdic.geometry import lens
 from ringdic.geometry.camera import Camera
 
@@ -63,7 +64,9 @@ def stereo_hypotheses(
     low, high = between or (np.full(len(px), -np.inf), np.full(len(px), np.inf))
     spacing = float(np.diff(exact).max(initial=0.0))
     knots = np.full((len(px), len(exact), 6), np.nan)
-    _fill_warps(
+    in_ranges(
+        _fill_warps,
+        len(px),
         first.centre,
         np.ascontiguousarray(rays),
         np.ascontiguousarray(px, dtype=float),
@@ -76,6 +79,7 @@ def stereo_hypotheses(
         second.size,
         half_width,
         knots,
+        least=100,
     )
     return WarpHypotheses(knots, np.interp(radii, exact, np.arange(len(exact))))
 
@@ -97,13 +101,14 @@ def _project_intersection(origin, ray, radius, P, K, distortion):  # type: ignor
     return K[0, 0] * x_d + K[0, 1] * y_d + K[0, 2], K[1, 1] * y_d + K[1, 2]
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", parallel=True)
-def _fill_warps(origin, rays, px, radii, low, high, P, K, distortion, size, half_width, warps):  # type: ignore[no-untyped-def]
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _fill_warps(begin, end, origin, rays, px, radii, low, high, P, K, distortion, size, half_width, warps):  # type: ignore[no-untyped-def]
     """Compute the warps (n, K, 6) of positions px (n, 2) for the radii (K,) between low (n,) and high (n,).
 
+    begin, end : of the positions to compute for.
     rays : (n, 5, 3), lines of sight through each position and through four positions ``half_width`` px around it.
     """
-    for i in nb.prange(len(px)):
+    for i in range(begin, end):
         image = np.empty((5, 2))
         for k in range(len(radii)):
             if not low[i] <= radii[k] <= high[i]:

@@ -13,7 +13,7 @@ digest of everything that the output depends on. A task whose output file exists
 """
 
 from ringdic.tasks.agenda import Agenda
-from ringdic.tasks.local import LocalExecutor, kernels_side_by_side
+from ringdic.tasks.local import LocalExecutor
 from ringdic.tasks.memory import Memory, process_memory
 from ringdic.tasks.task import (
     Arrays,
@@ -40,7 +40,6 @@ __all__ = [
     "code_stamp",
     "digest",
     "file_digest",
-    "kernels_side_by_side",
     "process_memory",
     "read_output",
     "tidy",

@@ -13,8 +13,6 @@ import numba
 from ringdic.tasks.agenda import Agenda
 from ringdic.tasks.task import OnTaskEnd, Task, TaskReport
 
-_THREAD_SAFE = ("omp", "tbb")  # threading layers of numba whose kernels several threads may start at a time
-
 
 class LocalExecutor:
     """Runs tasks in threads of this process.
@@ -35,7 +33,7 @@ class LocalExecutor:
         if not agenda:
             return
         cores = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-        workers = min(self._workers or (os.cpu_count() or 1), len(agenda)) if kernels_side_by_side() else 1
+        workers = min(self._workers or (os.cpu_count() or 1), len(agenda))
         running: dict[Future[TaskReport], Task] = {}
         with _single_threaded_filters(workers > 1), ThreadPoolExecutor(workers, "task") as pool:
             while agenda:
@@ -50,14 +48,6 @@ class LocalExecutor:
 def _run(task: Task, threads: int) -> TaskReport:
     numba.set_num_threads(threads)  # the setting holds for this thread alone
     return task.run()
-
-
-def kernels_side_by_side() -> bool:
-    """Whether several threads of this process may run kernels at a time; False before the first kernel has run."""
-    try:
-        return numba.threading_layer() in _THREAD_SAFE
-    except ValueError:  # no kernel has run yet
-        return False
 
 
 @contextmanager

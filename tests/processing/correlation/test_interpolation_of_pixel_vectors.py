@@ -29,13 +29,16 @@ _SPLINES = {3: make_interpolation(False), 5: make_interpolation(True)}
 
 
 def _make_sampler(degree):
-    spline = _SPLINES[degree]
+    inside, crossing = _SPLINES[degree]
 
     @nb.njit
     def sample(coef, stride, first, case, place, bend, spare, out):
         c = pointer(coef)
         tx, sx, ty, sy = place
-        g = spline(c, first, stride, case, tx, sx, bend[0], ty, sy, bend[1], pointer(spare))
+        if case == 0:
+            g = inside(c, first, stride, tx, sx, bend[0], ty, sy, bend[1])
+        else:
+            g = crossing(c, first, stride, case, tx, sx, bend[0], ty, sy, bend[1], pointer(spare))
         store(pointer(out), _U(0), g)
 
     return sample

@@ -9,7 +9,6 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
-from ringdic.correlation.correlate import load_kernels
 from ringdic.errors import ComputationError, InputError
 from ringdic.session.records import CameraRecord
 from ringdic.settings import CorrelationGroup
@@ -21,7 +20,6 @@ from ringdic.tasks import (
     TaskReport,
     digest,
     file_digest,
-    kernels_side_by_side,
     read_output,
     tidy,
 )
@@ -208,11 +206,9 @@ def _threads(*, inputs: tuple[Path, ...]) -> dict[str, np.ndarray]:
 
 
 def test_a_task_that_all_others_wait_for_has_all_cores(tmp_path: Path) -> None:
-    load_kernels()
     first = Task("first", "first", _threads, (), tmp_path)
     later = [Task(f"later{k}", f"later {k}", _threads, (), tmp_path, ("first",)) for k in range(4)]
     LocalExecutor(workers=2).run([first, *later], lambda *told: None)
     cores = numba.config.NUMBA_NUM_THREADS
     assert read_output(first.output)["threads"] == cores
-    side_by_side = kernels_side_by_side()
-    assert read_output(later[0].output)["threads"] == (max(1, cores // 2) if side_by_side else cores)
+    assert read_output(later[0].output)["threads"] == max(1, cores // 2)

@@ -15,12 +15,11 @@ import numba
 
 from ringdic.correlation.correlate import load_kernels
 from ringdic.errors import InputError
-from ringdic.tasks import Task, TaskReport, code_stamp, kernels_side_by_side
+from ringdic.tasks import Task, TaskReport, code_stamp
 
 VISIBLE_S = 60.0  # a shared folder may show a file of another machine with this delay
 _LOOK_S = 0.2
 
-_alone = threading.Lock()  # held by a task whose kernels use all threads of the worker
 _ready = threading.Lock()
 _accepted: set[Handshake] = set()  # checked by this process, without a refusal
 
@@ -77,7 +76,7 @@ def run_task(task: Task, handshake: Handshake, share: int) -> TaskOutcome:
     """Run a task in this process after checking it against the driver.
 
     handshake : to check the worker against. share : threads for the task's kernels, so that the tasks running at a time
-    use no more than the worker's threads. Where kernels cannot run side by side, one task at a time uses all of them.
+    use no more than the worker's threads.
     """
     address, threads = _worker()
     refusal = inspect(handshake)
@@ -87,10 +86,7 @@ def run_task(task: Task, handshake: Handshake, share: int) -> TaskOutcome:
     if absent:
         return TaskOutcome(address, refusal=f"it does not see {absent[0]}, which another worker has written")
     try:
-        if kernels_side_by_side():
-            return TaskOutcome(address, report=_run(task, min(share, threads)))
-        with _alone:
-            return TaskOutcome(address, report=_run(task, threads))
+        return TaskOutcome(address, report=_run(task, min(share, threads)))
     except InputError as error:
         return TaskOutcome(address, input_error=str(error))
 

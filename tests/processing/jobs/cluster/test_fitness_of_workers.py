@@ -55,7 +55,6 @@ def test_a_tasks_kernels_take_their_share_and_no_more_than_the_worker_has(
     handshake: Handshake, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: int, threads: int
 ):
     monkeypatch.setattr(worker, "_worker", lambda: ("tcp://here", threads))
-    monkeypatch.setattr(worker, "kernels_side_by_side", lambda: True)
     task = Task("k", "a task", threads_seen, (), tmp_path)
     outcome: list[TaskOutcome] = []
     thread = threading.Thread(
