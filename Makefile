@@ -27,7 +27,8 @@ $(VENV)/.installed-dist: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet -e ".[pc,dist]"
 	touch $@
 
-install: $(VENV)/.installed            ## the command .venv/bin/ringdic
+install: $(VENV)/.installed            ## the command .venv/bin/ringdic, and its kernels compiled
+	$(BIN)/python -m ringdic.jobs.compiling
 
 demo: install                          ## a simulated 12-node rig, captured, processed, shown
 	$(BIN)/ringdic demo $(DEMO)

@@ -18,6 +18,7 @@ from ringdic.correlation.features import feature_start_values
 from ringdic.correlation.hypotheses import search_warps
 from ringdic.correlation.prepared import Current, Reference, prepare_current, prepare_reference
 from ringdic.correlation.propagation import Progress, Propagation
+from ringdic.correlation.refinement import refine
 from ringdic.correlation.seeds import even_sample, flow_start_values, template_start_values
 from ringdic.correlation.settings import CorrelationSettings
 from ringdic.correlation.status import Status
@@ -177,11 +178,31 @@ def load_kernels() -> None:
 
     Called before anything is timed.
     """
+    points = _small_example()
+    _match_automatically(points, {"prepare": 0.0, "start": 0.0, "refine": 0.0})
+
+
+def load_refinement() -> None:
+    """Compile the kernels of the refinement, or load them from numba's cache."""
+    points = _small_example()
+    refine(points.reference, points.current, points.xy, np.zeros((len(points.xy), 12)), points.settings)
+
+
+def load_search() -> None:
+    """Compile the kernels of a correlation other than the refinement's, or load them from numba's cache."""
+    points = _small_example()
+    n = len(points.xy)
+    search_warps(points.reference, points.current, points.xy, np.zeros((n, 1, 6)), points.settings.radius)
+    points.status[:], points.parameters[:] = Status.GOOD, 0.0
+    points.reject_outliers()
+
+
+def _small_example() -> Propagation:
+    """An image that is to be matched with itself, so small that compiling takes nearly all of the time."""
     image = np.random.default_rng(0).normal(128.0, 30.0, (64, 64))
     settings = CorrelationSettings(radius=6, step=6)
     xy = np.stack(np.meshgrid(np.arange(16.0, 48.0, 6.0), np.arange(16.0, 48.0, 6.0)), axis=-1).reshape(-1, 2)
-    reference, current = prepare_reference(image, None, settings), prepare_current(image, None, settings)
-    _match_automatically(Propagation(reference, current, xy, settings), {"prepare": 0.0, "start": 0.0, "refine": 0.0})
+    return Propagation(prepare_reference(image, None, settings), prepare_current(image, None, settings), xy, settings)
 
 
 def _match_automatically(points: Propagation, seconds: dict[str, float]) -> None:

@@ -5,6 +5,7 @@
 ``run``         a finished run as an object: fields, drawings, measurements, exports
 ``live_step``   processing of a single step during the capture
 ``serving``     a waiting process with loaded kernels, which carries out orders
+``compiling``   compiles all kernels once, by several processes side by side
 ``warm_up``     compiles the kernels that follow the matching
 ``allocation``  how the process asks the system for memory
 ``cluster``     tasks on more than one machine

@@ -20,7 +20,7 @@ from typing import Any
 
 from ringdic.errors import RingdicError
 from ringdic.jobs.allocation import keep_freed_memory
-from ringdic.jobs.serving import carry_out, compile_kernels, progress_values, serve
+from ringdic.jobs.serving import carry_out, progress_values, serve
 from ringdic.progress import Progress
 from ringdic.settings import load_settings
 
@@ -31,15 +31,11 @@ def main() -> int:
     choice = parser.add_mutually_exclusive_group(required=True)
     choice.add_argument("session", type=Path, nargs="?")
     choice.add_argument("--serve", action="store_true", help="take orders from standard input")
-    choice.add_argument("--compile", action="store_true", help="compile the kernels at low priority, and end")
     parser.add_argument("--settings", type=Path)
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="NAME=VALUE")
     arguments = parser.parse_args()
     keep_freed_memory()
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
-    if arguments.compile:
-        compile_kernels(_line)
-        return 0
     if arguments.serve:
         return _serve_to_the_end()
     try:

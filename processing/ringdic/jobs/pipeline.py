@@ -21,10 +21,11 @@ from ringdic.correlation.correlate import load_kernels
 from ringdic.errors import ComputationError, InputError
 from ringdic.geometry.camera import Camera
 from ringdic.jobs import summary
+from ringdic.jobs.compiling import compile_once
 from ringdic.pairs.reconstruction import pair_shape
 from ringdic.pairs.surfaces import Merging, PairSurface, merge_surfaces, pairs_surface, reconstruct_pair
 from ringdic.pairs.tasks import PairJob, ordered_tasks, pair_jobs
-from ringdic.progress import Report, Stages, silent
+from ringdic.progress import COMPILING, Report, Stages, silent
 from ringdic.results import noise_floor
 from ringdic.results.results import Results
 from ringdic.results.series import InMemorySeries, Series, StepCache, join_steps
@@ -118,7 +119,8 @@ def match_session(
     cache their results.
     """
     stages, steps = stages or Stages(_WEIGHTS, silent), tuple(steps)
-    stages.at("prepare", 0.0, "loading the correlation kernels (compiled at the first use)")
+    compile_once(lambda done, count, _: stages.at("prepare", 0.0, f"{COMPILING}; {done} of {count} parts are ready"))
+    stages.at("prepare", 0.0, "loading the correlation kernels")
     load_kernels()
     stages.at("calibrate", 0.0)
     rig = calibrate(session, settings.calibration, lambda done, who: stages.at("calibrate", done, who))

@@ -14,8 +14,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -24,6 +22,7 @@ from threading import Thread
 from typing import Any
 
 from ringdic.errors import RingdicError
+from ringdic.jobs.compiling import compile_once
 from ringdic.jobs.live_step import process_step
 from ringdic.jobs.pipeline import process_session
 from ringdic.progress import Progress, Report
@@ -33,7 +32,6 @@ from ringdic.tasks import process_memory
 Say = Callable[[dict[str, Any]], None]
 _MOST_KEPT = 4 << 30  # bytes of prepared images that stay in memory between orders
 _TYPICAL_MEMORY = 8 << 30  # bytes, where the system does not say how much there is
-_NICE = 10  # compiling must not slow a capture down
 
 
 def _memory() -> int:
@@ -55,39 +53,23 @@ def serve(lines: Iterable[str], say: Say) -> None:
     began = time.monotonic()
     process_memory.limit = _memory()
     say({"worker": "warming"})
-    compile_and_load()
+    compile_and_load(say)
     say({"worker": "ready", "seconds": round(time.monotonic() - began, 1)})
     while (order := orders.next()) is not None:
         say(_carried_out(order, say, orders))
 
 
-def compile_and_load() -> None:
-    """Load all kernels; those that are not in the cache are compiled first, by a process of low priority."""
-    lowered = getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0)
-    command = [sys.executable, "-P", "-m", "ringdic.jobs", "--compile"]
-    subprocess.run(command, check=False, stdin=subprocess.DEVNULL, creationflags=lowered)
-    _load_kernels()
+def compile_and_load(say: Say) -> None:
+    """Load all kernels; those that are not in the cache are compiled first, by processes of low priority.
 
-
-def _load_kernels() -> None:
+    say : called if there are any.
+    """
     from ringdic.correlation.correlate import load_kernels
     from ringdic.jobs.warm_up import run_small_plate
 
+    compile_once(lambda done, count, _: say({"worker": "warming", "compiling": done < count}))
     load_kernels()
     run_small_plate()
-
-
-def compile_kernels(say: Say) -> None:
-    """Compile the kernels that are not in the cache yet, at low priority.
-
-    ``say`` is called once if there are any.
-    """
-    if hasattr(os, "nice"):
-        os.nice(_NICE)
-    from ringdic.correlation.warming import on_compiling
-
-    with on_compiling(lambda: say({"worker": "warming", "compiling": True})):
-        _load_kernels()
 
 
 def carry_out(session: Path, settings: Settings, report: Report, step: str | None = None) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from types import FrameType
 from typing import Any
 
 from ringdic.cli.console import say, show_table
+from ringdic.jobs.compiling import compile_once
 from ringdic.progress import Progress, Report, progress_bar
 from ringdic.session.folder import newest_results
 from ringdic.session.rig import parse_rig
@@ -38,7 +39,9 @@ def run_demo(folder: Path, *, cameras: int, scale: float, steps: int, serve: boo
     setting = Setting(_new_folder(folder), cameras, scale)
     rig = paper_rig(cameras, scale, setting.seed)
     say(f"a simulated ring of {cameras} cameras of {rig.cameras[0].width} x {rig.cameras[0].height} px")
-    load_renderer()  # compiled once here, so that the nodes load it from the cache
+    with progress_bar() as report:  # once here, so that the nodes and the controller load all kernels from the cache
+        compile_once(lambda done, count, _: report(Progress("compile", done / count, f"{done} of {count} parts, once")))
+    load_renderer()
     write_truth(rig, setting.folder)
     name = parse_rig(rig.rig_toml()).name
     ids = [camera.id for camera in rig.cameras]
