@@ -16,6 +16,8 @@ from ringdic.arrays import Floats, Indices, Mask, Pixels
 from ringdic.correlation import kernels
 from ringdic.correlation.features import feature_start_values
 from ringdic.correlation.hypotheses import search_warps
+from ringdic.correlation.lattice_field import interpolate_lattice
+from ringdic.correlation.neighbours import local_affine_fit
 from ringdic.correlation.prepared import Current, Reference, prepare_current, prepare_reference
 from ringdic.correlation.propagation import Progress, Propagation
 from ringdic.correlation.refinement import refine
@@ -195,11 +197,13 @@ def load_search() -> None:
     search_warps(points.reference, points.current, points.xy, np.zeros((n, 1, 6)), points.settings.radius)
     points.status[:], points.parameters[:] = Status.GOOD, 0.0
     points.reject_outliers()
+    local_affine_fit(points.xy, points.parameters, points.good, points.near, np.arange(n))
+    interpolate_lattice(6.0 * np.rint(points.xy / 6.0), np.zeros((n, 6)), 6.0, points.xy)
 
 
 def _small_example() -> Propagation:
     """An image that is to be matched with itself, so small that compiling takes nearly all of the time."""
-    image = np.random.default_rng(0).normal(128.0, 30.0, (64, 64))
+    image = np.random.default_rng(0).integers(0, 256, (64, 64), np.uint8)  # of the type of a camera's images
     settings = CorrelationSettings(radius=6, step=6)
     xy = np.stack(np.meshgrid(np.arange(16.0, 48.0, 6.0), np.arange(16.0, 48.0, 6.0)), axis=-1).reshape(-1, 2)
     return Propagation(prepare_reference(image, None, settings), prepare_current(image, None, settings), xy, settings)

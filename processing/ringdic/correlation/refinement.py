@@ -131,7 +131,8 @@ def _refine(
     cache: tuple[SubsetCache, Indices] | None,
 ) -> SubsetMatches:
     """Refinement of ``refine`` on the images as they are, without transposing them."""
-    n, xy, parameters = len(xy), np.ascontiguousarray(xy, dtype=np.float64), np.array(start, dtype=np.float64)
+    n, xy = len(xy), np.ascontiguousarray(xy, dtype=np.float64)
+    parameters = np.array(start, dtype=np.float64, order="C")  # the kernel is compiled for this order alone
     known = np.isfinite(parameters).all(axis=1)
     status = np.full(n, Status.NOT_REACHED, np.int64)
     zncc, sigma = np.full(n, np.nan), np.full((n, 2), np.nan)
