@@ -89,6 +89,17 @@ class SurfaceStep:
     residual: Floats
 
 
+@dataclass(frozen=True)
+class _TrackedPixels:
+    """Pixels of the N points in C cameras at one step, with arrays as in `SurfaceStep`; weight of all views."""
+
+    px: Pixels
+    sigma: Pixels
+    weight: Pixels
+    c_ls: Floats
+    status: NDArray[np.int8]
+
+
 class SurfaceSeries:
     """Series of results of a surface that all cameras measure together.
 
@@ -114,16 +125,15 @@ class SurfaceSeries:
         self._textures = [texture_of(surface.texture[k, view.vertex]) for k, view in enumerate(self._views)]
         self.poses = RefinedCameras(cameras)
         refine = self.poses if settings.calibration.refine_poses else None
-        self.drift = np.full((len(self.names), len(cameras)), np.nan)
-        residual = reprojection_residuals(cameras, surface.xyz, surface.px)
-        self.residual = residual
+        self._drift = np.full((len(self.names), len(cameras)), np.nan)
+        residual = self._residual = reprojection_residuals(cameras, surface.xyz, surface.px)
         with np.errstate(invalid="ignore"):
-            self.drift[0] = [np.nanmean(one[:, 1]) if np.isfinite(one).any() else np.nan for one in residual]
+            self._drift[0] = [np.nanmean(one[:, 1]) if np.isfinite(one).any() else np.nan for one in residual]
         c_ls: list[list[Floats]] = [[] for _ in cameras]
         for k in range(1, len(self.names)):
             step = self._measure(k, matches, refine)
             cache.put(k, step)
-            self.drift[k] = self.drift[0] + step.residual
+            self._drift[k] = self._drift[0] + step.residual
             for c, view in enumerate(self._views):
                 c_ls[c].append(_sample(step.c_ls[c, view.vertex]))
         self._grey_noise = [
@@ -135,12 +145,76 @@ class SurfaceSeries:
         self.reference = self._reference(rig, pairs)
         self._prepare_uncertainty()
 
+    @property
+    def drift(self) -> dict[str, Floats]:
+        """Mean vertical residual (F,) px of each camera that was used, by id."""
+        known = zip(self._cameras, self._drift.T, strict=True)
+        return {camera.id: values for camera, values in known if np.isfinite(values[0])}
+
+    @property
+    def agreement(self) -> dict[str, Any]:
+        """How well the cameras agree at the reference, as JSON values.
+
+        Mean number of views of a point, RMS residual of the cameras (px), and numbers of lost points by reason.
+        """
+        residual = self._residual.copy()
+        residual[self.surface.own, np.arange(len(self.surface.xyz))] = np.nan  # whole pixels by definition
+        reasons = {int(reason): reason.name.lower() for kind in (Status, LostPoint) for reason in kind}
+        return {
+            "views": float(np.isfinite(self.surface.px[..., 0]).sum(axis=0).mean()),
+            "residual_px": float(np.sqrt(np.nanmean(residual**2))),
+            "lost": {reasons[int(reason)]: int(number) for reason, number in self.surface.lost},
+        }
+
+    @property
+    def warnings(self) -> list[str]:
+        """Sentences for the operator: cameras that share no measured point with another, and cameras that moved."""
+        idle = [
+            f"camera {camera.id} shares no measured point of the surface with another; check that it sees the "
+            "specimen, that it is in focus, and its mask"
+            for camera, view in zip(self._cameras, self._views, strict=True)
+            if not len(view.vertex)
+        ]
+        return idle + self.poses.sentences(self.names)
+
     def _measure(self, k: int, matches: MatchesOfStep, refine: RefinedCameras | None) -> SurfaceStep:
         """Triangulate the points of step k from all cameras."""
+        tracked = self._tracked(k, matches)
+        px, weight, status = tracked.px, tracked.weight, tracked.status
+        cameras = self._cameras if refine is None else refine(k, px, weight)
+        points, used = triangulate_agreeing(cameras, px, weight)
+        turned = self._oblique(cameras, points.xyz) & np.isfinite(px[..., 0])
+        again = np.flatnonzero(turned.any(axis=0))
+        if len(again):  # surface that has turned away from a camera
+            px[turned], status[turned] = np.nan, LostPoint.OBLIQUE
+            some, used[:, again] = triangulate_agreeing(cameras, px[:, again], weight[:, again])
+            points.xyz[again], points.chi2[again], points.degrees[again] = some.xyz, some.chi2, some.degrees
+        enough = np.isfinite(px[..., 0]).sum(axis=0) >= 2
+        lost: Mask = np.asarray(~np.isfinite(points.xyz).all(axis=1))
+        overall = np.where(lost, np.where(enough, LostPoint.RESIDUAL, status.max(axis=0)), 0).astype(np.int8)
+        moved = np.where(lost[:, None], np.nan, points.xyz - self.surface.xyz)
+        overall[surface_outliers(self.surface.neighbours, moved)] = LostPoint.SURFACE
+        measured = overall == 0
+        used &= measured
+        xyz = np.where(measured[:, None], points.xyz, np.nan)
+        residual = np.full(len(cameras), np.nan)
+        for c, camera in enumerate(cameras):
+            at = np.flatnonzero(used[c])
+            if len(at):
+                residual[c] = float(np.mean((px[c, at] - camera.project(xyz[at]))[:, 1]))
+        return SurfaceStep(
+            xyz, px, tracked.sigma.astype(np.float32), np.where(used[..., None], weight, np.nan).astype(np.float32),
+            tracked.c_ls.astype(np.float32), overall, status, np.where(measured, points.chi2, np.nan),
+            np.where(measured, points.degrees, 0), residual,
+        )  # fmt: skip
+
+    def _tracked(self, k: int, matches: MatchesOfStep) -> _TrackedPixels:
+        """Pixels of the points in all cameras at step k, from the matches of the cameras' grids."""
         n, count = len(self.surface.xyz), len(self._cameras)
-        px, sigma, weight = (np.full((count, n, 2), np.nan) for _ in range(3))
-        c_ls = np.full((count, n), np.nan)
-        status = np.full((count, n), Status.NOT_REACHED, np.int8)
+        out = _TrackedPixels(
+            np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan),
+            np.full((count, n), np.nan), np.full((count, n), Status.NOT_REACHED, np.int8),
+        )  # fmt: skip
         cell, sigma_max = CELL_STEPS * self._settings.correlation.step_px, self._settings.surface.sigma_max_px
         for c, view in enumerate(self._views):
             one = matches(c, k) if len(view.vertex) else None
@@ -149,36 +223,20 @@ class SurfaceSeries:
             pixels = interpolate_matches(one, view.px)
             with np.errstate(invalid="ignore"):
                 uncertain = (pixels.status == 0) & (pixels.sigma > sigma_max).any(axis=1)
-            own = np.where(uncertain, LostPoint.UNCERTAIN, pixels.status).astype(np.int8)
-            good = own == 0
-            status[c, view.vertex] = own
-            px[c, view.vertex[good]] = pixels.px[good]
-            sigma[c, view.vertex[good]] = pixels.sigma[good]
-            c_ls[c, view.vertex[good]] = pixels.c_ls[good]
-            weight[c, view.vertex[good]] = smooth_sigma(
-                view.px[good], np.maximum(pixels.sigma[good], _LEAST_SIGMA), cell
-            )
-        cameras = self._cameras if refine is None else refine(k, px, weight)
-        points, used = triangulate_agreeing(cameras, px, weight)
-        enough = np.isfinite(px[..., 0]).sum(axis=0) >= 2
-        lost: Mask = np.asarray(~np.isfinite(points.xyz).all(axis=1))
-        why = np.where(enough, LostPoint.RESIDUAL, status.max(axis=0))
-        overall = np.where(lost, why, 0).astype(np.int8)
-        moved = np.where(lost[:, None], np.nan, points.xyz - self.surface.xyz)
-        overall[surface_outliers(self.surface.neighbours, moved)] = LostPoint.SURFACE
-        measured = overall == 0
-        used &= measured
-        xyz = np.where(measured[:, None], points.xyz, np.nan)
-        residual = np.full(count, np.nan)
-        for c, camera in enumerate(cameras):
-            at = np.flatnonzero(used[c])
-            if len(at):
-                residual[c] = float(np.mean((px[c, at] - camera.project(xyz[at]))[:, 1]))
-        return SurfaceStep(
-            xyz, px, sigma.astype(np.float32), np.where(used[..., None], weight, np.nan).astype(np.float32),
-            c_ls.astype(np.float32), overall, status, np.where(measured, points.chi2, np.nan),
-            np.where(measured, points.degrees, 0), residual,
-        )  # fmt: skip
+            status = np.where(uncertain, LostPoint.UNCERTAIN, pixels.status).astype(np.int8)
+            out.status[c, view.vertex] = status
+            good = status == 0
+            vertex, sigma = view.vertex[good], pixels.sigma[good]
+            out.px[c, vertex], out.sigma[c, vertex], out.c_ls[c, vertex] = pixels.px[good], sigma, pixels.c_ls[good]
+            out.weight[c, vertex] = smooth_sigma(view.px[good], np.maximum(sigma, _LEAST_SIGMA), cell)
+        return out
+
+    def _oblique(self, cameras: Sequence[Camera], xyz: Points) -> Mask:
+        """Which views (C, n) of points (n, 3) mm are more oblique than the settings allow; none where unknown."""
+        normals = Mesh(xyz, self.surface.faces).vertex_normals
+        limit = np.cos(np.radians(self._settings.surface.incidence_deg))
+        with np.errstate(invalid="ignore"):
+            return np.stack([camera.incidence_cosine(xyz, normals) < limit for camera in cameras])
 
     def _reference(self, rig: str, pairs: Sequence[tuple[str, str]]) -> Results:
         """The results of the reference alone, without standard deviations."""
@@ -253,13 +311,13 @@ class SurfaceSeries:
             return self.reference
         one: SurfaceStep = self._cache.get(step)
         reference, surface = self.reference, self.surface
-        noise, total = self._pixel_sigma(one)
+        total = self._pixel_sigma(one)
         gain = position_gain(self._cameras, one.xyz, one.weight.astype(float))
-        half = noise / np.sqrt(2.0)  # the share of either image
-        displacement = _root(covariance(gain, noise))
+        half = total / np.sqrt(2.0)  # the share of either image
+        displacement = _root(covariance(gain, total))
         position = _root(step_covariance((self._gain, gain), surface.scatter, (half, half), surface.own, self._label))
         strains = deformation(surface.xyz, one.xyz, surface.faces)
-        stretches = stretch_sigma(strains, surface.xyz, surface.faces, gain, self._correlation, noise)
+        stretches = stretch_sigma(strains, surface.xyz, surface.faces, gain, self._correlation, total)
         lost = ~np.isfinite(one.xyz).all(axis=1)
         position[lost], displacement[lost] = np.nan, np.nan
         stretches[~np.isfinite(strains.J)] = np.nan
@@ -283,9 +341,9 @@ class SurfaceSeries:
             matches=tuple(self._matches(each, one, total, used) for each in reference.matches),
         )
 
-    def _pixel_sigma(self, step: SurfaceStep) -> tuple[Floats, Floats]:
-        """Standard deviations (C, N, 2) px of the displacements in each camera: due to noise, and due to all causes."""
-        noise, total = np.full(step.px.shape, np.nan), np.full(step.px.shape, np.nan)
+    def _pixel_sigma(self, step: SurfaceStep) -> Floats:
+        """Standard deviations (C, N, 2) px of the displacements in each camera, due to noise and to other change."""
+        total = np.full(step.px.shape, np.nan)
         for c, (view, texture) in enumerate(zip(self._views, self._textures, strict=True)):
             if not len(view.vertex):
                 continue
@@ -294,9 +352,8 @@ class SurfaceSeries:
                 step.sigma[c, view.vertex].astype(float), step.c_ls[c, view.vertex].astype(float),
                 (texture, texture), (variance, variance),
             )  # fmt: skip
-            noise[c, view.vertex] = np.hypot(parts.reference, parts.current)
-            total[c, view.vertex] = np.hypot(noise[c, view.vertex], parts.systematic)
-        return noise, total
+            total[c, view.vertex] = np.sqrt(parts.reference**2 + parts.current**2 + parts.systematic**2)
+        return total
 
     def _matches(self, reference: Matches, step: SurfaceStep, total: Floats, used: Mask) -> Matches:
         """Matches of one camera at the reference and at a step; good ones that contradict other cameras are marked."""

@@ -35,7 +35,7 @@ class ReferenceSurface:
     each match alone. texture : (C, N, 5), of `Chart`. grey_noise : (C,), variance of each camera's noise, grey
     levels², NaN where it took no part. chi2, degrees : (N,), of the triangulation. c_ls : (N,), the largest over the
     cameras. neighbours : (N, 4, 2), of `grid_neighbours`. lost : (K, 2), status and number of the points of charts
-    that were lost. mismatch : (P, 7), of every two charts that overlap.
+    that were lost.
     """
 
     xyz: Points

@@ -320,7 +320,7 @@ def _global_surface(matching: _Matching) -> MultiviewSurface:
 
 
 def _charts_surface(matching: _Matching) -> tuple[Series, dict[str, Floats], dict[str, Any], list[str]]:
-    """Match all cameras that have a reference image together, as tasks, and triangulate one surface."""
+    """Match every camera's part of the surface in all cameras that see it, as tasks, and triangulate one surface."""
     from ringdic.charts.series import SurfaceSeries
     from ringdic.charts.surface import ReferenceSurface
     from ringdic.charts.tasks import charts_job
@@ -336,11 +336,4 @@ def _charts_surface(matching: _Matching) -> tuple[Series, dict[str, Floats], dic
     series = SurfaceSeries(
         session.rig.name, cameras, matching.pairs, matching.names, surface, job.matches, settings, cache
     )
-    import numpy as np
-
-    views = float(np.isfinite(surface.px[..., 0]).sum(axis=0).mean())
-    residual = series.residual.copy()
-    residual[surface.own, np.arange(len(surface.xyz))] = np.nan
-    agreement = {"views": views, "residual_px": float(np.sqrt(np.nanmean(residual**2)))}
-    drift = {camera.id: series.drift[:, k] for k, camera in enumerate(cameras) if np.isfinite(series.drift[0, k])}
-    return series, drift, agreement, series.poses.sentences(matching.names)
+    return series, series.drift, series.agreement, series.warnings

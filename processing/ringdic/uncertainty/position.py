@@ -101,22 +101,23 @@ def step_covariance(
     gain_reference, gain_step = gains
     sigma_reference, sigma_step = tracked
     total = covariance(gain_step, sigma_step)
-    n = np.arange(len(reference))
     for k in range(len(gain_step)):
-        own_label = np.where((reference == k)[:, None, None], label, 0.0)
-        whole = np.nan_to_num(sigma_reference[k])
-        narrow = np.nan_to_num(sigma[k])
+        before, after = gain_reference[k].any(axis=(1, 2)), gain_step[k].any(axis=(1, 2))
+        index = np.flatnonzero(before | after | (reference == k))
+        own_label = np.where((reference[index] == k)[:, None, None], label[index], 0.0)
+        at_reference, at_step = gain_reference[k, index], gain_step[k, index]
+        whole = np.nan_to_num(sigma_reference[k, index])
+        narrow = np.nan_to_num(sigma[k, index])
         # Errors cancel only where the camera took part at the reference and at the step.
-        both = gain_reference[k].any(axis=(1, 2)) & gain_step[k].any(axis=(1, 2))
-        common = np.where(both[:, None], np.minimum(whole, narrow), 0.0)
+        common = np.where((before & after)[index, None], np.minimum(whole, narrow), 0.0)
         parts = (
-            ((gain_reference[k] - gain_step[k] - own_label), common),
-            (gain_reference[k] - own_label, np.sqrt(np.maximum(narrow**2 - common**2, 0.0))),
-            (gain_step[k], np.sqrt(np.maximum(whole**2 - common**2, 0.0))),
+            (at_reference - at_step - own_label, common),
+            (at_reference - own_label, np.sqrt(np.maximum(narrow**2 - common**2, 0.0))),
+            (at_step, np.sqrt(np.maximum(whole**2 - common**2, 0.0))),
         )
         for slope, part_sigma in parts:
-            scaled = slope * part_sigma[n, None, :]
-            total += scaled @ scaled.transpose(0, 2, 1)
+            scaled = slope * part_sigma[:, None, :]
+            total[index] += scaled @ scaled.transpose(0, 2, 1)
     return total
 
 
