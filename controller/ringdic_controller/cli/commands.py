@@ -73,6 +73,10 @@ def validate_command(
             metavar="NAME", help="One experiment; or bodies, rigs and rows of the gallery, by commas; repeatable."
         ),
     ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="A setting other than the default, for bodies; repeatable."),
+    ] = None,
     images_only: Annotated[bool, typer.Option("--images-only", help="Render the images and stop.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -81,7 +85,8 @@ def validate_command(
         from ringdic_controller.studies.gallery import run_gallery
 
         names = [name for each in only or () for name in each.split(",")]
-        findings = run_gallery(out, scale=0.3 if scale is None else scale, only=names, images_only=images_only)
+        size = 0.3 if scale is None else scale
+        findings = run_gallery(out, scale=size, only=names, overrides=overrides or (), images_only=images_only)
     else:
         from ringdic_controller.studies.validate import run_validation
 

@@ -1,4 +1,4 @@
-"""``ringdic validate --bodies``: render the gallery, measure every row at the defaults, and show the errors."""
+"""``ringdic validate --bodies``: render the gallery, measure every row, and show the errors."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from ringdic.jobs.pipeline import process_session
 from ringdic.progress import Progress, Report, progress_bar
 from ringdic.results.reader import read_results
 from ringdic.session.folder import open_session
-from ringdic.settings import Settings
+from ringdic.settings import Settings, load_settings
 from ringdic_node.virtual_rig.render import load_renderer
 
 from ringdic_controller.studies.gallery.comparison import judged
@@ -39,18 +40,27 @@ _FAULTS = (cv2.error, ValueError, IndexError, ArithmeticError)
 Captures = list[tuple[str, dict[str, RenderedShot]]]
 
 
-def run_gallery(folder: Path, *, scale: float, only: Sequence[str] = (), images_only: bool = False) -> dict[str, Any]:
+def run_gallery(
+    folder: Path,
+    *,
+    scale: float,
+    only: Sequence[str] = (),
+    overrides: Sequence[str] = (),
+    images_only: bool = False,
+) -> dict[str, Any]:
     """Measure the rows of the gallery, write tables and pictures into ``folder`` and return the table as JSON values.
 
-    scale : of the images. only : names of rows, bodies or rigs; all if empty. images_only : render missing images and
-    stop. Images of an earlier run in the folder are used again; every row is measured anew.
-    Raises InputError for a name that does not exist.
+    scale : of the images. only : names of rows, bodies or rigs; all if empty. overrides : settings other than the
+    defaults, as ``group.name=value``. images_only : render missing images and stop. Images of an earlier run in the
+    folder are used again; every row is measured anew.
+    Raises InputError for a name or a setting that does not exist.
     """
-    rows = gallery_rows(only)
+    rows, settings = gallery_rows(only), gallery_settings(scale, overrides)
+    about = {"folder": str(folder), "scale": scale, "settings": ", ".join(overrides) or "at the defaults"}
     folder.mkdir(parents=True, exist_ok=True)
     load_renderer()
     with progress_bar() as report:
-        gallery = _Gallery(folder, scale, report)
+        gallery = _Gallery(folder, scale, settings, report)
         entries = []
         for k, row in enumerate(rows):
             gallery.done = k / len(rows)
@@ -58,11 +68,11 @@ def run_gallery(folder: Path, *, scale: float, only: Sequence[str] = (), images_
             if not images_only:
                 entries.append(gallery.measure(row, captures))
                 say(_sentence(entries[-1], k + 1, len(rows)))
-                write_gallery(folder, entries, {"folder": str(folder), "scale": scale})
+                write_gallery(folder, entries, about)
     if images_only:
-        return {"folder": str(folder), "scale": scale, "rows": [row.name for row in rows]}
-    totals = write_gallery(folder, entries, {"folder": str(folder), "scale": scale})
-    show_table("Bodies of the virtual rig at the defaults; mm", [entry.short_cells() for entry in entries])
+        return {**about, "rows": [row.name for row in rows]}
+    totals = write_gallery(folder, entries, about)
+    show_table(f"Bodies of the virtual rig, {about['settings']}; mm", [entry.short_cells() for entry in entries])
     for entry in entries:
         if entry.refusal:
             say(f"{entry.name}: {entry.refusal}")
@@ -71,9 +81,9 @@ def run_gallery(folder: Path, *, scale: float, only: Sequence[str] = (), images_
     return totals
 
 
-def gallery_settings(scale: float) -> Settings:
-    """The default settings, with subsets for images of a scale."""
-    settings = Settings()
+def gallery_settings(scale: float, overrides: Sequence[str] = ()) -> Settings:
+    """The default settings, or others where they are given, with subsets for images of a scale."""
+    settings = load_settings(None, overrides)
     return settings.model_copy(update={"correlation": settings.correlation.at_scale(scale)})
 
 
@@ -83,6 +93,7 @@ class _Gallery:
 
     folder: Path
     scale: float
+    settings: Settings
     report: Report
     done: float = 0.0
     calibrated: dict[str, Path] = field(default_factory=dict)
@@ -102,13 +113,12 @@ class _Gallery:
         return captures
 
     def measure(self, row: GalleryRow, captures: Captures) -> GalleryEntry:
-        """Process a row at the defaults and compare it with the truth; a refusal is an entry with its sentence."""
-        settings = gallery_settings(self.scale)
+        """Process a row and compare it with the truth; a refusal is an entry with its sentence."""
         began = time.monotonic()
         try:
-            session = self._session(row.name, row.rig, captures, self._calibrated(row, captures, settings))
+            session = self._session(row.name, row.rig, captures, self._calibrated(row, captures))
             began = time.monotonic()
-            run = process_session(session, settings, self._renamed(row.name))
+            run = process_session(session, self.settings, self._renamed(row.name))
         except RingdicError as error:
             return GalleryEntry(row.name, time.monotonic() - began, refusal=str(error))
         except _FAULTS as error:
@@ -126,14 +136,13 @@ class _Gallery:
         draw_row(picture, _sentence(entry), judgement, results.vertices_ref)
         return GalleryEntry(row.name, entry.seconds, entry.figures, warnings=warnings, picture=picture.name)
 
-    def _calibrated(self, row: GalleryRow, captures: Captures, settings: Settings) -> Path:
+    def _calibrated(self, row: GalleryRow, captures: Captures) -> Path:
         """The session in which the row's rig is calibrated, once for all rows."""
         if row.rig not in self.calibrated:
             alone = [each for each in captures if each[0] != "specimen"]
             path = self._session(f"calibration-{row.rig}", row.rig, alone)
-            calibrate_rig(
-                open_session(path), settings.calibration, lambda done, who: self._tell(f"{row.rig}: calibrate", who)
-            )
+            report = partial(self._calibrating, row.rig)
+            calibrate_rig(open_session(path), self.settings.calibration, report)
             self.calibrated[row.rig] = path
         return self.calibrated[row.rig]
 
@@ -144,6 +153,9 @@ class _Gallery:
         path.parent.mkdir(exist_ok=True)
         toml = gallery_rig(rig, self.scale).rig_toml()
         return make_session(path, toml, captures, self.images, calibration=calibration)
+
+    def _calibrating(self, rig: str, _: float, who: str) -> None:
+        self._tell(f"{rig}: calibrate", who)
 
     def _tell(self, stage: str, message: str) -> None:
         self.report(Progress(stage, self.done, message))

@@ -105,7 +105,7 @@ def write_gallery(folder: Path, entries: Sequence[GalleryEntry], about: Mapping[
     totals = {**about, "rows": len(entries), "reached": reached, "entries": [entry.to_dict() for entry in entries]}
     (folder / "gallery.json").write_text(json.dumps(totals, indent=1, ensure_ascii=False), encoding="utf-8")
     lines = [
-        "# Bodies of the virtual rig, measured at the defaults",
+        f"# Bodies of the virtual rig, {about.get('settings', 'at the defaults')}",
         "",
         f"Images of scale {about['scale']}; {reached} of {len(entries)} rows reach all aims. {AIMS}",
         "Over σ: RMS / robust. Later: covered before and after the motion.",
