@@ -39,8 +39,9 @@ lint: $(VENV)/.installed-test          ## style, types and the walls between the
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-test: lint                             ## style, types and the whole suite
-	$(BIN)/python -m pytest $(PYTEST)
+test: $(VENV)/.installed-test          ## style, types and the whole suite; the kernels are compiled meanwhile
+	$(BIN)/python -m ringdic.jobs.compiling & $(MAKE) --no-print-directory lint && wait && \
+	  $(BIN)/python -m pytest $(PYTEST)
 
 test-narrow: $(VENV)/.installed-test   ## the kernels compiled for an x86-64 processor without AVX-512
 	NUMBA_CPU_NAME=haswell NUMBA_CPU_FEATURES="$(NARROW)" NUMBA_CACHE_DIR=build/narrow \

@@ -349,7 +349,7 @@ def test_a_bad_session_is_not_processed(
         (("--set", "correlation.radius=5"), ["unknown setting 'correlation.radius'", "radius_px"]),
         (("--set", "correlaton.radius_px=5"), ["unknown group of settings 'correlaton'", "correlation"]),
         (("--set", "calibration.method=clicks"), ["calibration.method", "'dlt' or 'bundle'", "'clicks'"]),
-        (("--set", "surface.method=clicks"), ["surface.method", "'pairs' or 'global'", "'clicks'"]),
+        (("--set", "surface.method=clicks"), ["surface.method", "'pairs', 'global' or 'charts'", "'clicks'"]),
         (("--set", "strain.window_mm=-4"), ["strain.window_mm", "greater than or equal to 0", "-4"]),
         (("--set", "radius"), ["--set radius", "group.name=value", "correlation.radius_px=20"]),
         (("--set", "correlation.radius_px=large"), ["correlation.radius_px must be a whole number", "'large'"]),

@@ -18,7 +18,7 @@ from ringdic.correlation import CorrelationSettings, Reference
 from ringdic.correlation.quadratic import LowerQuartiles, Neighbourhoods, QuadraticFit
 from ringdic.correlation.seeds import even_sample
 
-_APART = 1.0  # subset radii, side of the squares with one knot each
+_APART = 0.8  # subset radii, side of the squares with one knot each
 _REACH = 3.0  # subset radii about a knot, of the neighbours that its curvature and bias are computed from
 _SCATTERS = 8.0  # standard deviations from the neighbours' quadratic beyond which a point contradicts it
 _LEAST_OFF = 0.1  # px, least distance that is a contradiction

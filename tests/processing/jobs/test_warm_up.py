@@ -10,7 +10,7 @@ from ringdic.settings import load_settings
 
 MODULES = (
     "mesh.adjacency", "mesh.kernels", "mesh.nearest", "mesh.projection", "geometry.lens", "geometry.kernels",
-    "pairs.merging.kernels", "pairs.merging.mismatch", "pairs.merging.stars", "results.ranges", "strain.kernels",
+    "merging.kernels", "merging.mismatch", "merging.stars", "results.ranges", "strain.kernels",
 )  # fmt: skip
 
 
@@ -28,6 +28,6 @@ def compiled() -> set[tuple[str, str]]:
 def test_a_job_needs_no_kernel_that_the_warm_up_left_out(session: Path) -> None:
     run_small_plate()
     before = compiled()
-    assert any(name == "pairs.merging.stars.stars" for name, _ in before)
+    assert any(name == "merging.stars.stars" for name, _ in before)
     process_session(session, load_settings(None, ["correlation.radius_px=12", "correlation.step_px=8"]))
     assert sorted(compiled() - before) == []
