@@ -99,8 +99,9 @@ def match_chart(
         _View(images.cameras[other], reference, images.current(other), np.flatnonzero(plan.sees[nearest, other]))
         for other in partners.tolist()
     ]
+    stencil = patches.stencil(camera, _reach(settings))
     for slot, view in enumerate(views, start=1):
-        _enter(out, slot, view.index, view.first_pass(xy, patches.stencil(camera, _reach(settings)), settings))
+        _enter(out, slot, view.index, view.first_pass(xy, stencil, settings))
     refined = _measured_patches([images.cameras[c] for c in cameras], out, depth_map, settings)
     if refined is None:
         return out

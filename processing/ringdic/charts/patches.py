@@ -19,7 +19,7 @@ from ringdic.arrays import Floats, Indices, Pixels, Points, Vectors
 from ringdic.geometry.camera import Camera
 
 #: Offsets of the central differences, in units of the reach: centre, ± x, ± y, and the four corners.
-_STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]], dtype=float)
+STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]], dtype=float)
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Patches:
 
     def normals(self, camera: Camera) -> Vectors:
         """Normals of the patches, towards the camera, (n, 3) of unit length, no unit."""
-        right, left, down, up = np.moveaxis(self.points(camera, _STENCIL[1:5]), 1, 0)
+        right, left, down, up = np.moveaxis(self.points(camera, STENCIL[1:5]), 1, 0)
         normals = np.cross(right - left, down - up)
         towards = camera.centre - right
         normals *= np.sign(np.sum(normals * towards, axis=1, keepdims=True))
@@ -64,7 +64,7 @@ class Patches:
 
     def stencil(self, camera: Camera, reach: float) -> Points:
         """Points of the patches from whose projections `warps_between` takes derivatives, (n, 9, 3) mm. reach : px."""
-        return self.points(camera, reach * _STENCIL)
+        return self.points(camera, reach * STENCIL)
 
 
 def axial_rays(camera: Camera, px: Pixels) -> Vectors:
@@ -91,7 +91,7 @@ def warps_between(camera: Camera, px: Pixels, stencil: Points, reach: float) -> 
     ``reach``, px, about the radius of a subset. Returns (n, 12) u v ux uy vx vy uxx uxy uyy vxx vxy vyy, in px and its
     powers.
     """
-    displacement = camera.project(stencil) - (px[:, None, :] + reach * _STENCIL)
+    displacement = camera.project(stencil) - (px[:, None, :] + reach * STENCIL)
     centre, right, left, below, above, br, bl, ar, al = np.moveaxis(displacement, 1, 0)
     first = np.stack([(right - left) / (2 * reach), (below - above) / (2 * reach)], axis=-1)  # (n, u v, x y)
     second = np.stack(
@@ -125,7 +125,7 @@ def patches_from_warps(
     The patches, without curvature, and the derivative of the second camera's pixel by the inverse depth, (n,) px mm.
     """
     inverse = 1.0 / depths(first, xyz)
-    rays = axial_rays(first, px[:, None] + _STENCIL[:5])
+    rays = axial_rays(first, px[:, None] + STENCIL[:5])
     by_x, by_y = 0.5 * (rays[:, 1] - rays[:, 2]), 0.5 * (rays[:, 3] - rays[:, 4])
     _, jacobian = second.project_with_jacobian(xyz)
     plain = jacobian @ np.stack([by_x, by_y], axis=-1) / inverse[:, None, None]  # (n, 2, 2) with ∇ω = 0

@@ -19,6 +19,7 @@ from ringdic.charts.agreement import triangulate_agreeing
 from ringdic.charts.chart import texture_of
 from ringdic.charts.surface import ReferenceSurface
 from ringdic.charts.tracking import CameraMatches, interpolate_matches
+from ringdic.charts.views import facing_pairs
 from ringdic.charts.weights import CELL_STEPS, smooth_sigma
 from ringdic.correlation import Status
 from ringdic.geometry.camera import Camera
@@ -58,13 +59,10 @@ class CameraView:
     px: Pixels
 
 
-def camera_views(cameras: Sequence[Camera], surface: ReferenceSurface) -> list[CameraView]:
-    """The points of a surface that each camera sees."""
-    views = []
-    for camera, px in zip(cameras, surface.px, strict=True):
-        vertex = np.flatnonzero(np.isfinite(px[:, 0]))
-        views.append(CameraView(vertex, camera.project(surface.xyz[vertex])))
-    return views
+def camera_view(camera: Camera, k: int, surface: ReferenceSurface) -> CameraView:
+    """The points of a surface that camera number k sees."""
+    vertex = np.flatnonzero(np.isfinite(surface.px[k, :, 0]))
+    return CameraView(vertex, camera.project(surface.xyz[vertex]))
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,7 @@ class SurfaceSeries:
     ) -> None:  # fmt: skip
         self.names, self.surface, self._cameras = tuple(names), surface, tuple(cameras)
         self._settings, self._cache = settings, cache
-        self._views = camera_views(cameras, surface)
+        self._views = [camera_view(camera, c, surface) for c, camera in enumerate(cameras)]
         self._textures = [texture_of(surface.texture[k, view.vertex]) for k, view in enumerate(self._views)]
         self.poses = RefinedCameras(cameras)
         refine = self.poses if settings.calibration.refine_poses else None
@@ -381,17 +379,7 @@ def _facing_pairs(
     normals = Mesh(surface.xyz, surface.faces).vertex_normals
     squarely = np.stack([camera.incidence_cosine(surface.xyz, normals) for camera in cameras])
     squarely = np.where(np.isfinite(surface.px[..., 0]) & np.isfinite(squarely), squarely, -2.0)
-    best = np.sort(np.argsort(-squarely, axis=0)[:2], axis=0)
-    listed = [(first, second) for first, second in pairs]
-    index = {frozenset(pair): k for k, pair in enumerate(listed)}
-    vertex_pair = np.empty(len(surface.xyz), np.int64)
-    for a, b in np.unique(best, axis=1).T:
-        pair = (cameras[a].id, cameras[b].id)
-        if frozenset(pair) not in index:
-            index[frozenset(pair)] = len(listed)
-            listed.append(pair)
-        vertex_pair[(best[0] == a) & (best[1] == b)] = index[frozenset(pair)]
-    return tuple(listed), vertex_pair
+    return facing_pairs(cameras, pairs, squarely)
 
 
 def _root(covariances: Floats) -> Floats:
@@ -400,5 +388,5 @@ def _root(covariances: Floats) -> Floats:
 
 
 def _sample(values: NDArray[Any]) -> NDArray[Any]:
-    """Every so manieth of values (n,), about two thousand, of which a median is taken."""
+    """An evenly spaced sample of about two thousand of some values (n,), enough for their median."""
     return values[:: max(1, len(values) // 2000)]

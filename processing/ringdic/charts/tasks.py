@@ -19,7 +19,7 @@ from ringdic.charts.images import ChartImages
 from ringdic.charts.matching import match_chart
 from ringdic.charts.patches import Patches
 from ringdic.charts.plane_sweep import DepthRange
-from ringdic.charts.series import camera_views
+from ringdic.charts.series import camera_view
 from ringdic.charts.surface import ReferenceSurface, reference_surface
 from ringdic.charts.tracked_points import TrackedPoints, tracked_points
 from ringdic.charts.tracking import CameraMatches, match_in_two_passes, surface_grid
@@ -217,7 +217,7 @@ def _reference_and_points(
 
     def make() -> tuple[Reference, TrackedPoints]:
         measured = ReferenceSurface.from_arrays(read_output(surface))
-        view = camera_views(cameras, measured)[k]
+        view = camera_view(camera, k, measured)
         if not len(view.vertex):
             raise ComputationError(f"camera {camera.id}: it shares no measured point of the surface with another")
         px = np.full((len(measured.xyz), 2), np.nan)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ringdic.arrays import Image, Mask, Pixels, Points, Vectors
+from ringdic.arrays import Floats, Image, Indices, Mask, Pixels, Points, Vectors
 from ringdic.charts.depth_map import DepthMap
 from ringdic.charts.patches import depths
 from ringdic.geometry.camera import Camera
@@ -64,6 +64,29 @@ def plan_chart(
         sees[:, c] = (cosine > limit) & ~hidden & _inside(cameras[c], view.xyz)
     usable = (own > limit) & sees.any(axis=1)
     return ChartPlan(_dilated(maps[k], usable & (own >= squarest)) & usable, sees)
+
+
+def facing_pairs(
+    cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]], squarely: Floats
+) -> tuple[tuple[tuple[str, str], ...], Indices]:
+    """Pair of cameras that face each point most squarely.
+
+    cameras : the C cameras. pairs : ids of neighbouring cameras. squarely : (C, n), no unit, cosine of the angle of
+    incidence; -1 or less where a camera did not measure the point.
+    Returns the pairs of camera ids, with pairs that are not among those given appended, and the index (n,) of each
+    point's pair among them.
+    """
+    best = np.sort(np.argsort(-squarely, axis=0)[:2], axis=0)
+    listed = [(first, second) for first, second in pairs]
+    index = {frozenset(pair): k for k, pair in enumerate(listed)}
+    pair_of_point = np.empty(squarely.shape[1], np.int64)
+    for a, b in np.unique(best, axis=1).T:
+        pair = (cameras[a].id, cameras[b].id)
+        if frozenset(pair) not in index:
+            index[frozenset(pair)] = len(listed)
+            listed.append(pair)
+        pair_of_point[(best[0] == a) & (best[1] == b)] = index[frozenset(pair)]
+    return tuple(listed), pair_of_point
 
 
 class _MapViews:

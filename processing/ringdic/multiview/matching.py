@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Image, Indices, Mask, Pixels
+from ringdic.charts.patches import warps_between
 from ringdic.correlation import (
     CorrelationSettings,
     Current,
@@ -24,7 +25,7 @@ from ringdic.correlation.prepared import Box
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.multiview.lattice import Pieces
-from ringdic.multiview.warps import surface_stencil, warps_to
+from ringdic.multiview.warps import surface_stencil
 from ringdic.uncertainty.matches import match_uncertainty
 from ringdic.uncertainty.noise import flat_noise
 from ringdic.uncertainty.texture import Texture, TextureMap, texture_map
@@ -170,7 +171,7 @@ def match_nodes(
             )
             filtered = images.reference(a, at)
             px[a, own], c_ls[a, own] = at, 0.0
-        start = warps_to(images.cameras[b], at, stencil, reach)
+        start = warps_between(images.cameras[b], at, stencil, reach)
         if not curved:
             start[:, 6:] = 0.0
         chosen = np.flatnonzero(partners[b, own] & np.isfinite(start).all(axis=1))

@@ -14,6 +14,7 @@ import numpy as np
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels
 from ringdic.calibration.refined_cameras import RefinedCameras
+from ringdic.charts.views import facing_pairs
 from ringdic.correlation import Status
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
@@ -212,17 +213,7 @@ def _facing_pairs(
     """
     squarely = incidence(shape.pieces, cameras)[:, shape.node[:, 0], shape.node[:, 1]]
     squarely = np.where(np.isfinite(shape.px[..., 0]) & np.isfinite(squarely), squarely, -1.0)
-    best = np.sort(np.argsort(-squarely, axis=0)[:2], axis=0)
-    listed = [(first, second) for first, second in pairs]
-    index = {frozenset(pair): k for k, pair in enumerate(listed)}
-    vertex_pair = np.empty(len(shape.xyz), np.int64)
-    for a, b in np.unique(best, axis=1).T:
-        pair = (cameras[a].id, cameras[b].id)
-        if frozenset(pair) not in index:
-            index[frozenset(pair)] = len(listed)
-            listed.append(pair)
-        vertex_pair[(best[0] == a) & (best[1] == b)] = index[frozenset(pair)]
-    return tuple(listed), vertex_pair
+    return facing_pairs(cameras, pairs, squarely)
 
 
 def _matches(cameras: Sequence[Camera], track: VertexTrack, shape: ReferenceShape) -> Matches:

@@ -9,11 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from ringdic.arrays import Floats, Pixels, Points
+from ringdic.charts.patches import STENCIL
 from ringdic.geometry.camera import Camera
 from ringdic.multiview.lattice import SurfaceLattice, evaluate
 
-#: Offsets of the central differences, in units of the reach: centre, ± x, ± y, and the four corners.
-_STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]], dtype=float)
 _NEWTON = 6  # iterations
 
 
@@ -33,9 +32,9 @@ def surface_stencil(
 
     Returns
     -------
-    Positions (n, 9, 3) mm, world frame, in the order of ``_STENCIL``; NaN where a line of sight misses the piece.
+    Positions (n, 9, 3) mm, world frame, in the order of ``STENCIL``; NaN where a line of sight misses the piece.
     """
-    d = camera.ray(px[:, None, :] + reach * _STENCIL)
+    d = camera.ray(px[:, None, :] + reach * STENCIL)
     origin = camera.centre
     radius = coefficients[:, 0]
     node = np.stack([radius * np.cos(theta), radius * np.sin(theta), z], axis=-1)
@@ -52,23 +51,3 @@ def surface_stencil(
             step = np.where(np.abs(slope) > 1e-3, (rho - value) / slope, np.nan)
         t = t - np.clip(step, -20.0, 20.0)
     return np.where(np.abs(step)[..., None] < 1e-6, origin + t[..., None] * d, np.nan)
-
-
-def warps_to(camera: Camera, px: Pixels, stencil: Points, reach: float) -> Floats:
-    """Warps from a reference camera into another one, by central differences of the projections of a stencil.
-
-    px : (n, 2) float64, px, in the reference camera. stencil : (n, 9, 3) mm, of :func:`surface_stencil` with the same
-    ``reach``, px. Returns (n, 12) u v ux uy vx vy uxx uxy uyy vxx vxy vyy, in px and its powers.
-    """
-    displacement = camera.project(stencil) - (px[:, None, :] + reach * _STENCIL)
-    centre, right, left, below, above, br, bl, ar, al = np.moveaxis(displacement, 1, 0)
-    first = np.stack([(right - left) / (2 * reach), (below - above) / (2 * reach)], axis=-1)  # (n, u v, x y)
-    second = np.stack(
-        [
-            (right - 2 * centre + left) / reach**2,
-            (br - bl - ar + al) / (4 * reach**2),
-            (below - 2 * centre + above) / reach**2,
-        ],
-        axis=-1,
-    )
-    return np.concatenate([centre, first.reshape(-1, 4), second.reshape(-1, 6)], axis=1)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from ringdic.charts.agreement import triangulate_agreeing
+from ringdic.charts.patches import warps_between
 from ringdic.correlation import CorrelationSettings
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera, Intrinsics
@@ -20,7 +21,7 @@ from ringdic.multiview.surface import pair_indices, shape_settings, surface_of_t
 from ringdic.multiview.tasks import MultiviewJob, shape_task
 from ringdic.multiview.tube import lattice_faces
 from ringdic.multiview.views import visibility
-from ringdic.multiview.warps import surface_stencil, warps_to
+from ringdic.multiview.warps import surface_stencil
 from ringdic.results.reader import read_results
 from ringdic.results.writer import write_results
 from ringdic.settings import BEST, CorrelationGroup
@@ -63,7 +64,7 @@ def test_warps_are_those_of_exact_lines_of_sight_to_a_cylinder() -> None:
     px = np.rint(first.project(pieces.xyz[nodes]))
     stencil = surface_stencil(LATTICE, pieces.coefficients[nodes], theta, z, first, px, 3.0)
     assert np.abs(np.hypot(stencil[..., 0], stencil[..., 1]) - 57.0).max() < 1e-9
-    warps = warps_to(second, px, stencil, 3.0)
+    warps = warps_between(second, px, stencil, 3.0)
 
     def moved(dx: float, dy: float) -> np.ndarray:
         at = px + np.array([dx, dy])
