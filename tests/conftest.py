@@ -33,6 +33,21 @@ def shared_data() -> Path:
     return path
 
 
+@pytest.fixture(scope="session")
+def shared_cases() -> Path:
+    """The folder of small inputs with known answers: ``shared/cases`` beside the checkout, or RINGDIC_SHARED_CASES.
+
+    Where only the folder of reference data is named, the one beside that.
+    """
+    default = Path(__file__).resolve().parents[2] / "shared" / "cases"
+    if "RINGDIC_SHARED_DATA" in os.environ:
+        default = Path(os.environ["RINGDIC_SHARED_DATA"]).parent / "cases"
+    path = Path(os.environ.get("RINGDIC_SHARED_CASES", default))
+    if not (path / "README.md").is_file():
+        _skip_or_fail(f"SKIPPED FOR WANT OF DATA: no shared cases at {path}")
+    return path
+
+
 _TARGET_AND_BOARD = """
 [target]
 kind = "dot-cylinder"

@@ -29,11 +29,11 @@ Lost points
 The front door
 --------------
 ``ringdic.api`` offers what is listed in ``__all__``; the names are loaded when they are first used. Below it lie the
-rooms, by storey: ``jobs`` processes whole sessions; ``report`` writes their reports; ``pairs``, ``multiview`` and
-``charts`` measure surfaces, ``export``, ``pictures`` and ``measure`` make something of them; ``results`` holds fields
-and the results' file; ``sweep`` and ``uncertainty``; ``calibration`` and ``correlation``; ``tasks`` keeps what was
-computed; ``session`` reads what was captured, ``strain`` computes the deformation of a mesh and ``merging`` makes
-several meshes one; ``mesh`` and ``geometry``.
+rooms, by storey: ``jobs`` processes whole sessions; ``report`` writes their reports; ``charts`` measures the surface,
+``export``, ``pictures`` and ``measure`` make something of it; ``results`` holds fields and the results' file;
+``uncertainty``; ``calibration`` and ``correlation``; ``tasks`` keeps what was computed; ``session`` reads what was
+captured, ``strain`` computes the deformation of a mesh and ``merging`` makes several meshes one; ``mesh`` and
+``geometry``.
 """
 
 from __future__ import annotations

@@ -388,9 +388,11 @@ def _settings(settings: Settings | str | Path | None, changes: Sequence[str] | M
     elif isinstance(changes, str):
         changes = [changes]
     if isinstance(settings, Settings):
-        groups = settings.model_dump().items()
+        groups = settings.model_dump(exclude={"method"}).items()
         own = [_assignment(f"{group}.{name}", value) for group, values in groups for name, value in values.items()]
-        return load_settings(None, [*own, *changes])
+        if settings.calibration.method == Settings(method=settings.method).calibration.method:
+            own.remove(_assignment("calibration.method", settings.calibration.method))  # it follows the method
+        return load_settings(None, [_assignment("method", settings.method), *own, *changes])
     return load_settings(None if settings is None else Path(settings), list(changes))
 
 

@@ -87,7 +87,7 @@ class CalibrationGroup(_Group):
     """Settings of the calibration of the cameras.
 
     method : each camera by the direct linear transformation (dlt), or from there all cameras, their lenses and the
-        target adjusted together (bundle).
+        target adjusted together (bundle); the default is dlt where the settings' own method is paper.
     distortion : whether the lens is measured on the checkerboard and corrected.
     radial_terms, tangential, skew : number of radial terms, and whether the lens may have tangential terms and skew.
     terms : a lens gets as many of these terms as the checkerboard views determine (largest), or those with the smallest
@@ -97,11 +97,11 @@ class CalibrationGroup(_Group):
     print_error_mm, radius_error_mm, pitch_error_mm, tilt_error_deg : for method bundle; prior standard deviations of
         the dots' positions, the target's radius, the spacing of its columns and the rotation of the printed sheet about
         their values in rig.toml; 0 fixes a quantity at that value.
-    refine_poses : for surface.method global; where cameras have moved between the steps, their poses are estimated
-        again from the points that they track.
+    refine_poses : where cameras have moved between the steps, their poses are estimated again from the points that they
+        track.
     """
 
-    method: Literal["dlt", "bundle"] = "dlt"
+    method: Literal["dlt", "bundle"] = "bundle"
     distortion: bool = True
     radial_terms: Literal[2, 3] = 3
     tangential: bool = True
@@ -116,44 +116,18 @@ class CalibrationGroup(_Group):
 
 
 class SurfaceGroup(_Group):
-    """Settings of the surface: how it is reconstructed from the matches, and where in space it is searched for.
+    """Settings of the surface: how its parts become one, and which matches it is made of.
 
-    method : the surfaces of the camera pairs side by side (pairs); one lattice of points over the surface, each
-        measured by all cameras that see it (global); or each camera's grid over the part that it faces most squarely,
-        each point measured by all cameras that see it, for bodies of any shape (charts).
-    merge : how the pairs' surfaces become one: which triangles of an overlap are removed first, those worst by
-        correlation, by distance to the other surfaces, by orientation against theirs, or by all of these and the
-        nearness to the border (combined); none leaves the surfaces one over the other.
-    radius_mm : radius of the cylinder about which the surface is searched for; 0 takes the target's.
-    reach_mm : largest distance of the surface from that cylinder.
+    merge : how the cameras' charts, or the pairs' surfaces, become one: which triangles of an overlap are removed
+        first, those worst by correlation, by distance to the other surfaces, by orientation against theirs, or by all
+        of these and the nearness to the border (combined); none leaves the surfaces one over the other.
     incidence_deg : largest angle between a line of sight and the surface's normal at which a camera is used.
     sigma_max_px : largest standard deviation of a match; a point with a larger one, as where the speckle ends, is lost.
-    spacing_mm : spacing of the lattice; 0 takes the correlation's step as the cameras see it.
-    curvature : second derivatives of the warps between cameras, held at those of the measured shape (geometry), or
-        none.
     """
 
-    method: Literal["pairs", "global", "charts"] = "pairs"
     merge: Literal["none", "correlation", "distance", "orientation", "combined"] = "combined"
-    radius_mm: float = Field(default=0.0, ge=0)
-    reach_mm: float = Field(default=20.0, gt=0)
     incidence_deg: float = Field(default=65.0, gt=0, lt=90)
     sigma_max_px: float = Field(default=0.05, gt=0)
-    spacing_mm: float = Field(default=0.0, ge=0)
-    curvature: Literal["geometry", "none"] = "geometry"
-
-
-class TrackingGroup(_Group):
-    """Settings of the tracking of points in time, used where surface.method is global.
-
-    two_pass : whether points are matched a second time with affine shape functions, the warp's second derivatives held
-        at those of the neighbouring points' displacements.
-    update_reference : whether a point that is lost against the reference image is matched from the last image in which
-        it was matched.
-    """
-
-    two_pass: bool = True
-    update_reference: bool = True
 
 
 class StrainGroup(_Group):
@@ -166,39 +140,53 @@ class StrainGroup(_Group):
 
 
 class Settings(_Group):
-    """Settings of a processing run, in groups."""
+    """Settings of a processing run, in groups.
 
+    method : best measures every point by all cameras that see it, with the curvature of the surface and of its
+        displacement, after a bundle adjustment of the cameras. paper works as Solav et al. (2018): each camera by the
+        direct linear transformation, each pair of neighbouring cameras a surface of its own, flat subsets.
+    """
+
+    method: Literal["best", "paper"] = "best"
     correlation: CorrelationGroup = CorrelationGroup()
     calibration: CalibrationGroup = CalibrationGroup()
     surface: SurfaceGroup = SurfaceGroup()
-    tracking: TrackingGroup = TrackingGroup()
     strain: StrainGroup = StrainGroup()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _calibration_of_the_method(cls, values: Any) -> Any:
+        """Unless it is given, the calibration's method is that of the settings' method."""
+        if not isinstance(values, dict) or values.get("method") != "paper":
+            return values
+        calibration = values.get("calibration", {})
+        if isinstance(calibration, CalibrationGroup):
+            calibration = calibration.model_dump(exclude_unset=True)
+        return {**values, "calibration": {"method": "dlt", **calibration}} if isinstance(calibration, dict) else values
 
     @model_validator(mode="after")
     def _poses_need_many_views(self) -> Settings:
-        if self.calibration.refine_poses and self.surface.method == "pairs":
+        if self.calibration.refine_poses and self.method == "paper":
             raise ValueError(
-                "calibration.refine_poses needs surface.method=global: two cameras alone do not tell a camera's motion "
-                "from the surface's"
+                "calibration.refine_poses needs method=best: two cameras alone do not tell a camera's motion from the "
+                "surface's"
             )
         return self
 
     def to_toml(self) -> str:
         """Write the settings as the text of a TOML file that `load_settings` reads back."""
-        lines: list[str] = []
-        for group, values in self.model_dump().items():
+        lines = [f"method = {_toml(self.method)}", ""]
+        for group, values in self.model_dump(exclude={"method"}).items():
             lines += [f"[{group}]", *(f"{name} = {_toml(value)}" for name, value in values.items()), ""]
         return "\n".join(lines)
 
 
 #: Settings of the paper: cameras by the direct linear transformation, affine subsets, surfaces pair by pair.
-PAPER = Settings()
-#: The most exact settings: all cameras adjusted together, one surface with its own curvature, two passes in time.
-BEST = Settings(calibration=CalibrationGroup(method="bundle"), surface=SurfaceGroup(method="global"))
+PAPER = Settings(method="paper")
 
 
 def load_settings(path: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
-    """Read settings from a TOML file and from ``group.name=value`` pairs.
+    """Read settings from a TOML file and from ``group.name=value`` pairs, or ``method=value``.
 
     Parameters
     ----------
@@ -237,11 +225,12 @@ def settings_of_run(text: str) -> Settings:
     """
     try:
         tables = tomllib.loads(text)
-        known = {
-            group: {name: value for name, value in values.items() if name in _fields(_inner(Settings, group))}
-            for group, values in tables.items()
-            if group in Settings.model_fields
-        }
+        known: dict[str, Any] = {}
+        for group, values in tables.items():
+            if isinstance(values, dict):
+                values = {name: value for name, value in values.items() if name in _fields(_inner(Settings, group))}
+            if group in Settings.model_fields:
+                known[group] = values
         return Settings.model_validate(known)
     except (tomllib.TOMLDecodeError, AttributeError) as error:
         raise InputError(f"the run's settings are not readable as TOML ({error})") from error
@@ -253,6 +242,9 @@ def _set(tables: dict[str, Any], override: str) -> None:
     """Enter a ``group.name=value`` pair in the tables."""
     name, equals, text = override.partition("=")
     group, dot, key = name.strip().partition(".")
+    if equals and not dot and _inner(Settings, group) is None and group in Settings.model_fields:
+        tables[group] = _value(text.strip())
+        return
     if not (equals and dot and group and key):
         raise InputError(f"--set {override}: not of the form group.name=value, such as correlation.radius_px=20")
     table = tables.setdefault(group, {})
@@ -380,12 +372,18 @@ def _inner(model: type, name: str) -> type | None:
     return next((each for each in (annotation, *get_args(annotation)) if _fields(each)), None)
 
 
+#: Settings of former versions for which the method stands now.
+_GONE = ("surface.method", "surface.curvature", "tracking")
+
+
 def _setting(_: type, at: Location) -> str:
     """A setting's name in the interface: ``correlation.radius_px``."""
     return ".".join(str(part) for part in at)
 
 
 def _unknown_setting(model: type, at: Location, known: Sequence[str]) -> str:
+    if _setting(model, at) in _GONE:
+        return f"{_setting(model, at)} is no longer a setting; choose method=best, or method=paper for the paper's way"
     if len(at) < 2:
         return f"unknown group of settings {_nearest(_setting(model, at), known)}; known are {', '.join(known)}"
     name = _nearest(_setting(model, at), [f"{at[0]}.{key}" for key in known])

@@ -15,12 +15,18 @@ import numpy as np
 from ringdic.geometry.camera import Camera
 from ringdic.results.results import Results
 from ringdic.results.series import select_steps
+from ringdic.results.unmeasured import UnmeasuredPlaces, unmeasured_areas
 from ringdic.results.writer import write_results
 from ringdic.session.folder import new_live, new_run, open_session
 
 AROUND, ALONG = 60, 16
 LOST = (400, 401, 402)
 STRETCH = 0.1
+BARE = (
+    UnmeasuredPlaces(
+        "01", np.array([[30.0, 20.0], [40.0, 20.0]]), 10.0, np.array([3, 16], np.int8), np.array([70.0, 50])
+    ),
+)
 
 
 def tube(steps: tuple[str, ...]) -> Results:
@@ -50,7 +56,11 @@ def tube(steps: tuple[str, ...]) -> Results:
         correlation=np.where(lost, np.nan, 0.02),
         sigma_xyz=np.where(lost[..., None], np.nan, np.full((*shape, 3), 0.01)),
         status=lost.astype(np.int8),
-        summary={"table": [{"quantity": "larger stretch", "measured": "1.1", "true": "1.1"}]},
+        summary={
+            "table": [{"quantity": "larger stretch", "measured": "1.1", "true": "1.1"}],
+            "unmeasured": unmeasured_areas(BARE, 37_000.0),
+        },
+        unmeasured=BARE,
     )
 
 

@@ -13,6 +13,7 @@ import pytest
 from ringdic.errors import InputError
 from ringdic.results.fields import OPTIONAL_ARRAYS
 from ringdic.results.reader import read_results, read_summary
+from ringdic.results.unmeasured import UnmeasuredPlaces
 from ringdic.results.writer import write_results
 from ringdic.session.folder import open_session
 from ringdic_node import wire
@@ -77,13 +78,13 @@ def test_fields_of_a_session_that_are_not_known_are_ignored(session: Path, name:
 
 
 def stored(path: Path, group: str) -> set[str]:
-    """The datasets below a group, cameras and matches under ID and K."""
+    """The datasets below a group, cameras and what they did not measure under ID, matches under K."""
     names: set[str] = set()
 
     def take(name: str, item: h5py.Group | h5py.Dataset) -> None:
         parts = name.split("/")
-        if parts[0] in ("cameras", "matches") and len(parts) > 1:
-            parts[1] = "ID" if parts[0] == "cameras" else "K"
+        if parts[0] in ("cameras", "matches", "unmeasured") and len(parts) > 1:
+            parts[1] = "K" if parts[0] == "matches" else "ID"
         if isinstance(item, h5py.Dataset):
             names.add("/".join(parts))
 
@@ -101,7 +102,8 @@ def complete(tutorial: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     known = {name: np.full(shapes[kind], 1e-3) for name, kind in OPTIONAL_ARRAYS.items()}
     settings = results.settings.replace("window_mm = 0.0", "window_mm = 12.0")
     path = tmp_path_factory.mktemp("complete") / "results.h5"
-    write_results(path, dataclasses.replace(results, settings=settings, **known))
+    bare = UnmeasuredPlaces(results.cameras[0].id, np.zeros((1, 2)), 15.0, np.ones(1, np.int8), np.ones(1))
+    write_results(path, dataclasses.replace(results, settings=settings, unmeasured=(bare,), **known))
     return path
 
 
@@ -115,9 +117,9 @@ def test_the_tables_name_the_arrays_of_results(tutorial: Any, complete: Path, he
     assert stored(complete, f"VTKHDF/{heading}") == names
 
 
-def test_the_tables_name_the_rest_of_results(tutorial: Any, named: Named) -> None:
-    assert stored(tutorial.results, "ringdic") == set(named("formats/results.md", "Datasets"))
-    with h5py.File(tutorial.results) as file:
+def test_the_tables_name_the_rest_of_results(complete: Path, named: Named) -> None:
+    assert stored(complete, "ringdic") == set(named("formats/results.md", "Datasets"))
+    with h5py.File(complete) as file:
         assert set(file["ringdic"].attrs) == set(named("formats/results.md", "Attributes"))
 
 

@@ -1,19 +1,11 @@
 """A small session of the virtual ring for the tests of whole runs."""
 
 import shutil
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
 from ringdic.calibration.calibrated_rig import calibrate_rig
-from ringdic.correlation import CorrelationSettings
-from ringdic.geometry.camera import Camera
-from ringdic.multiview.motion import Motion, surface_motion, vertex_track
-from ringdic.multiview.shape import ReferenceShape
-from ringdic.multiview.surface import reference_pixels
-from ringdic.multiview.tracking import CameraTrack, Tracking, at_reference, track_block
 from ringdic.session.folder import open_session
 from ringdic.session.importing import import_images
 from ringdic.settings import CalibrationGroup
@@ -50,44 +42,3 @@ def session(two_cameras: Path, tmp_path: Path) -> Path:
     process_memory.clear()
     shutil.copytree(two_cameras, tmp_path / "session", ignore=shutil.ignore_patterns("results", "work"))
     return tmp_path / "session"
-
-
-@pytest.fixture(scope="session")
-def track_camera() -> Callable[..., CameraTrack]:
-    """Call it with a camera's images, the reference first, and points to track: their track through all the steps."""
-
-    def track(
-        images: Sequence[np.ndarray | None],
-        x0: np.ndarray,
-        settings: CorrelationSettings,
-        options: Tracking | None = None,
-    ) -> CameraTrack:
-        block, _ = track_block(
-            images[0], images.__getitem__, range(1, len(images)), x0, None, settings, options or Tracking()
-        )
-        return CameraTrack.joined([at_reference(x0, images[0].shape), block])
-
-    return track
-
-
-@pytest.fixture(scope="session")
-def motion_of_shape(track_camera: Callable[..., CameraTrack]) -> Callable[..., Motion]:
-    """Call it with cameras, a reference shape and images by camera id and step: the shape's motion."""
-
-    def motion(
-        cameras: Sequence[Camera],
-        shape: ReferenceShape,
-        image: Callable[[str, int], np.ndarray | None],
-        steps: int,
-        settings: CorrelationSettings,
-        sigma_max: float,
-    ) -> Motion:
-        tracks = []
-        for k, camera in enumerate(cameras):
-            vertex, x0 = reference_pixels(camera, shape, k)
-            if len(vertex):
-                track = track_camera([image(camera.id, step) for step in range(steps)], x0, settings)
-                tracks.append(vertex_track(k, x0, vertex, shape, track, settings.step, sigma_max))
-        return surface_motion(cameras, shape, tracks, steps)
-
-    return motion

@@ -120,10 +120,11 @@ def test_progress_goes_to_a_function(speckle: np.ndarray) -> None:
 def test_settings_come_from_objects_files_and_single_values(tmp_path: Path) -> None:
     file = tmp_path / "settings.toml"
     file.write_text("[correlation]\nradius_px = 14\n", encoding="utf-8")
-    own = ringdic.api._settings(file, {"calibration.distortion": False, "surface.method": "global"})
-    assert (own.correlation.radius_px, own.calibration.distortion, own.surface.method) == (14, False, "global")
+    own = ringdic.api._settings(file, {"calibration.distortion": False, "method": "paper"})
+    assert (own.correlation.radius_px, own.calibration.distortion, own.method) == (14, False, "paper")
     assert ringdic.api._settings(own, ()) == own
     assert ringdic.api._settings(own, "strain.window_mm=3").strain.window_mm == 3.0
+    assert ringdic.api._settings(own, "method=best").calibration.method == "bundle"
     with pytest.raises(ringdic.InputError, match="unknown setting"):
         ringdic.process(tmp_path, set={"correlation.radius": 1}, progress=False)
 

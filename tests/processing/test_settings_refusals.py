@@ -9,18 +9,44 @@ from ringdic.errors import InputError
 from ringdic.settings import CorrelationGroup, Settings, load_settings, settings_of_run
 
 
-def test_the_defaults_are_the_papers() -> None:
+def test_the_defaults_are_the_best_method() -> None:
     settings = load_settings()
+    assert (settings.method, settings.calibration.method) == ("best", "bundle")
     assert (settings.correlation.radius_px, settings.correlation.step_px) == (20, 10)
     assert (settings.correlation.order, settings.correlation.subset) == (1, "circle")
-    assert (settings.calibration.method, settings.calibration.distortion) == ("dlt", True)
-    assert (settings.surface.method, settings.strain.window_mm) == ("pairs", 0.0)
+    assert (settings.calibration.distortion, settings.strain.window_mm) == (True, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "calibration"),
+    [
+        (["method=paper"], "dlt"),
+        (["method=paper", "calibration.distortion=false"], "dlt"),
+        (["calibration.method=bundle", "method=paper"], "bundle"),
+        (["calibration.method=dlt"], "dlt"),
+        (["method=best"], "bundle"),
+    ],
+)
+def test_the_method_decides_how_cameras_are_calibrated_unless_that_is_said(
+    overrides: list[str], calibration: str
+) -> None:
+    settings = load_settings(None, overrides)
+    assert settings.calibration.method == calibration
+    assert settings_of_run(settings.to_toml()) == settings
+
+
+def test_a_file_states_the_method_above_its_groups(tmp_path: Path) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text('method = "paper"\n[calibration]\nskew = false\n')
+    settings = load_settings(path)
+    assert (settings.method, settings.calibration.method, settings.calibration.skew) == ("paper", "dlt", False)
+    assert load_settings(path, ["method=best"]).calibration.method == "bundle"
 
 
 def test_a_file_is_read_and_an_override_wins_over_it(tmp_path: Path) -> None:
     path = tmp_path / "settings.toml"
     path.write_text('[correlation]\nradius_px = 12\nstep_px = 6\nsubset = "square"\n')
-    settings = load_settings(path, ["correlation.radius_px=14", "calibration.distortion=false", "surface.method=pairs"])
+    settings = load_settings(path, ["correlation.radius_px=14", "calibration.distortion=false"])
     assert settings.correlation.radius_px == 14
     assert settings.correlation.step_px == 6
     assert settings.correlation.subset == "square"
@@ -28,7 +54,9 @@ def test_a_file_is_read_and_an_override_wins_over_it(tmp_path: Path) -> None:
 
 
 def test_what_is_written_reads_back_the_same(tmp_path: Path) -> None:
-    settings = load_settings(None, ["correlation.tolerance=1e-7", "correlation.radius_px=33", "surface.reach_mm=12.5"])
+    settings = load_settings(
+        None, ["correlation.tolerance=1e-7", "correlation.radius_px=33", "surface.incidence_deg=50.5"]
+    )
     path = tmp_path / "settings.toml"
     path.write_text(settings.to_toml())
     assert load_settings(path) == settings
@@ -69,10 +97,12 @@ def test_the_correlation_understands_its_group() -> None:
         ("calibration.terms=best", ["calibration.terms", "'largest' or 'criterion'", "best"]),
         ("calibration.skew=perhaps", ["calibration.skew", "true or false"]),
         ("calibration.print_error_mm=-0.1", ["calibration.print_error_mm", "-0.1"]),
-        ("surface.curvature=guess", ["surface.curvature", "'geometry' or 'none'", "guess"]),
-        ("surface.method=magic", ["surface.method", "'pairs', 'global' or 'charts'", "magic"]),
+        ("method=magic", ["method", "'best' or 'paper'", "magic"]),
+        ("surface.method=global", ["surface.method is no longer a setting", "method=best", "method=paper"]),
+        ("surface.curvature=none", ["surface.curvature is no longer a setting", "method=best"]),
+        ("tracking.two_pass=false", ["tracking is no longer a setting", "method=best"]),
+        ("surface.merge=guess", ["surface.merge", "'combined'", "guess"]),
         ("strain.window_mm=-1", ["strain.window_mm", "greater than or equal to 0", "-1"]),
-        ("calibration.refine_poses=true", ["calibration.refine_poses needs surface.method=global"]),
         ("strain=5", ["group.name=value"]),
     ],
 )
@@ -111,3 +141,8 @@ def test_the_settings_of_a_run_of_another_version_can_be_read() -> None:
 def test_the_nearest_name_is_offered() -> None:
     with pytest.raises(InputError, match=r"did you mean 'correlation\.radius_px'"):
         load_settings(None, ["correlation.radius=20"])
+
+
+def test_two_cameras_cannot_refine_their_poses() -> None:
+    with pytest.raises(InputError, match=r"calibration\.refine_poses needs method=best"):
+        load_settings(None, ["method=paper", "calibration.refine_poses=true"])

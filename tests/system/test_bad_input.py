@@ -307,7 +307,7 @@ UNPROCESSABLE: dict[str, tuple[Callable[[Path], object], int, list[str]]] = {
     "mask beside the specimen": (
         mask_beside_the_specimen,
         NOT_COMPUTABLE,
-        ["cam_01 and cam_02", "inside the mask of camera cam_01"],
+        ["camera cam_01 does not match", "the contrast inside its mask is", "draw the mask on the specimen"],
     ),
     "no target": (without("target"), BAD_INPUT, ["no capture of the calibration target", "capture or import one"]),
     "no specimen": (without("specimen"), BAD_INPUT, ["no capture of the specimen", "capture or import"]),
@@ -329,7 +329,7 @@ UNPROCESSABLE: dict[str, tuple[Callable[[Path], object], int, list[str]]] = {
     "specimen without texture": (
         bare_specimen,
         NOT_COMPUTABLE,
-        ["cam_01 and cam_02", "no textured surface", "check that the specimen is speckled"],
+        ["no two cameras share a textured surface", "camera cam_01", "0 textured places", "speckle the specimen"],
     ),
 }
 
@@ -349,7 +349,7 @@ def test_a_bad_session_is_not_processed(
         (("--set", "correlation.radius=5"), ["unknown setting 'correlation.radius'", "radius_px"]),
         (("--set", "correlaton.radius_px=5"), ["unknown group of settings 'correlaton'", "correlation"]),
         (("--set", "calibration.method=clicks"), ["calibration.method", "'dlt' or 'bundle'", "'clicks'"]),
-        (("--set", "surface.method=clicks"), ["surface.method", "'pairs', 'global' or 'charts'", "'clicks'"]),
+        (("--set", "method=clicks"), ["method", "'best' or 'paper'", "'clicks'"]),
         (("--set", "strain.window_mm=-4"), ["strain.window_mm", "greater than or equal to 0", "-4"]),
         (("--set", "radius"), ["--set radius", "group.name=value", "correlation.radius_px=20"]),
         (("--set", "correlation.radius_px=large"), ["correlation.radius_px must be a whole number", "'large'"]),

@@ -36,7 +36,7 @@ from ringdic.jobs.cluster import ClusterExecutor  # noqa: E402 - after the check
 
 SCALE = 0.2
 STEPS = 4  # with the reference
-TASKS = 2 + 3 * (STEPS - 1)  # the reference images of two pairs, and for each of three cameras each later step
+TASKS = 7 + 3 * (STEPS - 1)  # depth map and chart of each of three cameras, the surface, and each later step of each
 SETTINGS = ["correlation.radius_px=10", "correlation.step_px=5"]
 Workers = Callable[..., "Worker"]
 
@@ -226,15 +226,6 @@ def test_a_cluster_finds_what_one_machine_finds(session: Path, local: Results, c
     assert [path.name for path in (session / "work").iterdir() if path.suffix != ".npz"] == [], (
         "no file of the handshake is left"
     )
-
-
-def test_one_surface_from_all_cameras_is_the_same_on_a_cluster(session: Path, crew: str, tmp_path: Path) -> None:
-    alone = Path(shutil.copytree(session, tmp_path / "alone"))
-    whole = settings("surface.method=global")
-    counted = Counted(ClusterExecutor(crew))
-    expected = read_results(process_session(alone, whole) / "results.h5")
-    same(process_session(session, whole, executor=counted), expected)
-    assert counted.made == 1 + 3, "the shape, and the steps of three cameras"
 
 
 def test_a_worker_killed_in_the_middle_costs_only_its_tasks(

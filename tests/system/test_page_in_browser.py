@@ -321,6 +321,21 @@ def test_every_control_of_the_results_does_what_it_says(page: Page, station: Sta
     assert Path(download.value.path()).read_bytes()[1:4] == b"HDF"
 
 
+def test_what_was_not_measured_is_told_by_reason_and_shown_on_the_photographs(page: Page, station: Station) -> None:
+    station.processed_session("bare")
+    page.select_option("#session-select", "bare")
+    part = page.locator("#unmeasured")
+    expect(part.locator("summary")).to_have_text(
+        "Not measured: 1.2 cm² of the texture that two cameras see", timeout=WAIT
+    )
+    part.locator("summary").click()
+    expect(part.locator("li")).to_have_text(
+        ["the images do not look alike: 0.7 cm²", "the lines of sight miss one another: 0.5 cm²"]
+    )
+    expect(part.locator("figcaption")).to_have_text(["01"])
+    page.wait_for_function("document.querySelector('#unmeasured-pictures img').naturalWidth > 0")
+
+
 def test_processing_is_started_watched_and_cancelled(page: Page, station: Station) -> None:
     station.processed_session("again", steps=2)
     expect(page.locator("#session-select")).to_have_value("again", timeout=WAIT)

@@ -29,9 +29,9 @@ def _arrange(data: Path, folder: Path) -> Path:
 
 #: The paper's way, its correlation with the bundle's cameras, and the better way.
 WAYS = {
-    "paper's way": (),
-    "paper's way, bundle": ("calibration.method=bundle",),
-    "one surface, bundle": ("calibration.method=bundle", "surface.method=global"),
+    "paper's way": ("method=paper",),
+    "paper's way, bundle": ("method=paper", "calibration.method=bundle"),
+    "best": (),
 }
 
 
@@ -130,21 +130,20 @@ def test_every_figure_of_multidic_is_reached(ways: dict[str, Results], figures) 
         assert rows["control points: mean vector, RMS, mm"][1] <= 0.060
         assert abs(rows["diameter off 114, STD of 2 r, mm"][0]) <= 0.05
         assert rows["diameter off 114, STD of 2 r, mm"][1] <= 0.0415
-    better = found["one surface, bundle"]
+    better = found["best"]
     assert max(better["rigid residual, frames 2, 3, mm"]) <= 0.0145
     assert better["diameter off 114, STD of 2 r, mm"][1] <= 0.03
 
 
 def test_matches_are_as_sure_as_ncorr_s(results: Results, reference, figures) -> None:
-    ours = [np.nanmedian(c) for c in results.matches[0].c_ls]
+    ours = [np.nanmedian(c) for c in results.correlation]
     theirs = [float(np.median(reference["corrcoef_202"][frame])) for frame in range(3)]
-    worst = float(np.nanmax(results.matches[0].c_ls))
+    worst = float(np.nanmax(results.correlation))
     figures("paper's rig: C_LS median by frame", ", ".join(f"{c:.4f}" for c in ours), "0.019-0.020")
     figures("paper's rig: C_LS largest", f"{worst:.4f}", "0.066")
     assert np.isclose(ours[0], theirs[0], rtol=0.01)
-    # Later images are matched to their own camera's, and look more alike than those of two cameras: the match between
-    # the cameras stays the worst of the three, where MultiDIC matches every image across.
-    assert all(0.95 < own / across < 1.01 for own, across in zip(ours[1:], theirs[1:], strict=True))
+    # Later images are matched to their own camera's, and look more alike than those of two cameras.
+    assert all(own < 0.5 * across for own, across in zip(ours[1:], theirs[1:], strict=True))
     assert worst <= 0.068
 
 
@@ -166,8 +165,8 @@ def test_the_points_are_multidics(results: Results, reference, figures) -> None:
 
 
 def test_the_cameras_unrest_is_reported(ways: dict[str, Results]) -> None:
-    # The vertical residual of this pair is +0.13, +0.24, +0.35 px, projected minus measured, in frames 1, 2, 3.
-    drift = ways["paper's way"].summary["drift_px"]["201-202"]
+    # The vertical residual of camera 201 is +0.13, +0.24, +0.35 px, projected minus measured, in frames 1, 2, 3.
+    drift = ways["paper's way"].summary["drift_px"]["201"]
     np.testing.assert_allclose(drift, [-0.13, -0.24, -0.35], atol=0.05)  # measured minus projected
     for way, results in ways.items():
         told = [sentence for sentence in results.summary["warnings"] if "drift off the epipolar line" in sentence]

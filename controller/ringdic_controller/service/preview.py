@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from ringdic.session.images import read_gray
 
 
@@ -16,11 +18,25 @@ def preview_jpeg(path: Path, width: int = 320) -> bytes:
     InputError if the file is missing or is not an image.
     """
     image = read_gray(path)
-    if image.shape[1] > width:
-        height = max(1, round(image.shape[0] * width / image.shape[1]))
-        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     if image.dtype != np.uint8:
+        image = _no_wider(image, width)
         low, high = np.percentile(image, [0.5, 99.5])
         image = np.clip((image - low) * (255.0 / max(high - low, 1.0)), 0, 255).astype(np.uint8)
+    return _jpeg(_no_wider(image, width))
+
+
+def picture_jpeg(picture: NDArray[np.uint8], width: int) -> bytes:
+    """A JPEG (as bytes) of a picture (height, width, 3) sRGB, at most ``width`` px wide."""
+    return _jpeg(_no_wider(picture[..., ::-1], width))
+
+
+def _no_wider(image: NDArray[Any], width: int) -> NDArray[Any]:
+    if image.shape[1] <= width:
+        return image
+    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+
+
+def _jpeg(image: NDArray[Any]) -> bytes:
     _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])
     return bytes(jpeg)

@@ -6,6 +6,7 @@ image, by ``patches`` of surface as one camera sees them. ``views`` tells which 
 which others see it: its chart. ``matching`` matches the chart's grid in the reference ``images`` of all of them,
 ``chart`` adds the uncertainty, and ``surface`` triangulates the charts by ``agreement`` of their views, with smooth
 ``weights``, and merges them.
+``unmeasured`` finds the texture that the surface does not cover, and ``evidence`` why a camera does not match.
 
 In time:
 ``tracked_points`` and ``step_matching`` match points of one image in a later one of the same camera, ``tracking`` lays

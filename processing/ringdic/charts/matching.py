@@ -6,7 +6,7 @@ while the match is refined with an affine subset: a subset of second order, free
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from ringdic.arrays import Floats, Indices, Mask, Pixels, Points
 from ringdic.charts.depth_map import DepthMap
 from ringdic.charts.images import ChartImages
-from ringdic.charts.patches import Patches, depths, warps_between
+from ringdic.charts.patches import STENCIL, Patches, depths, stencil_rays, warps_between
 from ringdic.charts.tracked_points import robust_quadratics
 from ringdic.charts.views import ChartPlan, chart_region
 from ringdic.correlation import (
@@ -36,9 +36,15 @@ from ringdic.geometry.outliers import LostPoint
 from ringdic.geometry.triangulation import triangulate
 
 _WINDOW = 2.7  # steps of the lattice about a place, of the neighbours from which its curvature is computed
-_NEAR = 2.5  # subset radii about a point, of the neighbours from which its curvature is computed again
+_NEAR = 1.2  # subset radii about a point, of the neighbours from which its curvature is computed again
+_NOISE = 0.015  # px, standard deviation of the matches from which on that radius grows, to twice of it at most
+_NEAREST = 2.3  # steps of the grid, the least such radius, of a circle with 21 points
 _OVERLAP = 1.5  # subsets share pixels: a fit to several is this much less certain than to independent ones
-_HARM = 0.01  # px, bias due to a wrong curvature beyond which a point is matched again
+_HARM = 0.008  # px, bias due to a wrong curvature beyond which a point is matched again
+_ROUNDS = 2  # times that the curvature is computed again from the matches
+_SETTLED = 0.05  # matches with another curvature, as a share of the points, below which the rounds end
+_STEEPER = 10.0  # degrees by which the incidence at the rim of a subset may exceed the limit
+_MARGIN = 3.0  # subset radii about the points, of the part of an image in which they are matched
 _FEWEST = 30  # points of a chart from which curvature is computed again
 _DIFFERENCE = 0.6  # subset radii over which a warp's central differences are taken
 
@@ -47,13 +53,12 @@ _DIFFERENCE = 0.6  # subset radii over which a warp's central differences are ta
 class ChartMatches:
     """Matches of a chart at the reference: n points of a grid in camera number ``camera`` and in the other C - 1.
 
-    cameras : (C,) indices, the chart's own first. region : (height, width) bool. xy : (n, 2) px, the grid. faces : (m,
-    3) int. px : (C, n, 2) px, NaN where there is no match; px[0] is the grid. sigma : (C, n, 2) px, as the correlation
-    states it. gradient : (C, n, 2, 2). c_ls : (C, n). status : (C, n).
+    cameras : (C,) indices, the chart's own first. xy : (n, 2) px, the grid. faces : (m, 3) int. px : (C, n, 2) px, NaN
+    where there is no match; px[0] is the grid. sigma : (C, n, 2) px, as the correlation states it. gradient : (C, n,
+    2, 2). c_ls : (C, n). status : (C, n).
     """
 
     cameras: Indices
-    region: Mask
     xy: Pixels
     faces: NDArray[np.int32]
     px: Pixels
@@ -64,8 +69,9 @@ class ChartMatches:
 
 
 def match_chart(
-    images: ChartImages, k: int, depth_map: DepthMap, plan: ChartPlan, mask: Mask | None, incidence_deg: float = 65.0
-) -> ChartMatches:
+    images: ChartImages, k: int, depth_map: DepthMap, plan: ChartPlan, mask: Mask | None, incidence_deg: float = 65.0,
+    *, curved: bool = True,
+) -> ChartMatches:  # fmt: skip
     """Match a chart's grid from its own camera in all cameras that see it.
 
     Parameters
@@ -76,6 +82,7 @@ def match_chart(
     plan : places of the depth map that belong to the chart, and the cameras that see them.
     mask : (height, width) bool, drawn by the user; None: the region follows from the places.
     incidence_deg : degrees, largest angle of incidence of a view that is used.
+    curved : whether the curvature of the surface is held; otherwise subsets are as the settings' order says.
     """
     camera, settings = images.cameras[k], images.settings
     region, of_points = chart_region(images.image(k), depth_map, plan.inside, settings.radius)
@@ -86,7 +93,7 @@ def match_chart(
     cameras = np.concatenate([[k], partners]).astype(np.int64)
     count, n = len(cameras), len(xy)
     out = ChartMatches(
-        cameras, region, xy, faces,
+        cameras, xy, faces,
         np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan), np.full((count, n, 2, 2), np.nan),
         np.full((count, n), np.nan), np.full((count, n), Status.NOT_REACHED, np.int8),
     )  # fmt: skip
@@ -95,39 +102,98 @@ def match_chart(
     out.px[0], out.sigma[0], out.c_ls[0], out.status[0], out.gradient[0] = xy, 0.0, 0.0, Status.GOOD, 0.0
     reference = prepare_reference(images.image(k), region, settings)
     patches, nearest = interpolated_patches(camera, depth_map, xy)
+    sees = plan.sees[np.ix_(nearest, partners)].T
+    others = [images.cameras[other] for other in partners.tolist()]
+    rays = stencil_rays(camera, xy, _reach(settings))
+    stencil = patches.stencil(camera, _reach(settings), rays)
     views = [
-        _View(images.cameras[other], reference, images.current(other), np.flatnonzero(plan.sees[nearest, other]))
-        for other in partners.tolist()
-    ]
-    stencil = patches.stencil(camera, _reach(settings))
+        _View.of(
+            reference, images.current(c), images.cameras[c], images.cameras[c].project(stencil[:, 0]),
+            np.flatnonzero(seen), _MARGIN * settings.radius,
+        )
+        for c, seen in zip(partners.tolist(), sees, strict=True)
+    ]  # fmt: skip
+    squarest = _squarest(others, stencil, sees)
     for slot, view in enumerate(views, start=1):
-        _enter(out, slot, view.index, view.first_pass(xy, stencil, settings))
-    refined = _measured_patches([images.cameras[c] for c in cameras], out, depth_map, settings)
-    if refined is None:
-        return out
-    stencil = refined.stencil(camera, _reach(settings))
-    for slot, view in enumerate(views, start=1):
-        index, matches = view.second_pass(xy, stencil, settings)
-        _enter(out, slot, index, matches)
-    _drop_oblique(out, [images.cameras[c] for c in cameras], refined, incidence_deg)
+        chosen = squarest[view.index] == slot - 1 if curved else np.ones(len(view.index), bool)
+        _enter(out, slot, *view.first_look(xy, stencil, settings, chosen, curved=curved))
+    for _ in range(_ROUNDS if curved else 0):
+        patches = _measured_patches([camera, *others], out, depth_map, settings) or patches
+        stencil = patches.stencil(camera, _reach(settings), rays)
+        for slot, view in enumerate(views, start=1):
+            _enter(out, slot, *view.match(xy, stencil, settings))
+        if sum(view.changed for view in views) < _SETTLED * n:
+            break
+    _drop_oblique(out, [camera, *others], stencil, incidence_deg, settings.radius / _reach(settings))
     return out
 
 
-def _drop_oblique(out: ChartMatches, cameras: Sequence[Camera], patches: Patches, incidence_deg: float) -> None:
-    """Drop the views of points that a camera sees more obliquely than a limit, and points that their own camera does.
+def _squarest(others: Sequence[Camera], stencil: Points, sees: Mask) -> Indices:
+    """Index (n,) of the camera that faces each patch most squarely, among those that see it.
 
-    out : matches in the C cameras. patches : about the points.
+    others : C cameras. stencil : (n, 9, 3) mm. sees : (C, n) bool.
     """
-    xyz, normals = patches.points(cameras[0], np.zeros((1, 2)))[:, 0], patches.normals(cameras[0])
-    with np.errstate(invalid="ignore"):
-        oblique = [camera.incidence_cosine(xyz, normals) < np.cos(np.radians(incidence_deg)) for camera in cameras]
-    for slot in range(1, len(cameras)):
-        lost = (oblique[slot] | oblique[0]) & (out.status[slot] == Status.GOOD)
-        out.px[slot, lost], out.status[slot, lost] = np.nan, LostPoint.OBLIQUE
+    cosine = np.stack([_incidence_cosine(other, stencil, np.zeros((1, 2))) for other in others])
+    return np.asarray(np.argmax(np.where(sees & np.isfinite(cosine), cosine, -np.inf), axis=0))
+
+
+def _drop_oblique(
+    out: ChartMatches, cameras: Sequence[Camera], stencil: Points, incidence_deg: float, rim: float
+) -> None:
+    """Drop views of points that a camera sees more obliquely than a limit, and points that their own camera does.
+
+    Views that are as oblique anywhere in the subset are dropped too, where another remains: no warp of second order
+    describes them.
+
+    out : matches in the C cameras. stencil : (n, 9, 3) mm, of patches about the points. rim : reaches of the stencil
+    from a point to the rim of its subset.
+    """
+    limit, steepest = np.cos(np.radians(incidence_deg)), np.cos(np.radians(incidence_deg + _STEEPER))
+    middle = [_incidence_cosine(camera, stencil, np.zeros((1, 2))) for camera in cameras]
+    around = [_incidence_cosine(camera, stencil, rim * STENCIL[1:5]) for camera in cameras]
+    good = out.status[1:] == Status.GOOD
+    oblique = np.stack([(middle[0] < limit) | (each < limit) for each in middle[1:]])
+    steep = np.stack([each < steepest for each in around[1:]])
+    steep &= (good & ~oblique & ~steep).any(axis=0)
+    lost = good & (oblique | steep)
+    out.px[1:][lost], out.status[1:][lost] = np.nan, LostPoint.OBLIQUE
+
+
+def _incidence_cosine(camera: Camera, stencil: Points, at: Pixels) -> Floats:
+    """Least cosine (n,) of the incidence at some places of patches, from quadratics through their stencils.
+
+    stencil : (n, 9, 3) mm. at : (k, 2), the places, in reaches of the stencil.
+    """
+    centre, right, left, below, above, br, bl, ar, al = np.moveaxis(stencil, 1, 0)
+    along, down = 0.5 * (right - left), 0.5 * (below - above)
+    xx, xy, yy = right - 2.0 * centre + left, 0.25 * (br - bl - ar + al), below - 2.0 * centre + above
+    least = np.full(len(centre), np.inf)
+    for s, t in at:
+        xyz = centre + s * along + t * down + 0.5 * s * s * xx + s * t * xy + 0.5 * t * t * yy
+        normals = np.cross(along + s * xx + t * xy, down + s * xy + t * yy)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            normals /= -np.linalg.norm(normals, axis=1, keepdims=True)
+        least = np.minimum(least, camera.incidence_cosine(xyz, normals))
+    return least
+
+
+def drop_masked(matches: ChartMatches, masks: Callable[[int], Mask | None]) -> None:
+    """Drop the views of points that lie outside the region drawn for the camera, in place.
+
+    masks : function of a camera's index; returns its region (height, width) bool, None where none was drawn.
+    """
+    for slot, camera in enumerate(matches.cameras[1:].tolist(), start=1):
+        mask = masks(camera)
+        good = np.flatnonzero(matches.status[slot] == Status.GOOD)
+        if mask is None or not len(good):
+            continue
+        column, row = np.rint(matches.px[slot, good]).astype(np.int64).T
+        outside = good[~mask[row.clip(0, mask.shape[0] - 1), column.clip(0, mask.shape[1] - 1)]]
+        matches.px[slot, outside], matches.status[slot, outside] = np.nan, Status.NOT_REACHED
 
 
 def _enter(out: ChartMatches, slot: int, index: Indices, matches: PointMatches | None) -> None:
-    """Enter the matches of points ``index`` (k,) in one camera."""
+    """Enter the matches of points ``index`` (k,) in one camera, if there are any."""
     if matches is None:
         return
     out.px[slot, index], out.sigma[slot, index] = matches.xy + matches.uv, matches.sigma
@@ -142,52 +208,73 @@ def _reach(settings: CorrelationSettings) -> float:
 
 @dataclass
 class _View:
-    """One camera in which points ``index`` (k,) of a chart are matched, and their matches so far."""
+    """One camera in which points ``index`` (k,) of a chart are matched.
+
+    current : its image in the box about them. held : (k, 6) 1/px, second derivatives that the warps were last held at,
+    NaN for points not tried yet. good : (k,) bool, points that are matched. changed : number of points whose curvature
+    was another one in the round before.
+    """
 
     camera: Camera
     reference: Reference
     current: Current
     index: Indices
-    matches: PointMatches | None = None
+    held: Floats
+    good: Mask
+    changed: int = 0
 
-    def first_pass(self, xy: Pixels, stencil: Points, settings: CorrelationSettings) -> PointMatches | None:
-        """Match all points from the warps of the depth map's patches, stencil (n, 9, 3); None without any."""
-        start = self._warps(xy, stencil, settings)
-        if np.isfinite(start).any():
-            first_order = replace(settings, order=1)
-            self.matches = correlate_points(self.reference, self.current, xy[self.index], first_order, start=start)
-        return self.matches
+    @classmethod
+    def of(
+        cls, reference: Reference, current: Current, camera: Camera, at: Pixels, index: Indices, margin: float
+    ) -> _View:
+        """A camera with its whole image. at : (n, 2) px, where all points of the chart are there. margin : px."""
+        at = at[index][np.isfinite(at[index]).all(axis=1)]
+        if len(at):
+            current = current.crop_around(at, margin)
+        return cls(camera, reference, current, index, np.full((len(index), 6), np.nan), np.zeros(len(index), bool))
 
-    def second_pass(
-        self, xy: Pixels, stencil: Points, settings: CorrelationSettings
+    def first_look(
+        self, xy: Pixels, stencil: Points, settings: CorrelationSettings, chosen: Mask, *, curved: bool
     ) -> tuple[Indices, PointMatches | None]:
-        """Match the lost points, and those whose curvature differs from that held before, by the measured shape.
+        """Match the ``chosen`` (k,) of the points, of which only the depth map's patches are known.
 
-        stencil : (n, 9, 3) mm, of patches fitted to the first pass. Returns the points (j,) that changed, and their
-        matches.
+        xy : (n, 2) px. stencil : (n, 9, 3) mm, of those patches. curved : whether their curvature is held; otherwise
+        subsets are as the settings say. Returns indices (j,) of points and their matches.
         """
-        if self.matches is None:
-            return self.index, None
-        first = self.matches
-        start = self._warps(xy, stencil, settings)
-        held = first.curvature.reshape(-1, 6)
-        with np.errstate(invalid="ignore"):
-            harm = np.abs(start[:, 6:] - held).max(axis=1) * settings.radius**2 / 8.0
-            again = np.flatnonzero(np.isfinite(start).all(axis=1) & ((harm > _HARM) | ~first.good))
-        if not len(again):
-            return self.index[again], None
-        sound = first.good[again]
-        warp = np.concatenate([first.uv, first.gradient.reshape(-1, 4)], axis=1)[again]
-        start = start[again]
-        start[sound, :6] = warp[sound]
-        at = xy[self.index[again]]
-        matches = correlate_independently(self.reference, self.current, at, replace(settings, order=1), start)
-        better = matches.good & (matches.zncc > settings.zncc_min)
-        return self.index[again[better]], matches.part(better)
+        at = np.flatnonzero(chosen)
+        start = self._warps(xy, stencil, settings, at)
+        if not np.isfinite(start).any():
+            return self.index[at], None
+        points, used = xy[self.index[at]], replace(settings, order=1) if curved else settings
+        start = start if curved or settings.order == 2 else start[:, :6]
+        matches = correlate_points(self.reference, self.current, points, used, start=start)
+        self.held[at], self.good[at] = matches.curvature.reshape(-1, 6), matches.good
+        return self.index[at], matches
 
-    def _warps(self, xy: Pixels, stencil: Points, settings: CorrelationSettings) -> Floats:
-        """Warps (k, 12) of the points into this camera; NaN where there is none."""
-        warps = warps_between(self.camera, xy[self.index], stencil[self.index], _reach(settings))
+    def match(self, xy: Pixels, stencil: Points, settings: CorrelationSettings) -> tuple[Indices, PointMatches | None]:
+        """Match the points whose curvature differs from that held before, or that have not been tried.
+
+        xy : (n, 2) px. stencil : (n, 9, 3) mm, of measured patches. Returns indices (j,) of the points that changed,
+        and their matches.
+        """
+        start = self._warps(xy, stencil, settings, np.arange(len(self.index)))
+        with np.errstate(invalid="ignore"):
+            harm = np.abs(start[:, 6:] - self.held).max(axis=1) * settings.radius**2 / 8.0
+            at = np.flatnonzero(np.isfinite(start).all(axis=1) & ~(harm <= _HARM))
+        self.changed = int(np.isfinite(self.held[at]).all(axis=1).sum())
+        if not len(at):
+            return self.index[at], None
+        points = xy[self.index[at]]
+        matches = correlate_independently(self.reference, self.current, points, replace(settings, order=1), start[at])
+        self.held[at] = start[at, 6:]
+        entered = matches.good | ~self.good[at]
+        self.good[at] |= matches.good
+        return self.index[at[entered]], matches.part(entered)
+
+    def _warps(self, xy: Pixels, stencil: Points, settings: CorrelationSettings, at: Indices) -> Floats:
+        """Warps (j, 12) into this camera of the points at ``at`` (j,) of its own; NaN where there is none."""
+        points = self.index[at]
+        warps = warps_between(self.camera, xy[points], stencil[points], _reach(settings))
         warps[~np.isfinite(warps).all(axis=1)] = np.nan
         return warps
 
@@ -202,7 +289,10 @@ def _measured_patches(
         return None
     usual = float(np.median(depth_map.sigma))
     values = np.stack([1.0 / np.where(known, depth, np.nan), np.zeros(len(depth))], axis=1) / usual
-    fit = robust_quadratics(Neighbourhoods(matches.xy, _NEAR * settings.radius), values, np.ones(len(depth)))
+    noise = float(np.nanmedian(np.hypot(*np.moveaxis(matches.sigma[1:], -1, 0))))
+    wider = float(np.clip((noise / _NOISE) ** (2.0 / 3.0), 1.0, 2.0))
+    reach = max(_NEAR * wider * settings.radius, _NEAREST * settings.step)
+    fit = robust_quadratics(Neighbourhoods(matches.xy, reach), values, np.ones(len(depth)))
     scatter = _OVERLAP * 1.4826 * float(np.nanmedian(np.abs(fit.leave_one_out[:, 0])))
     with np.errstate(invalid="ignore"):
         harm = scatter * fit.curvature_sigma.max(axis=1) * settings.radius**2 / 8.0

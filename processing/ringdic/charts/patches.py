@@ -39,13 +39,13 @@ class Patches:
         """Some of the patches. index : (k,) int, or (n,) bool."""
         return Patches(self.px[index], self.inverse_depth[index], self.gradient[index], self.curvature[index])
 
-    def points(self, camera: Camera, offsets: Pixels) -> Points:
+    def points(self, camera: Camera, offsets: Pixels, rays: Vectors | None = None) -> Points:
         """Points of the patches at offsets from their pixels.
 
-        camera : whose pixels they are. offsets : (k, 2) px. Returns (n, k, 3) mm, world frame; NaN where a patch
-        reaches infinity.
+        camera : whose pixels they are. offsets : (k, 2) px. rays : (n, k, 3), axial rays there where they are known.
+        Returns (n, k, 3) mm, world frame; NaN where a patch reaches infinity.
         """
-        rays = axial_rays(camera, self.px[:, None] + offsets)
+        rays = axial_rays(camera, self.px[:, None] + offsets) if rays is None else rays
         dx, dy = offsets.T
         xx, xy, yy = self.curvature.T[..., None]
         inverse = self.inverse_depth[:, None] + self.gradient[:, :1] * dx + self.gradient[:, 1:] * dy
@@ -62,9 +62,17 @@ class Patches:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
 
-    def stencil(self, camera: Camera, reach: float) -> Points:
-        """Points of the patches from whose projections `warps_between` takes derivatives, (n, 9, 3) mm. reach : px."""
-        return self.points(camera, reach * STENCIL)
+    def stencil(self, camera: Camera, reach: float, rays: Vectors | None = None) -> Points:
+        """Points of the patches from whose projections `warps_between` takes derivatives, (n, 9, 3) mm.
+
+        reach : px. rays : (n, 9, 3), of `stencil_rays`, where they are known.
+        """
+        return self.points(camera, reach * STENCIL, rays)
+
+
+def stencil_rays(camera: Camera, px: Pixels, reach: float) -> Vectors:
+    """Axial rays of the pixels of a stencil. px : (n, 2) px. reach : px. Returns (n, 9, 3)."""
+    return axial_rays(camera, px[:, None] + reach * STENCIL)
 
 
 def axial_rays(camera: Camera, px: Pixels) -> Vectors:

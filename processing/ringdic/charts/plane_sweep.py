@@ -24,7 +24,7 @@ from ringdic.geometry.camera import Camera
 _REDUCED_RADIUS = 8  # px of a subset in the reduced images
 _RADII = 1.6  # subset's radius in the reduced images, in radii of a subset in the full ones
 _KNOTS = 14  # depths at which warps are computed exactly
-_SPACING = 1.5  # px of the reduced image between the matches of successive depths
+_SPACING = 2.0  # px of the reduced image between the matches of successive depths
 _STEEPEST = 60.0  # degrees of incidence at which a surface is still to be matched
 _UPWARDS = 32.0  # degrees by which slants are turned out of the plane of the two lines of sight
 _AROUND = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=float)
@@ -48,7 +48,7 @@ class DepthRange:
         """The space about the point nearest to the optical axes of all cameras."""
         across = [np.eye(3) - np.outer(axis, axis) for axis in map(optical_axis, cameras)]
         right = sum((M @ camera.centre for M, camera in zip(across, cameras, strict=True)), np.zeros(3))
-        return cls(np.linalg.solve(np.sum(across, axis=0), right))
+        return cls(np.linalg.pinv(np.sum(across, axis=0)) @ right)
 
     def limits(self, camera: Camera) -> tuple[float, float]:
         """Least and largest depth in a camera, mm."""

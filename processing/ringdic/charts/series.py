@@ -28,6 +28,8 @@ from ringdic.geometry.triangulation import reprojection_residuals
 from ringdic.mesh.mesh import Mesh
 from ringdic.results.results import Matches, Results
 from ringdic.results.series import StepCache, median_deviations
+from ringdic.results.unmeasured import UnmeasuredPlaces
+from ringdic.results.writer import map_in_order
 from ringdic.settings import Settings
 from ringdic.strain.deformation import deformation
 from ringdic.uncertainty.matches import match_uncertainty
@@ -106,18 +108,23 @@ class SurfaceSeries:
     rig : its name.
     cameras : the C cameras.
     pairs : ids of neighbouring cameras.
+    charts : names of the charts.
     names : (F,) of the steps, the reference first.
     surface : at the reference.
     matches : function that returns the matches of a camera at a step.
     settings : of the run.
     cache : for the points in space of every step.
+    unmeasured : textured places that are not part of the surface.
+    unmatched : for each camera why it has no depths, an empty sentence where it has.
     """
 
     def __init__(
-        self, rig: str, cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]], names: Sequence[str],
-        surface: ReferenceSurface, matches: MatchesOfStep, settings: Settings, cache: StepCache,
+        self, rig: str, cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]], charts: Sequence[str],
+        names: Sequence[str], surface: ReferenceSurface, matches: MatchesOfStep, settings: Settings, cache: StepCache,
+        unmeasured: Sequence[UnmeasuredPlaces] = (), unmatched: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        self.names, self.surface, self._cameras = tuple(names), surface, tuple(cameras)
+        self._unmeasured, self._unmatched = tuple(unmeasured), list(unmatched) or [""] * len(cameras)
+        self.names, self.surface, self._cameras, self._charts = tuple(names), surface, tuple(cameras), tuple(charts)
         self._settings, self._cache = settings, cache
         self._views = [camera_view(camera, c, surface) for c, camera in enumerate(cameras)]
         self._textures = [texture_of(surface.texture[k, view.vertex]) for k, view in enumerate(self._views)]
@@ -128,8 +135,8 @@ class SurfaceSeries:
         with np.errstate(invalid="ignore"):
             self._drift[0] = [np.nanmean(one[:, 1]) if np.isfinite(one).any() else np.nan for one in residual]
         c_ls: list[list[Floats]] = [[] for _ in cameras]
-        for k in range(1, len(self.names)):
-            step = self._measure(k, matches, refine)
+        steps = range(1, len(self.names))
+        for k, step in enumerate(map_in_order(lambda k: self._measure(k, matches, refine), steps), start=1):
             cache.put(k, step)
             self._drift[k] = self._drift[0] + step.residual
             for c, view in enumerate(self._views):
@@ -153,7 +160,8 @@ class SurfaceSeries:
     def agreement(self) -> dict[str, Any]:
         """How well the cameras agree at the reference, as JSON values.
 
-        Mean number of views of a point, RMS residual of the cameras (px), and numbers of lost points by reason.
+        Mean number of views of a point, RMS residual of the cameras (px), numbers of lost points by reason, distances
+        between the charts where they overlap (mm), and the motion of cameras that have moved.
         """
         residual = self._residual.copy()
         residual[self.surface.own, np.arange(len(self.surface.xyz))] = np.nan  # whole pixels by definition
@@ -162,16 +170,17 @@ class SurfaceSeries:
             "views": float(np.isfinite(self.surface.px[..., 0]).sum(axis=0).mean()),
             "residual_px": float(np.sqrt(np.nanmean(residual**2))),
             "lost": {reasons[int(reason)]: int(number) for reason, number in self.surface.lost},
+            **_distances(self.surface.mismatch, self._charts),
+            "moved_cameras": self.poses.figures(self.names),
         }
 
     @property
     def warnings(self) -> list[str]:
         """Sentences for the operator: cameras that share no measured point with another, and cameras that moved."""
         idle = [
-            f"camera {camera.id} shares no measured point of the surface with another; check that it sees the "
-            "specimen, that it is in focus, and its mask"
-            for camera, view in zip(self._cameras, self._views, strict=True)
-            if not len(view.vertex)
+            why or f"camera {camera.id} shares no measured point of the surface with another, though it has depths"
+            for camera, view, why in zip(self._cameras, self._views, self._unmatched, strict=True)
+            if why or not len(view.vertex)
         ]
         return idle + self.poses.sentences(self.names)
 
@@ -270,6 +279,7 @@ class SurfaceSeries:
             ),
             settings=self._settings.to_toml(),
             chi2=(surface.chi2 / np.where(surface.degrees > 0, surface.degrees, 1))[None],
+            unmeasured=self._unmeasured,
         )
 
     def _prepare_uncertainty(self) -> None:
@@ -366,6 +376,22 @@ class SurfaceSeries:
             sigma=np.stack([reference.sigma[0], total[c, vertex][None]]),
             status=np.stack([reference.status[0], status]),
         )
+
+
+def _distances(mismatch: Floats, charts: Sequence[str]) -> dict[str, Any]:
+    """Distances between the charts as JSON values: for every two, and as mean and standard deviation over all.
+
+    mismatch : (J, 8), of `ReferenceSurface`. charts : their names.
+    """
+    rows: list[dict[str, Any]] = []
+    for first, second, points, mean, std, bias, rms, largest in mismatch.tolist():
+        figures = {"mean_mm": mean, "std_mm": std, "bias_mm": bias, "rms_mm": rms, "largest_mm": largest}
+        rows.append({"charts": [charts[int(first)], charts[int(second)]], "points": int(points), **figures})
+    if not rows:
+        return {"mismatch_mm": None, "mismatch_std_mm": None, "mismatches": rows}
+    weights = mismatch[:, 2] / mismatch[:, 2].sum()
+    mean, square = weights @ mismatch[:, 3], weights @ (mismatch[:, 3] ** 2 + mismatch[:, 4] ** 2)
+    return {"mismatch_mm": float(mean), "mismatch_std_mm": float(np.sqrt(square - mean**2)), "mismatches": rows}
 
 
 def _facing_pairs(

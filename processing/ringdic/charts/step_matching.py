@@ -1,11 +1,12 @@
 """Matching of a camera's points in a later image, in two passes that account for the displacement field's curvature.
 
 A first-order subset in a curved displacement field is biased; one of second order is not, but is nearly twice as noisy.
-So there are two passes. The first is of second order, at the knots, a part of the points. A quadratic fitted to its
-displacements over the neighbours gives every point its start value, and second derivatives far less noisy than a
-subset's own; the second pass is of first order and holds these fixed. What bias remains (where the surface turns away,
-the field is not quadratic) is the smooth part of the difference of the two passes. It is subtracted as far as it
-exceeds the noise.
+So there are two passes, both of first order. The first is at the knots, a small part of the points. Where the curvature
+is nearly constant, so is the bias: a quadratic fitted to the knots' displacements has the second derivatives of the
+field, far less noisy than a subset's own, and gives every point its start value. The second pass, of all points, holds
+these second derivatives fixed. Its own displacements then give the curvature over smaller neighbourhoods, and what
+this changes is corrected. At the rim, where the neighbours lie to one side, subsets of a strongly curved field are of
+second order.
 
 A subset of the reference lies on a whole pixel, where nothing is interpolated; gradient and curvature carry the result
 to the point, less than a pixel away.
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels
-from ringdic.charts.tracked_points import TrackedPoints, robust_quadratics
+from ringdic.charts.tracked_points import APART, TrackedPoints, robust_quadratics
 from ringdic.correlation import (
     CorrelationSettings,
     Current,
@@ -29,20 +30,19 @@ from ringdic.correlation import (
     as_start_values,
     correlate_independently,
     correlate_points,
+    search_warps,
 )
 from ringdic.correlation.quadratic import QuadraticFit
 from ringdic.correlation.seeds import flow_start_values
 
 _LOOSE = 5e-3  # px, tolerance of the first of two passes
-_PATIENCE = 10  # iterations of the first of two passes
 _MARGIN = 32.0  # px about the subsets in which a current image is filtered
+_START_ZNCC = 0.6  # least ZNCC under the warp by optical flow that makes it a start value
+_SOME = 0.2  # least share of the knots with start values from which the others can be reached
+_FEWEST = 8  # start values from which an affine fit extrapolates where all points lie
 _ENOUGH = 0.5  # least share of valid start values; with fewer, the images are searched for others
-_SPARE = 0.05  # share of the knots that may be lost before they are searched for again
-_LEAST_EXCESS = 0.1  # of a second-order subset's variance, beyond that of the same subset of first order
-_OVERLAP = 1.2  # subsets share pixels: a mean of several is this much less certain than of independent ones
-_BIASED = 4.0  # Σ(b/σ)² of a bias below which it may be noise, of 2 numbers
+_BENT = 2.0  # standard deviations by which curvature moves a subset, from which on it matters at the rim
 _CURVED = 20.0  # Σ(c/σ)² of second derivatives below which they may be noise, of 6 numbers of overlapping subsets
-_LEFT = 0.25  # share of the bias that may be left: the neighbourhood is wider than the subset
 
 
 @dataclass(frozen=True)
@@ -101,16 +101,18 @@ def match_tracked_points(
     if not two_pass:
         matches = _match_pixels(reference, current, points.pixels, pixel_start, settings, search)
         return _reject_outliers(matches, points)
-    part = current
-    if pixel_start is not None:
-        part = _about(points.pixels + pixel_start[:, :2], settings.radius, current, current)
-    first = _at_knots(reference, (part, current), points, pixel_start, _of_knots(settings), search)
+    first, part = _at_knots(reference, current, points, pixel_start, _of_knots(settings))
     if not first.good.any():
-        return _lost(points, first.status[points.knot])
+        return _lost(points, first.status[points.knots.of_points])
     warp = _predicted_warps(first, points, settings.radius)
     part = _about(points.pixels + warp[:, :2], settings.radius, part, current)
-    second = correlate_independently(reference, part, points.pixels, settings, warp)
-    return _reject_outliers(_subtract_bias(first, second, points), points)
+    second = correlate_independently(reference, part, points.pixels, settings, warp, repeated=True)
+    mended, again = _mend_curvature(second, points, settings.radius)
+    if len(again):
+        settings = replace(settings, order=2)
+        third = correlate_independently(reference, part, points.pixels[again], settings, _warp(mended)[again])
+        mended = with_matches(mended, again, third)
+    return _reject_outliers(mended, points)
 
 
 def shift_warps(warp: Floats, shift: Pixels) -> Floats:
@@ -130,45 +132,36 @@ def shift_warps(warp: Floats, shift: Pixels) -> Floats:
 
 
 def _of_knots(settings: CorrelationSettings) -> CorrelationSettings:
-    """Settings of the first of two passes: second order, with as many iterations as a converging point needs."""
+    """Settings of the first of two passes: first order, as precise as start values and curvatures need."""
     return replace(
         settings,
-        order=2,
-        step=max(settings.step, settings.radius),
+        order=1,
+        step=max(settings.step, round(APART * settings.radius)),
         tolerance=max(settings.tolerance, _LOOSE),
-        max_iterations=min(settings.max_iterations, _PATIENCE),
     )
 
 
 def _at_knots(
-    reference: Reference,
-    current: tuple[Current, Current],
-    points: TrackedPoints,
-    start: Floats | None,
-    settings: CorrelationSettings,
-    search: bool,
-) -> PointMatches:
-    """Match the knots from start values, from optical flow, or by a search over the images.
+    reference: Reference, current: Current, points: TrackedPoints, start: Floats | None, settings: CorrelationSettings
+) -> tuple[PointMatches, Current]:
+    """Match the knots from start values or from optical flow, and those that these do not reach from their neighbours.
 
-    current : the part of the current image about the start values, and the whole. start : (n, 12), of all points.
+    start : (n, 12), of all points. Returns the matches, and the part of the current image where all points will lie.
     """
-    part, whole = current
-    xy = points.neighbourhoods.xy
+    xy = points.knots.neighbourhoods.xy
     if start is None:
-        part, start_at_knots = whole, as_start_values(flow_start_values(reference, whole, xy, settings.radius))
+        at_knots = as_start_values(flow_start_values(reference, current, xy, settings.radius))[:, :6]
     else:
-        start_at_knots = start[points.knots]
-    matches = correlate_independently(reference, part, xy, settings, start_at_knots)
-    if search and matches.good.sum() < _ENOUGH * max(1, np.isfinite(start_at_knots).all(axis=1).sum()):
-        searched = correlate_points(reference, whole, xy, settings)
-        return searched if searched.good.sum() > matches.good.sum() else matches
-    lost = np.flatnonzero(~matches.good)
-    if len(lost) <= _SPARE * len(xy) or not matches.good.any():
-        return matches
-    smooth_start = _smooth(matches, points)[lost]
-    if not np.isfinite(smooth_start).all(axis=1).any():
-        return matches
-    return with_matches(matches, lost, correlate_independently(reference, part, xy[lost], settings, smooth_start))
+        at_knots = start[points.knots.index, :6]
+    known = np.flatnonzero(np.isfinite(at_knots).all(axis=1))
+    _, zncc, _ = search_warps(reference, current, xy[known], at_knots[known, None], settings.radius)
+    at_knots[known[~(zncc > _START_ZNCC)]] = np.nan
+    known = known[zncc > _START_ZNCC]
+    if len(known) < max(_FEWEST, _SOME * len(xy)):
+        return correlate_points(reference, current, xy, settings), current
+    at = xy[known]
+    part = current.crop_by_affine_fit(at, at + at_knots[known, :2], points.pixels, settings.radius)
+    return correlate_points(reference, part, xy, settings, start=at_knots, prefer_neighbour=True), part
 
 
 def with_matches(matches: PointMatches, index: Indices, other: PointMatches) -> PointMatches:
@@ -226,11 +219,6 @@ def _warp(matches: PointMatches) -> Floats:
     return np.concatenate([matches.uv, matches.gradient.reshape(n, 4), matches.curvature.reshape(n, 6)], axis=1)
 
 
-def _smooth(first: PointMatches, points: TrackedPoints) -> Floats:
-    """Warps (m, 12) of the knots by the quadratics of their neighbours' displacement; NaN where these are too few."""
-    return _warp_of(robust_quadratics(points.neighbourhoods, first.uv, np.hypot(*first.sigma.T)))
-
-
 def _warp_of(fit: QuadraticFit) -> Floats:
     """Warps (m, 12) of local quadratics."""
     return np.concatenate([fit.value, fit.gradient.reshape(-1, 4), fit.curvature.reshape(-1, 6)], axis=1)
@@ -238,56 +226,52 @@ def _warp_of(fit: QuadraticFit) -> Floats:
 
 def _predicted_warps(first: PointMatches, points: TrackedPoints, radius: int) -> Floats:
     """Predict the warps (n, 12) of all points from the knots' matches, with the second derivatives to be held fixed."""
-    fit = robust_quadratics(points.neighbourhoods, first.uv, np.hypot(*first.sigma.T))
+    near = points.knots.neighbourhoods
+    fit = robust_quadratics(near, first.uv, np.hypot(*first.sigma.T))
     warp = _warp_of(fit)
     warp = np.where(np.isfinite(warp).all(axis=1, keepdims=True), warp, _warp(first))
-    knot = points.nearest(np.asarray(np.isfinite(warp).all(axis=1)), points.neighbourhoods.window)
-    out = shift_warps(warp[knot], points.pixels - points.neighbourhoods.xy[knot])
+    knot = points.knots.nearest(np.asarray(np.isfinite(warp).all(axis=1)), points.pixels, near.window)
+    out = shift_warps(warp[knot], points.pixels - near.xy[knot])
     out[knot < 0] = np.nan
-    out[:, 6:] = _fixed_curvature(fit, first, points, radius)
+    curvature, known = _change_of_curvature(fit, first, np.zeros((len(first.xy), 6)), radius)
+    out[:, 6:] = curvature[points.knots.nearest(known, points.pixels)] if known.any() else 0.0
     return out
 
 
-def _fixed_curvature(fit: QuadraticFit, first: PointMatches, points: TrackedPoints, radius: int) -> Floats:
-    """Second derivatives (n, 6) that the second pass holds fixed, from the quadratics of the first pass.
+def _change_of_curvature(fit: QuadraticFit, matches: PointMatches, held: Floats, radius: int) -> tuple[Floats, Mask]:
+    """Second derivatives of quadratics about m knots less those that were held, as far as they exceed the noise.
 
-    Where a knot's own are too uncertain, as at the rim, those of the nearest knot are taken. A wrong second
-    derivative δ moves a round first-order subset of radius r by δ r²/8, the mean of δ x²/2 over it.
+    fit : to the displacements. matches : of the knots. held : (m, 6) 1/px. Returns (m, 6) 1/px, and which of them are
+    certain enough, (m,) bool. A wrong second derivative δ moves a round first-order subset of radius r by δ r²/8, the
+    mean of δ x²/2 over it.
     """
-    size = np.hypot(*first.sigma.T)
+    size = np.hypot(*matches.sigma.T)
     with np.errstate(invalid="ignore", divide="ignore"):
-        sigma = (first.sigma / size[:, None])[:, :, None] * fit.curvature_sigma[:, None, :]
+        sigma = (matches.sigma / size[:, None])[:, :, None] * fit.curvature_sigma[:, None, :]
         harm = fit.curvature_sigma.max(axis=1) * radius**2 / 8.0
-        known = np.isfinite(fit.curvature).all(axis=(1, 2)) & (harm < size)
-        curvature = fit.curvature.reshape(-1, 6)
-        curvature = curvature * _shrinkage(curvature, sigma.reshape(-1, 6), _CURVED)
-    if not known.any():
-        return np.zeros((len(points.positions), 6))
-    return np.asarray(curvature[points.nearest(known)])
+        known: Mask = np.asarray(np.isfinite(fit.curvature).all(axis=(1, 2)) & (harm < size))
+        change = fit.curvature.reshape(-1, 6) - held
+        return change * _shrinkage(change, sigma.reshape(-1, 6), _CURVED), known
 
 
-def _subtract_bias(first: PointMatches, second: PointMatches, points: TrackedPoints) -> PointMatches:
-    """Subtract from the second pass the smooth part of its difference from the first that exceeds noise.
+def _mend_curvature(second: PointMatches, points: TrackedPoints, radius: int) -> tuple[PointMatches, Indices]:
+    """Correct the second pass for the curvature of its own displacements, over smaller neighbourhoods.
 
-    This is the bias of first-order subsets where the field is not quadratic; its uncertainty is added to that of the
-    match.
+    Returns the matches, and the points (k,) int at the rim of a strongly curved field, where it is unknown.
     """
-    second_sigma = second.sigma[points.knots]
+    knots = points.fine_knots
+    own = second.part(knots.index)
+    fit = robust_quadratics(knots.neighbourhoods, own.uv, np.hypot(*own.sigma.T))
+    change, known = _change_of_curvature(fit, own, own.curvature.reshape(-1, 6), radius)
+    if not known.any():
+        return second, np.zeros(0, np.int64)
+    by_point = change[knots.nearest(known, points.pixels)].reshape(-1, 2, 3)
+    bias = radius**2 / 8.0 * (by_point[..., 0] + by_point[..., 2])
+    mended = replace(second, uv=second.uv - bias, curvature=second.curvature + by_point)
+    bent = radius**2 / 8.0 * np.abs(mended.curvature).max(axis=(1, 2))
     with np.errstate(invalid="ignore"):
-        excess = np.sqrt(np.maximum(first.sigma**2 - second_sigma**2, _LEAST_EXCESS * first.sigma**2))
-    size = np.hypot(*excess.T)
-    fit = points.neighbourhoods.fit(second.uv[points.knots] - first.uv, size)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        bias_sigma = _OVERLAP * fit.value_sigma[:, None] * excess / size[:, None]
-    share = _shrinkage(fit.value, bias_sigma, _BIASED)
-    known = np.isfinite(fit.value).all(axis=1) & np.isfinite(bias_sigma).all(axis=1)
-    knot = points.nearest(known, points.neighbourhoods.window)
-    bias = fit.extrapolate(knot, points.pixels - points.neighbourhoods.xy[knot])
-    known_bias: Mask = np.asarray((knot >= 0) & second.good)
-    uv = np.where(known_bias[:, None], second.uv - share[knot] * bias, second.uv)
-    left_over = share[knot] * np.hypot(bias_sigma[knot], _LEFT * bias)
-    sigma = np.where(known_bias[:, None], np.hypot(second.sigma, left_over), second.sigma)
-    return replace(second, uv=uv, sigma=sigma)
+        strong = second.good & (bent > _BENT * np.hypot(*second.sigma.T))
+    return mended, np.flatnonzero(strong & knots.one_sided[knots.of_points])
 
 
 def _shrinkage(values: Floats, sigma: Floats, limit: float) -> Floats:

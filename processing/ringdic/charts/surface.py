@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from ringdic.correlation import Status
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.outliers import LostPoint, grid_neighbours, surface_outliers
-from ringdic.merging import SurfacePart, merge
+from ringdic.merging import SurfacePart, merge, side_by_side
 from ringdic.mesh.mesh import Mesh
 
 _BEND = 0.2  # spacings by which a point lies off the middle of its neighbours on a surface bent as sharply as a finger
@@ -35,7 +35,9 @@ class ReferenceSurface:
     each match alone. texture : (C, N, 5), of `Chart`. grey_noise : (C,), variance of each camera's noise, grey
     levels², NaN where it took no part. chi2, degrees : (N,), of the triangulation. c_ls : (N,), the largest over the
     cameras. neighbours : (N, 4, 2), of `grid_neighbours`. lost : (K, 2), status and number of the points of charts
-    that were lost.
+    that were lost. lost_at : (L, 4), camera, x and y (px) and status of each of them. mismatch : (J, 8), distances of
+    every two charts that overlap: their numbers, the number of points compared, mean, standard deviation, bias, root
+    mean square and largest, mm.
     """
 
     xyz: Points
@@ -51,6 +53,8 @@ class ReferenceSurface:
     c_ls: Floats
     neighbours: Indices
     lost: Indices
+    lost_at: Indices
+    mismatch: Floats
 
     def arrays(self) -> dict[str, NDArray]:
         """Arrays of the surface by name, as stored in a task's output: (N, ...) mm, (C, N, ...) px, (M, 3) indices."""
@@ -63,24 +67,25 @@ class ReferenceSurface:
 
 
 def reference_surface(
-    cameras: Sequence[Camera], charts: Sequence[Chart], step: int, sigma_max: float
+    cameras: Sequence[Camera], charts: Sequence[Chart], step: int, sigma_max: float, heuristic: str = "combined"
 ) -> ReferenceSurface:
     """Triangulate the points of all charts from all their views and merge the charts into one surface.
 
     Parameters
     ----------
     cameras : the C cameras.
-    charts : one for each camera, which may be empty.
+    charts : n points each, of which some may have none.
     step : px, of the grids.
     sigma_max : px, greatest standard deviation of an accepted match.
+    heuristic : of the merging, or none to leave the charts one over the other.
 
     Raises ComputationError where no chart gave a triangle.
     """
-    measured = [_measure(cameras, k, chart, step, sigma_max) for k, chart in enumerate(charts)]
+    measured = [_measure(cameras, chart, step, sigma_max) for chart in charts]
     parts = [SurfacePart(one.xyz, one.faces, one.c_ls) for one in measured]
     if not any(len(part.faces) for part in parts):
         raise ComputationError("no two cameras share a textured surface")
-    merged = merge(parts)
+    merged = merge(parts, heuristic) if heuristic != "none" else side_by_side(parts)
     number = np.full(sum(len(one.xyz) for one in measured) + 1, -1, np.int64)
     number[merged.vertex] = np.arange(len(merged.vertex))
 
@@ -93,20 +98,22 @@ def reference_surface(
         for one, offset in zip(measured, offsets, strict=False)
     ]
     neighbours = np.concatenate(shifted)[merged.vertex]
-    status, count = np.unique(np.concatenate([one.lost for one in measured]), return_counts=True)
+    lost_at = np.concatenate([one.lost for one in measured])
+    status, count = np.unique(lost_at[:, 3], return_counts=True)
     grey_noise = np.full(len(cameras), np.nan)
     for chart in charts:
         grey_noise[chart.cameras] = chart.grey_noise
     return ReferenceSurface(
         joined("xyz"), number[merged.faces], joined("own"), joined("px", 1), joined("sigma", 1), joined("scatter", 1),
         joined("texture", 1), grey_noise, joined("chi2"), joined("degrees"), joined("c_ls"), number[neighbours],
-        np.stack([status, count], axis=1),
+        np.stack([status, count], axis=1), lost_at,
+        np.array([astuple(one) for one in merged.mismatch]).reshape(-1, 8),
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class _MeasuredChart:
-    """Points of one chart in space, with arrays as in `ReferenceSurface`, and the reasons (k,) of those lost."""
+    """Points of one chart in space, with arrays as in `ReferenceSurface`, and those that were lost."""
 
     xyz: Points
     faces: Indices
@@ -119,11 +126,11 @@ class _MeasuredChart:
     degrees: Indices
     c_ls: Floats
     neighbours: Indices
-    lost: NDArray[np.int8]
+    lost: Indices
 
 
-def _measure(cameras: Sequence[Camera], k: int, chart: Chart, step: int, sigma_max: float) -> _MeasuredChart:
-    """Triangulate the points of chart k and keep those that form triangles."""
+def _measure(cameras: Sequence[Camera], chart: Chart, step: int, sigma_max: float) -> _MeasuredChart:
+    """Triangulate the points of a chart and keep those that form triangles."""
     if len(chart.cameras) < 2 or not len(chart.xy):
         return _empty(len(cameras), chart)
     own = [cameras[c] for c in chart.cameras]
@@ -152,9 +159,9 @@ def _measure(cameras: Sequence[Camera], k: int, chart: Chart, step: int, sigma_m
 
     c_ls = np.max(np.where(used, chart.c_ls, -np.inf), axis=0, initial=-np.inf)
     return _MeasuredChart(
-        xyz[rows], number[faces], np.full(len(rows), k), everywhere(px), everywhere(smooth),
+        xyz[rows], number[faces], np.full(len(rows), chart.cameras[0]), everywhere(px), everywhere(smooth),
         everywhere(sigma), everywhere(chart.texture), points.chi2[rows], points.degrees[rows],
-        c_ls[rows].astype(float), number[neighbours[rows]], status[status != 0],
+        c_ls[rows].astype(float), number[neighbours[rows]], _lost_at(chart, status),
     )  # fmt: skip
 
 
@@ -173,8 +180,15 @@ def _empty(count: int, chart: Chart) -> _MeasuredChart:
     return _MeasuredChart(
         triples, triples.astype(np.int64), nothing.astype(np.int64), views, views, views,
         np.zeros((count, 0, 5), np.float32), nothing, nothing.astype(np.int64), nothing,
-        np.zeros((0, 4, 2), np.int64), chart.status[0].astype(np.int8),
+        np.zeros((0, 4, 2), np.int64), _lost_at(chart, chart.status[0]),
     )  # fmt: skip
+
+
+def _lost_at(chart: Chart, status: NDArray[np.int8]) -> Indices:
+    """Camera, x, y (px) and status (L, 4) of the points of a chart whose status is not 0."""
+    lost = status != 0
+    own = np.full(int(lost.sum()), chart.cameras[0])
+    return np.column_stack([own, chart.xy[lost], status[lost]]).astype(np.int64)
 
 
 def _status(chart: Chart, px: Pixels, uncertain: Mask, xyz: Points) -> NDArray[np.int8]:

@@ -14,22 +14,24 @@ import numpy as np
 
 from ringdic.arrays import Image, Mask
 from ringdic.charts.chart import Chart, chart_with_uncertainty
-from ringdic.charts.depth_map import DepthImages, DepthMap, measure_depths
+from ringdic.charts.depth_map import DepthMap, depths_at_fitting_size
+from ringdic.charts.evidence import match_evidence, why_unmatched
 from ringdic.charts.images import ChartImages
-from ringdic.charts.matching import match_chart
+from ringdic.charts.matching import drop_masked, match_chart
 from ringdic.charts.patches import Patches
 from ringdic.charts.plane_sweep import DepthRange
 from ringdic.charts.series import camera_view
 from ringdic.charts.surface import ReferenceSurface, reference_surface
 from ringdic.charts.tracked_points import TrackedPoints, tracked_points
 from ringdic.charts.tracking import CameraMatches, match_in_two_passes, surface_grid
+from ringdic.charts.unmeasured import arrays_of_places, unmeasured_places
 from ringdic.charts.views import plan_chart
 from ringdic.correlation import CorrelationSettings, Reference, prepare_reference, reference_bytes
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.session.folder import Capture, Session
 from ringdic.session.images import read_mask
-from ringdic.settings import Settings
+from ringdic.settings import Settings, SurfaceGroup
 from ringdic.tasks import Arrays, Task, code_stamp, digest, process_memory, read_output, work_folder
 from ringdic.tasks.step_images import Digests, step_image
 
@@ -67,9 +69,13 @@ class RigViews:
 
 @dataclass(frozen=True)
 class ChartsJob:
-    """Tasks of a measurement by all cameras: depth maps, charts, the surface, and for each camera its later steps."""
+    """Tasks of a measurement by all cameras: depth maps, charts, the surface, and for each camera its later steps.
+
+    views : of the cameras. names : of the charts: of their camera, or of their pair of cameras.
+    """
 
     views: RigViews
+    names: tuple[str, ...]
     maps: tuple[Task, ...]
     charts: tuple[Task, ...]
     surface: Task
@@ -93,10 +99,16 @@ class ChartsJob:
         return CameraMatches(step=int(arrays["step"]), **{name: arrays[name] for name in _MATCHES})
 
 
-def charts_job(session: Session, cameras: Sequence[Camera], steps: Sequence[Capture], settings: Settings) -> ChartsJob:
+def charts_job(
+    session: Session, cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]], steps: Sequence[Capture],
+    settings: Settings,
+) -> ChartsJob:  # fmt: skip
     """Create the tasks of a session's measurement by all cameras that have a reference image.
 
-    cameras : all with a reference image. steps : captures, the reference first.
+    By the best method every camera has a chart, of what it faces most squarely; by the paper's method every pair has
+    one, of all that its two cameras share.
+
+    cameras : all with a reference image. pairs : ids of neighbouring cameras. steps : captures, the reference first.
     """
     views = RigViews.of(cameras)
     digests, folder = Digests(session), work_folder(session.path)
@@ -112,17 +124,14 @@ def charts_job(session: Session, cameras: Sequence[Camera], steps: Sequence[Capt
         key = digest(stamp, "depth map", k, list(cameras), correlation, used)
         maps.append(Task(key, f"depth of camera {camera.id}", depth_task, (reference, k), folder, cost=_CHART_COST))
     needs = tuple(task.key for task in maps)
-    incidence = settings.surface.incidence_deg
-    for k, camera in enumerate(cameras):
-        key = digest(stamp, "chart", k, needs, incidence)
-        name = f"chart of camera {camera.id}"
-        charts.append(Task(key, name, chart_task, (reference, k, incidence), folder, needs, _CHART_COST))
-    needs = tuple(task.key for task in charts)
-    sigma_max = settings.surface.sigma_max_px
-    surface = Task(
-        digest(stamp, "surface", needs, sigma_max), "surface", surface_task,
-        (views.cameras, correlation.step, sigma_max), folder, needs,
-    )  # fmt: skip
+    plans = _planned_charts(views, pairs, settings)
+    for plan in plans:
+        key = digest(stamp, "chart", plan, needs)
+        charts.append(Task(key, f"chart of {plan.name}", chart_task, (reference, plan), folder, needs, _CHART_COST))
+    needs = (*needs, *(task.key for task in charts))
+    joining = (correlation.step, settings.surface)
+    surface = Task(digest(stamp, "surface", needs, joining), "surface", surface_task, (views, *joining), folder, needs)
+    curved = settings.method == "best"
     rows = []
     for k, camera in enumerate(cameras):
         row: list[Task | None] = []
@@ -131,11 +140,39 @@ def charts_job(session: Session, cameras: Sequence[Camera], steps: Sequence[Capt
                 row.append(None)
                 continue
             mark = digests.image(step, camera.id)
-            arguments = (views.cameras, k, correlation, images[k], step.images[camera.id])
+            arguments = (views.cameras, k, correlation, curved, images[k], step.images[camera.id])
             key = digest("tracked camera", surface.key, k, mark)
             row.append(Task(key, f"camera {camera.id}, {step.id}", tracking_task, arguments, folder, (surface.key,)))
         rows.append(tuple(row))
-    return ChartsJob(views, tuple(maps), tuple(charts), surface, tuple(rows))
+    names = tuple(plan.name for plan in plans)
+    return ChartsJob(views, names, tuple(maps), tuple(charts), surface, tuple(rows))
+
+
+@dataclass(frozen=True)
+class _PlannedChart:
+    """A chart before it is matched.
+
+    name : of its camera or pair. camera : its index. partners : indices of the cameras that it may be matched with.
+    incidence : degrees, of the steepest view. curved : whether the curvature of the surface is held, and the chart is
+    the part that its camera faces most squarely; otherwise it is flat and all that it shares with its partner.
+    """
+
+    name: str
+    camera: int
+    partners: tuple[int, ...]
+    incidence: float
+    curved: bool
+
+
+def _planned_charts(views: RigViews, pairs: Sequence[tuple[str, str]], settings: Settings) -> list[_PlannedChart]:
+    """The charts of a measurement: of every camera, or by the paper's method of every pair of cameras."""
+    incidence = settings.surface.incidence_deg
+    if settings.method == "best":
+        return [
+            _PlannedChart(camera.id, k, views.partners[k], incidence, True) for k, camera in enumerate(views.cameras)
+        ]
+    index = {camera.id: k for k, camera in enumerate(views.cameras)}
+    return [_PlannedChart(f"{a}-{b}", index[a], (index[b],), incidence, False) for a, b in pairs]
 
 
 @dataclass(frozen=True)
@@ -161,50 +198,70 @@ def depth_task(files: _ReferenceFiles, k: int, *, inputs: tuple[Path, ...]) -> A
     """Measure the depth map of camera k. Returns its arrays, and "points", their number."""
     del inputs
     partners = files.views.partners[k]
-    images = DepthImages.of(files.views.cameras, files.image, files.correlation)
-    depth_map = measure_depths(images, k, partners[:_MOST], files.views.space, files.mask(k))
+    mask, space = files.mask(k), files.views.space
+    images, depth_map = depths_at_fitting_size(
+        files.views.cameras, files.image, files.correlation, k, partners[:_MOST], space, mask
+    )
+    evidence = match_evidence(images, depth_map, k, partners[0], space, mask) if partners else None
     patches = depth_map.patches
     return {
         "px": patches.px, "inverse_depth": patches.inverse_depth, "gradient": patches.gradient,
-        "sigma": depth_map.sigma, "zncc": depth_map.zncc, "textured": depth_map.textured,
+        "sigma": depth_map.sigma, "textured": depth_map.textured, "patterned": depth_map.patterned,
         "spacing": np.array(depth_map.spacing), "grey_noise": np.array(depth_map.grey_noise),
-        "points": np.array(len(patches.px)),
+        "points": np.array(len(patches.px)), "evidence": np.zeros(0) if evidence is None else evidence.array(),
     }  # fmt: skip
 
 
-def _depth_map(camera: str, arrays: Mapping[str, np.ndarray]) -> DepthMap:
-    """The depth map of a camera from the arrays of a task's output."""
+def _depth_map(arrays: Mapping[str, np.ndarray]) -> DepthMap:
+    """A depth map from the arrays of a task's output."""
     n = len(arrays["px"])
     patches = Patches(arrays["px"], arrays["inverse_depth"], arrays["gradient"], np.zeros((n, 3)))
-    sigma, zncc, textured = (arrays[name] for name in ("sigma", "zncc", "textured"))
-    return DepthMap(camera, int(arrays["spacing"]), patches, sigma, zncc, textured, float(arrays["grey_noise"]))
+    sigma, textured, patterned = (arrays[name] for name in ("sigma", "textured", "patterned"))
+    return DepthMap(int(arrays["spacing"]), patches, sigma, textured, patterned, float(arrays["grey_noise"]))
 
 
-def chart_task(files: _ReferenceFiles, k: int, incidence: float, *, inputs: tuple[Path, ...]) -> Arrays:
-    """Match the chart of camera k in all cameras that see it. inputs : outputs of the depth maps of all cameras."""
-    cameras = files.views.cameras
-    maps = [_depth_map(camera.id, read_output(path)) for camera, path in zip(cameras, inputs, strict=True)]
-    plan = plan_chart(k, cameras, maps, incidence, files.views.partners[k])
+def chart_task(files: _ReferenceFiles, planned: _PlannedChart, *, inputs: tuple[Path, ...]) -> Arrays:
+    """Match a chart in all cameras that see it. inputs : outputs of the depth maps of all cameras."""
+    cameras, k, incidence = files.views.cameras, planned.camera, planned.incidence
+    maps = [_depth_map(read_output(path)) for path in inputs]
+    plan = plan_chart(k, cameras, maps, incidence, planned.partners, whole=not planned.curved)
     images = ChartImages(cameras, files.image, files.correlation)
-    matches = match_chart(images, k, maps[k], plan, files.mask(k), incidence)
+    matches = match_chart(images, k, maps[k], plan, files.mask(k), incidence, curved=planned.curved)
+    drop_masked(matches, files.mask)
     noise = np.array([maps[c].grey_noise for c in matches.cameras])
     chart = chart_with_uncertainty(images, matches, noise)
     return {**chart.arrays(), "points": np.array(int(np.isfinite(chart.px[..., 0]).sum()))}
 
 
-def surface_task(cameras: tuple[Camera, ...], step: int, sigma_max: float, *, inputs: tuple[Path, ...]) -> Arrays:
-    """Triangulate and merge the charts. inputs : outputs of the charts of all cameras."""
-    charts = [Chart.from_arrays(read_output(path)) for path in inputs]
-    return reference_surface(cameras, charts, step, sigma_max).arrays()
+def surface_task(views: RigViews, step: int, settings: SurfaceGroup, *, inputs: tuple[Path, ...]) -> Arrays:
+    """Triangulate and merge the charts, and find what they left unmeasured.
+
+    inputs : outputs of the depth maps of all cameras, then of the charts. Returns the arrays of the surface and of the
+    unmeasured places, and "unmatched", a sentence for each camera that has hardly a depth, else an empty one.
+    """
+    cameras = views.cameras
+    depths, charts = [read_output(path) for path in inputs[: len(cameras)]], inputs[len(cameras) :]
+    maps = [_depth_map(one) for one in depths]
+    why = why_unmatched(cameras, maps, [one["evidence"] for one in depths])
+    try:
+        measured = [Chart.from_arrays(read_output(path)) for path in charts]
+        surface = reference_surface(cameras, measured, step, settings.sigma_max_px, settings.merge)
+    except ComputationError as error:
+        raise ComputationError(f"{error}: {'; '.join(filter(None, why))}") from error
+    places = unmeasured_places(cameras, maps, surface, settings.incidence_deg, views.space.centre)
+    return {**surface.arrays(), **arrays_of_places(places), "unmatched": np.array(why)}
 
 
 def tracking_task(
-    cameras: tuple[Camera, ...], k: int, settings: CorrelationSettings, reference: Path, image: Path,
+    cameras: tuple[Camera, ...], k: int, settings: CorrelationSettings, curved: bool, reference: Path, image: Path,
     *, inputs: tuple[Path, ...],
 ) -> Arrays:  # fmt: skip
-    """Match the grid of camera k in its image of one step. inputs : output of the surface."""
+    """Match the grid of camera k in its image of one step, with or without the field's curvature held.
+
+    inputs : output of the surface.
+    """
     prepared, points = _reference_and_points(cameras, k, settings, reference, inputs[0])
-    matches = match_in_two_passes(prepared, step_image(image, cameras[k]), points, settings)
+    matches = match_in_two_passes(prepared, step_image(image, cameras[k]), points, settings, curved=curved)
     arrays = {name: getattr(matches, name) for name in _MATCHES}
     return {**arrays, "step": np.array(matches.step), "points": np.array(len(points.positions))}
 

@@ -1,7 +1,7 @@
 """Points tracked through a camera's images, with quantities that are computed once for all images.
 
-Quantities that are smooth over the image, the field's curvature and the bias of the subsets, are computed at a part
-of the points only, the knots: one in each square not quite a subset's radius wide.
+The field's curvature, which is smooth over the image, is computed about a part of the points only, the knots: one in
+each square of a grid.
 """
 
 from __future__ import annotations
@@ -18,8 +18,11 @@ from ringdic.correlation import CorrelationSettings, Reference
 from ringdic.correlation.quadratic import LowerQuartiles, Neighbourhoods, QuadraticFit
 from ringdic.correlation.seeds import even_sample
 
-_APART = 0.8  # subset radii, side of the squares with one knot each
-_REACH = 3.0  # subset radii about a knot, of the neighbours that its curvature and bias are computed from
+#: Side of the squares with one knot each, in subset radii.
+APART = 1.5
+_REACH = 3.0  # subset radii about a knot, of the neighbours that its curvature is computed from
+_FINE = (0.4, 2.5)  # subset radii, side of the squares and reach of the fine knots
+_ONE_SIDED = 0.12  # windows between a knot and the mean of its neighbours; 0.42 where these are a half disc
 _SCATTERS = 8.0  # standard deviations from the neighbours' quadratic beyond which a point contradicts it
 _LEAST_OFF = 0.1  # px, least distance that is a contradiction
 _STRICTER = (4.0, 1.0)  # times the limit: the most distant knots are rejected first, so that they do not bias the fit
@@ -27,14 +30,62 @@ _UNLIKE = 3.0  # times the usual mean square difference that noise alone, which 
 
 
 @dataclass(frozen=True)
+class Knots:
+    """Some of n points, about which local quadratics of a field are fitted: m knots.
+
+    index : (m,) int, among the points. of_points : (n,) int, the knot next to each point. neighbourhoods : of the
+    knots, at whole pixels.
+    """
+
+    index: Indices
+    of_points: Indices
+    neighbourhoods: Neighbourhoods
+
+    @classmethod
+    def of(cls, pixels: Pixels, side: float | None, window: float) -> Knots:
+        """Choose the knots of points.
+
+        pixels : (n, 2) px. side : px, of squares with one knot each; None to make every point one. window : px, radius
+        of the neighbourhoods.
+        """
+        if side is None:
+            everyone = np.arange(len(pixels))
+            return cls(everyone, everyone, Neighbourhoods(pixels, window))
+        index = thin_to_grid(pixels, side)
+        _, nearest = cKDTree(pixels[index]).query(pixels)
+        return cls(index, np.asarray(nearest, np.int64), Neighbourhoods(pixels[index], window))
+
+    @property
+    def one_sided(self) -> Mask:
+        """Knots (m,) bool whose neighbours lie to one side, as at the rim of the surface."""
+        return np.asarray(self.neighbourhoods.eccentricity > _ONE_SIDED)
+
+    def nearest(self, known: Mask, pixels: Pixels, reach: float = np.inf) -> Indices:
+        """Nearest known knot of every point.
+
+        known : (m,) bool, of the knots. pixels : (n, 2) px, the points. reach : px. Returns indices (n,) of knots, -1
+        where none lies within reach.
+        """
+        if not known.any():
+            return np.full(len(pixels), -1)
+        out = self.of_points.copy()
+        lost = np.flatnonzero(~known[out])
+        if len(lost):
+            which = np.flatnonzero(known)
+            distance, index = cKDTree(self.neighbourhoods.xy[which]).query(pixels[lost], distance_upper_bound=reach)
+            out[lost] = np.where(np.isfinite(distance), which[np.minimum(index, len(which) - 1)], -1)
+        return out
+
+
+@dataclass(frozen=True)
 class TrackedPoints:
-    """Points of a reference image that are tracked through later images: n points, of which m are knots.
+    """Points of a reference image that are tracked through later images: n points.
 
     positions : (n, 2) float64, px. pixels : (n, 2) float64, px, the whole pixels next to them, on which their
     subsets lie. variance : (n,), of the grey levels there, grey levels². least : mean square difference due
-    to rounding to whole grey levels, grey levels². seeds : (s,) int, some points spread evenly. knots : (m,) int,
-    indices of the knots. knot : (n,) int, the knot next to each point. neighbourhoods : of the knots. quartile : of
-    the knots about each point.
+    to rounding to whole grey levels, grey levels². seeds : (s,) int, some points spread evenly. knots : matched before
+    all other points. fine_knots : closer together, with smaller neighbourhoods. quartile : of the knots about each
+    point.
     """
 
     positions: Pixels
@@ -42,9 +93,8 @@ class TrackedPoints:
     variance: Floats
     least: float
     seeds: Indices
-    knots: Indices
-    knot: Indices
-    neighbourhoods: Neighbourhoods
+    knots: Knots
+    fine_knots: Knots
     quartile: LowerQuartiles
 
     @property
@@ -52,42 +102,19 @@ class TrackedPoints:
         """Offsets from the points to their whole pixels, (n, 2) px."""
         return self.pixels - self.positions
 
-    def nearest(self, known: Mask, reach: float = np.inf) -> Indices:
-        """Nearest known knot of every point.
-
-        known : (m,) bool, of the knots. reach : px. Returns indices (n,) of knots, -1 where none lies within reach.
-        """
-        if not known.any():
-            return np.full(len(self.positions), -1)
-        out = self.knot.copy()
-        lost = np.flatnonzero(~known[out])
-        if len(lost):
-            which = np.flatnonzero(known)
-            distance, index = cKDTree(self.neighbourhoods.xy[which]).query(
-                self.pixels[lost], distance_upper_bound=reach
-            )
-            out[lost] = np.where(np.isfinite(distance), which[np.minimum(index, len(which) - 1)], -1)
-        return out
-
-    def quadratics(self, values: Pixels, sigma: Floats) -> QuadraticFit:
-        """Fit local quadratics of a displacement field about the knots, with rejection of outlying knots.
-
-        values : (n, 2) px, at the points. sigma : (n,) px.
-        """
-        return robust_quadratics(self.neighbourhoods, values[self.knots], sigma[self.knots])
-
     def contradict(self, values: Pixels, sigma: Floats) -> Mask:
         """Outlying points, whose displacement is far from the quadratic fitted to their neighbours.
 
         values : (n, 2) px, NaN where unknown. sigma : (n,) px. Returns (n,) bool, False where the displacement is
         unknown.
         """
-        fit = self.quadratics(values, sigma)
-        knot = self.nearest(np.asarray(np.isfinite(fit.value).all(axis=1)), self.neighbourhoods.window)
-        distance = np.hypot(*(values - fit.extrapolate(knot, self.pixels - self.neighbourhoods.xy[knot])).T)
+        near, index = self.knots.neighbourhoods, self.knots.index
+        fit = robust_quadratics(near, values[index], sigma[index])
+        knot = self.knots.nearest(np.asarray(np.isfinite(fit.value).all(axis=1)), self.pixels, near.window)
+        distance = np.hypot(*(values - fit.extrapolate(knot, self.pixels - near.xy[knot])).T)
         distance[knot < 0] = np.nan
         own = np.hypot(*fit.leave_one_out.T)
-        distance[self.knots] = np.where(np.isfinite(own), own, distance[self.knots])
+        distance[index] = np.where(np.isfinite(own), own, distance[index])
         with np.errstate(invalid="ignore"):
             return np.asarray(distance > _limit(distance))
 
@@ -103,7 +130,7 @@ class TrackedPoints:
         known = np.isfinite(mean_square)
         if not known.any():
             return np.full(len(mean_square), np.nan)
-        return _UNLIKE * np.fmax(self.quartile(mean_square[self.knots]), np.median(mean_square[known]))
+        return _UNLIKE * np.fmax(self.quartile(mean_square[self.knots.index]), np.median(mean_square[known]))
 
 
 def tracked_points(
@@ -119,24 +146,13 @@ def tracked_points(
     positions : (n, 2) float64, px. window : px, radius of the neighbourhoods; None: 3 subset radii. thin : whether only
     one point in each square is a knot; otherwise every point is one.
     """
-    pixels = np.rint(positions)
-    knots = thin_to_grid(pixels, _APART * settings.radius) if thin else np.arange(len(positions))
-    neighbourhoods = Neighbourhoods(pixels[knots], window or _REACH * settings.radius)
-    quartile = LowerQuartiles(pixels, neighbourhoods.xy, neighbourhoods.window)
-    _, knot = cKDTree(pixels[knots]).query(pixels)
-    variance = _variance(reference, pixels, settings.radius)
+    pixels, radius = np.rint(positions), settings.radius
+    knots = Knots.of(pixels, APART * radius if thin else None, window or _REACH * radius)
+    fine_knots = Knots.of(pixels, _FINE[0] * radius, _FINE[1] * radius)
+    quartile = LowerQuartiles(pixels, knots.neighbourhoods.xy, knots.neighbourhoods.window)
     least = (reference.grey_range / 255.0) ** 2
-    return TrackedPoints(
-        positions,
-        pixels,
-        variance,
-        least,
-        even_sample(positions),
-        knots,
-        np.asarray(knot, np.int64),
-        neighbourhoods,
-        quartile,
-    )
+    variance = _variance(reference, pixels, radius)
+    return TrackedPoints(positions, pixels, variance, least, even_sample(positions), knots, fine_knots, quartile)
 
 
 def thin_to_grid(xy: Pixels, side: float) -> Indices:

@@ -93,15 +93,16 @@ def surface_grid(size: tuple[int, int], step: int, views: Sequence[ChartView]) -
 
 
 def match_in_two_passes(
-    reference: Reference, image: Image, points: TrackedPoints, settings: CorrelationSettings
+    reference: Reference, image: Image, points: TrackedPoints, settings: CorrelationSettings, *, curved: bool = True
 ) -> CameraMatches:
     """Match the points of a camera's grid in its image of a step.
 
     reference : its reference image, prepared with the grid's region. image : (height, width) grey levels. points : of
-    the grid, prepared for tracking.
+    the grid, prepared for tracking. curved : whether the curvature of the displacement is held; otherwise one
+    pass as the settings say.
     """
     current = prepare_current(image, settings=settings)
-    matches = match_tracked_points(reference, current, points, None, settings)
+    matches = match_tracked_points(reference, current, points, None, settings, two_pass=curved)
     return CameraMatches(
         points.pixels.astype(np.int32),
         settings.step,

@@ -12,20 +12,24 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ringdic.arrays import Floats, Image, Indices, Mask, Pixels, Points, Vectors
+from ringdic.charts.contrast import contrast
 from ringdic.charts.depth_map import DepthMap
 from ringdic.charts.patches import depths
 from ringdic.geometry.camera import Camera
-from ringdic.sweep.region import contrast
 
 _REACH = 1.5  # steps of a map's lattice within which its nearest place tells the depth of a pixel
 _SAME = 0.5  # steps of the lattice, in mm on the surface, within which two depths agree
 _STRONG = 0.5  # slope of a textured pixel, in units of the usual contrast of the chart
 _GAP = 0.6  # subset radii, half the largest gap between speckles
+_POINTS = 0.1  # subset radii, width of the strip along the border of the pattern in which no point lies
+_EDGE = 0.45  # subset radii, width of the strip along the border of the pattern that no subset contains
 _LEAST_CONTRAST = 0.3  # close to a point, of the usual one: a subset beyond the last speckles is ill determined
-_OVERLAP = 2  # steps of the lattice by which a chart exceeds the part that its camera faces most squarely
+_OVERLAP = 1  # steps of the lattice by which a chart exceeds the part that its camera faces most squarely
+_RIM = 3.0  # steps of the lattice by which matches may reach beyond the last place with a depth
 
 
 @dataclass(frozen=True)
@@ -40,8 +44,9 @@ class ChartPlan:
 
 
 def plan_chart(
-    k: int, cameras: Sequence[Camera], maps: Sequence[DepthMap], incidence_deg: float, partners: Sequence[int]
-) -> ChartPlan:
+    k: int, cameras: Sequence[Camera], maps: Sequence[DepthMap], incidence_deg: float, partners: Sequence[int],
+    *, whole: bool = False,
+) -> ChartPlan:  # fmt: skip
     """Determine the part of the surface that a camera faces most squarely, with a margin round it.
 
     Parameters
@@ -51,6 +56,7 @@ def plan_chart(
     maps : their depth maps.
     incidence_deg : degrees, largest angle of incidence of a view that is used.
     partners : indices of the cameras that it may be matched with.
+    whole : whether the chart is all that the camera shares with a partner, instead of what it faces most squarely.
     """
     view = _MapViews(cameras[k], maps[k])
     limit = math.cos(math.radians(incidence_deg))
@@ -63,6 +69,8 @@ def plan_chart(
         squarest = np.maximum(squarest, np.where(same, cosine, -1.0))
         sees[:, c] = (cosine > limit) & ~hidden & _inside(cameras[c], view.xyz)
     usable = (own > limit) & sees.any(axis=1)
+    if whole:
+        return ChartPlan(usable, sees)
     return ChartPlan(_dilated(maps[k], usable & (own >= squarest)) & usable, sees)
 
 
@@ -172,13 +180,19 @@ def chart_region(grey: Image, depth_map: DepthMap, inside: Mask, radius: int) ->
         mask[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1] = 1
     closed = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((2 * reach + 1,) * 2, np.uint8))) > 0
     textured, close = _textured_pixels(part, float(np.median(contrast(grey, px[inside], radius))), radius)
-    region[top:bottom, left:right] = closed & textured
-    of_points[top:bottom, left:right] = closed & textured & close
+    pattern = (closed & textured).astype(np.uint8)
+    region[top:bottom, left:right] = _eroded(pattern, _EDGE * radius)
+    of_points[top:bottom, left:right] = _eroded(pattern, _POINTS * radius) & close
     return region, of_points
 
 
+def _eroded(pattern: NDArray[np.uint8], width: float) -> Mask:
+    """Mask of a pattern, (height, width) bool, without a strip along its border. width : px, of the strip."""
+    return np.asarray(cv2.erode(pattern, np.ones((2 * round(width) + 1,) * 2, np.uint8)) > 0)
+
+
 def _cells(depth_map: DepthMap, inside: Mask) -> Pixels:
-    """Places (k, 2) px of a chart, and textured places without a depth within the overlap of them."""
+    """Places (k, 2) px of a chart, and textured places without a depth close to them."""
     spacing = depth_map.spacing
     known, textured = depth_map.patches.px, depth_map.textured
     taken = {tuple(cell) for cell in np.rint(known / spacing).astype(int).tolist()}
@@ -186,7 +200,7 @@ def _cells(depth_map: DepthMap, inside: Mask) -> Pixels:
     beyond = textured[np.array(free, bool)]
     if not len(beyond):
         return known[inside]
-    distance = cKDTree(known[inside]).query(beyond, distance_upper_bound=1.5 * _OVERLAP * spacing)[0]
+    distance = cKDTree(known[inside]).query(beyond, distance_upper_bound=_RIM * spacing)[0]
     return np.concatenate([known[inside], beyond[np.isfinite(distance)]])
 
 

@@ -32,14 +32,13 @@ def smooth_sigma(px: Pixels, sigma: Floats, cell: float) -> Floats:
     column, row = cell_position.astype(np.int64).T
     shape = (int(row.max()) + 1, int(column.max()) + 1)
     number = row * shape[1] + column
-    order = np.argsort(number, kind="stable")
-    cells, first = np.unique(number[order], return_index=True)
+    cells, first, members = np.unique(np.sort(number), return_index=True, return_counts=True)
     count, total = np.zeros(shape), np.zeros((2, *shape))
-    values = sigma[known]
-    for which, members in zip(cells, np.split(order, first[1:]), strict=True):
-        count.flat[which] = len(members)
-        for axis in range(2):
-            total[axis].flat[which] = len(members) * np.median(values[members, axis])
+    count.flat[cells] = members
+    for axis, values in enumerate(sigma[known].T):
+        ordered = values[np.lexsort((values, number))]
+        median = 0.5 * (ordered[first + (members - 1) // 2] + ordered[first + members // 2])
+        total[axis].flat[cells] = members * median
 
     def blurred(values: Floats) -> Floats:
         smooth = gaussian_filter(values, 1.0, mode="constant")

@@ -134,7 +134,12 @@ def correlate_points(
 
 
 def correlate_independently(
-    reference: Reference, current: Current, xy: Pixels, settings: CorrelationSettings, start: Floats
+    reference: Reference,
+    current: Current,
+    xy: Pixels,
+    settings: CorrelationSettings,
+    start: Floats,
+    repeated: bool = False,
 ) -> PointMatches:
     """Match points of a reference image each from its own start value, without propagation and test of outliers.
 
@@ -144,13 +149,16 @@ def correlate_independently(
         where a subset leaves that, the point is lost.
     xy : (n, 2) float64, px, points of the reference image.
     start : (n, 6) or (n, 12) float64, px and derivatives, as for :func:`correlate_points`; NaN leaves a point out.
+    repeated : whether these points of the reference are matched in other images too, and what all share is kept.
 
     Raises InputError if there is no point, or if the images were prepared for other settings.
     """
     xy = _check_points(reference, current, xy, settings)
     load_kernels()
     textureless = np.zeros(len(xy), bool)  # the kernel tests each subset
-    points = Propagation(reference, current, xy, settings, region=current, textureless=textureless, independent=True)
+    points = Propagation(
+        reference, current, xy, settings, region=current, textureless=textureless, independent=True, repeated=repeated
+    )
     given = np.flatnonzero(np.isfinite(start).all(axis=1))
     began = time.perf_counter()
     if len(given):

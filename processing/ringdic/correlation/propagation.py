@@ -48,6 +48,7 @@ class Propagation:
     filtering : seconds spent so far on filtering the current image.
     textureless : (n,) bool, points with too little texture; determined from the image by default.
     independent : each point is refined from its own start value only; no point has neighbours.
+    repeated : these points are matched in other images too, so that their normal matrices are worth keeping.
 
     Attributes
     ----------
@@ -71,6 +72,7 @@ class Propagation:
     filtering: float = 0.0
     textureless: Mask | None = None
     independent: bool = False
+    repeated: bool = True
     near: Indices = field(init=False)
     parameters: Floats = field(init=False)
     status: Indices = field(init=False)
@@ -98,7 +100,7 @@ class Propagation:
         if self.textureless is None:
             self.textureless = textureless_points(self.reference, self.xy, self.settings)
         self.status[self.textureless] = Status.NO_TEXTURE
-        if not self.independent:
+        if self.repeated:
             self.subsets = subset_cache(self.reference, self.xy, self.settings)
 
     @property

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numba as nb
 import numpy as np
@@ -69,6 +70,13 @@ class Neighbourhoods:
         self.xy = np.ascontiguousarray(xy, dtype=np.float64)
         self.window = float(window)
         self._first, self._members = neighbours_within(self.xy, self.xy, self.window)
+
+    @cached_property
+    def eccentricity(self) -> Floats:
+        """Distance (n,) from each point to its neighbours' mean over the window, no unit; 0.4 at a straight rim."""
+        total = np.add.reduceat(self.xy[self._members], self._first[:-1], axis=0)
+        mean = total / np.diff(self._first)[:, None]
+        return np.asarray(np.hypot(*(mean - self.xy).T) / self.window)
 
     def fit(self, values: Floats, sigma: Floats | None = None) -> QuadraticFit:
         """Fit a quadratic of a field around every point.

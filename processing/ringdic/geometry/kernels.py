@@ -91,47 +91,6 @@ def solve_normal_equations(normal, right, which, xyz):  # type: ignore[no-untype
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def linear_variance(P, px, slopes, normal, which, xyz, sigma):  # type: ignore[no-untyped-def]
-    """Variances (n, 3) mm² of linearly triangulated points, by first-order propagation of independent pixel errors.
-
-    P (C, 3, 4) projection matrices. px (C, n, 2) undistorted pixels. slopes (C, n, 2, 2) Jacobians of the image pixel
-    by the undistorted pixel, NaN for the identity. normal (n, 3, 3) and xyz (n, 3) mm: normal matrices and solutions of
-    the triangulation. which (n,) bool: points to be computed, the others are NaN. sigma (C, n, 2) px standard
-    deviations in the image, NaN for an exact pixel.
-    """
-    out = np.zeros((len(xyz), 3))
-    inverse, A, moved = np.empty((3, 3)), np.empty((2, 3)), np.empty((3, 2))
-    for n in range(len(xyz)):
-        if not which[n]:
-            out[n] = np.nan
-            continue
-        _inverse(normal[n], inverse)
-        for c in range(len(P)):
-            u, v = px[c, n, 0], px[c, n, 1]
-            if not (math.isfinite(u) and math.isfinite(v)):
-                continue
-            depth = P[c, 2, 3]
-            for i in range(3):
-                depth += xyz[n, i] * P[c, 2, i]
-                A[0, i], A[1, i] = P[c, 0, i] - u * P[c, 2, i], P[c, 1, i] - v * P[c, 2, i]
-            for i in range(3):
-                for k in range(2):
-                    moved[i, k] = depth * (inverse[i, 0] * A[k, 0] + inverse[i, 1] * A[k, 1] + inverse[i, 2] * A[k, 2])
-            J = slopes[c, n]
-            xx, xy, yx, yy = J[0, 0], J[0, 1], J[1, 0], J[1, 1]
-            if not math.isfinite(xx + xy + yx + yy):
-                xx, xy, yx, yy = 1.0, 0.0, 0.0, 1.0
-            det = xx * yy - xy * yx
-            first = 0.0 if math.isnan(sigma[c, n, 0]) else sigma[c, n, 0]
-            second = 0.0 if math.isnan(sigma[c, n, 1]) else sigma[c, n, 1]
-            for i in range(3):
-                by_u = (moved[i, 0] * yy - moved[i, 1] * yx) / det * first
-                by_v = (moved[i, 1] * xx - moved[i, 0] * xy) / det * second
-                out[n, i] += by_u * by_u + by_v * by_v
-    return out
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
 def gain(slopes, sigma, out):  # type: ignore[no-untyped-def]
     """Sensitivities d(point)/d(pixel) of the weighted triangulation, ``(Σ Jᵀ W J)⁻¹ J_cᵀ W_c`` for camera c.
 

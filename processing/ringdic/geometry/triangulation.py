@@ -9,12 +9,10 @@ because the projection matrices are scaled to P[2, 3] = 1.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
-from ringdic.arrays import Floats, Indices, Mask, Pixels, Points
+from ringdic.arrays import Floats, Mask, Pixels, Points
 from ringdic.geometry import kernels
 from ringdic.geometry.camera import Camera
 
@@ -35,7 +33,9 @@ def triangulate(cameras: Sequence[Camera], px: Pixels) -> Points:
     ------
     ValueError : fewer than two cameras, or pixels of another shape.
     """
-    return LinearSystem.of(cameras, px).solution
+    px = pixels_of_cameras(cameras, px)
+    undistorted = np.stack([camera.undistort(image) for camera, image in zip(cameras, px, strict=True)])
+    return triangulate_undistorted(np.stack([camera.P for camera in cameras]), undistorted)
 
 
 def triangulate_undistorted(P: Floats, px: Pixels) -> Points:
@@ -44,61 +44,14 @@ def triangulate_undistorted(P: Floats, px: Pixels) -> Points:
     P : (C, 3, 4), world mm to undistorted px. px : (C, n, 2) undistorted px, NaN where a camera did not match the
     point. Returns (n, 3) mm, NaN where fewer than two cameras saw the point or the lines of sight are parallel.
     """
-    return LinearSystem(P, px).solution
-
-
-@dataclass(frozen=True)
-class LinearSystem:
-    """The linear equations of n points in C images (Solav et al. 2018, eq. 7-9) and their solution.
-
-    P : (C, 3, 4) projection matrices, world mm to undistorted px.
-    undistorted : (C, n, 2) undistorted px, NaN where a camera did not match the point.
-    """
-
-    P: Floats
-    undistorted: Pixels
-
-    def __post_init__(self) -> None:
-        for name in ("P", "undistorted"):
-            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=float))
-
-    @classmethod
-    def of(cls, cameras: Sequence[Camera], px: Pixels) -> LinearSystem:
-        """The system of image pixels, which are undistorted by each camera's lens.
-
-        px : (C, n, 2) px, NaN where a camera did not match the point. Raises ValueError for fewer than two cameras or
-        another shape.
-        """
-        px = pixels_of_cameras(cameras, px)
-        undistorted = np.stack([camera.undistort(image) for camera, image in zip(cameras, px, strict=True)])
-        return cls(np.stack([camera.P for camera in cameras]), undistorted)
-
-    @cached_property
-    def _summed(self) -> tuple[Floats, Floats, Indices, Mask]:
-        """``AᵀA`` (n, 3, 3), ``Aᵀb`` (n, 3), numbers of cameras (n,), and where ``AᵀA`` is proved regular (n,)."""
-        n = self.undistorted.shape[1]
-        normal, right, views = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty(n, np.int64)
-        return normal, right, views, kernels.normal_equations(self.P, self.undistorted, normal, right, views)
-
-    @property
-    def normal(self) -> Floats:
-        """Normal matrices ``AᵀA`` of the points, (n, 3, 3) px²/mm²."""
-        return self._summed[0]
-
-    @cached_property
-    def solvable(self) -> Mask:
-        """Which points are determined, (n,) bool: visible in at least two cameras, with lines of sight that cross."""
-        normal, _, views, sure = self._summed
-        solvable = sure.copy()
-        solvable[~sure] = _well_conditioned(normal[~sure])
-        return np.asarray(solvable & (views >= 2))
-
-    @cached_property
-    def solution(self) -> Points:
-        """Least-squares positions of the points, (n, 3) mm in the world frame, NaN where not determined."""
-        xyz = np.empty(self.normal.shape[:2])
-        kernels.solve_normal_equations(self.normal, self._summed[1], self.solvable, xyz)
-        return xyz
+    P, px = np.ascontiguousarray(P, dtype=float), np.ascontiguousarray(px, dtype=float)
+    n = px.shape[1]
+    normal, right, views, xyz = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty(n, np.int64), np.empty((n, 3))
+    solvable = kernels.normal_equations(P, px, normal, right, views)  # where AᵀA is proved regular
+    unsure = ~solvable
+    solvable[unsure] = _well_conditioned(normal[unsure])
+    kernels.solve_normal_equations(normal, right, solvable & (views >= 2), xyz)
+    return xyz
 
 
 def _well_conditioned(normal: Floats) -> Mask:

@@ -1,21 +1,18 @@
 """Processing of a single step during the capture, for display until a run processes the whole session.
 
 The matches of the step are stored like those of a run, so that a later run computes only what is missing. All steps
-are shown on the surface of the reference, which is merged once. It is always measured by pairs of cameras, whatever the
-settings say, because only pairs need no matches of the steps in between.
+are shown on the surface of the reference, which is measured once.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 from ringdic.calibration.calibrated_rig import CalibratedRig, calibrate_rig
 from ringdic.errors import InputError
 from ringdic.jobs.pipeline import match_session
-from ringdic.merging import MergedSurface, merge
-from ringdic.pairs.surfaces import PairSurface
 from ringdic.progress import Report, Stages, silent
 from ringdic.results.writer import write_series
 from ringdic.session.folder import Capture, Session, new_live, open_session
@@ -41,15 +38,9 @@ def process_step(
     began = time.monotonic()
     stages = Stages(_WEIGHTS, report)
     session = open_session(path)
-    settings = settings.model_copy(update={"surface": settings.surface.model_copy(update={"method": "pairs"})})
     steps = _with_reference(session, capture_id)
 
-    def merging(pairs: Sequence[PairSurface], heuristic: str) -> MergedSurface:
-        surfaces = [pair.part_at_reference for pair in pairs]
-        key = digest("live surface", heuristic, [(each.vertices, each.faces, each.correlation) for each in surfaces])
-        return process_memory.get(key, lambda: merge(surfaces, heuristic), _bytes)
-
-    matches = match_session(session, settings, steps, stages, executor, _calibrated, merging)
+    matches = match_session(session, settings, steps, stages, executor, _calibrated)
     summary = {"warnings": list(matches.warnings), "seconds": round(time.monotonic() - began, 2)}
     stages.at("deform", 0.0)
     with new_live(path, capture_id) as folder:
@@ -74,8 +65,3 @@ def _with_reference(session: Session, capture_id: str) -> tuple[Capture, ...]:
         there = ", ".join(capture.id for capture in specimen) or "none"
         raise InputError(f"{session.path}: no capture '{capture_id}' of the specimen; there are {there}")
     return (specimen[0], *chosen) if chosen[0] is not specimen[0] else (specimen[0],)
-
-
-def _bytes(merged: MergedSurface) -> int:
-    """Size of a merged surface, bytes."""
-    return int(merged.vertex.nbytes + merged.faces.nbytes + merged.pair.nbytes)

@@ -11,33 +11,29 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ringdic.arrays import Floats
 from ringdic.calibration.calibrated_rig import CalibratedRig, calibrate_rig, control_points
 from ringdic.calibration.quality import ReconstructionError
-from ringdic.correlation import CorrelationSettings
+from ringdic.charts.series import SurfaceSeries
+from ringdic.charts.surface import ReferenceSurface
+from ringdic.charts.tasks import charts_job
+from ringdic.charts.unmeasured import places_of_arrays
 from ringdic.correlation.correlate import load_kernels
 from ringdic.errors import ComputationError, InputError
 from ringdic.geometry.camera import Camera
 from ringdic.jobs import summary
 from ringdic.jobs.compiling import compile_once
-from ringdic.pairs.reconstruction import pair_shape
-from ringdic.pairs.surfaces import Merging, PairSurface, merge_surfaces, pairs_surface, reconstruct_pair
-from ringdic.pairs.tasks import PairJob, ordered_tasks, pair_jobs
 from ringdic.progress import COMPILING, Report, Stages, silent
 from ringdic.results import noise_floor
 from ringdic.results.results import Results
-from ringdic.results.series import InMemorySeries, Series, StepCache, join_steps
+from ringdic.results.series import StepCache, join_steps
 from ringdic.results.uncertainty import StepUncertainty, camera_covariance
 from ringdic.results.writer import ResultsWriter, StepRecord, map_in_order
 from ringdic.session.folder import Capture, Session, new_run, open_session
 from ringdic.settings import CalibrationGroup, Settings
-from ringdic.sweep.sweep import DepthSearch
-from ringdic.tasks import Executor, LocalExecutor, Task, TaskReport, tidy, work_folder
-
-if TYPE_CHECKING:
-    from ringdic.multiview.surface import MultiviewSurface
+from ringdic.tasks import Executor, LocalExecutor, Task, TaskReport, read_output, tidy, work_folder
 
 Calibrate = Callable[[Session, CalibrationGroup, Callable[[float, str], None]], CalibratedRig]
 
@@ -52,12 +48,12 @@ class SessionMatches:
 
     series : the surface, step by step. rig : the calibrated cameras.
     errors : reconstruction errors of the control points, by pair.
-    drift : (F,) px by pair or camera, mean vertical reprojection residual at each step.
-    agreement : figures of how well the pairs' surfaces, or the cameras' views of a point, agree, as JSON values.
+    drift : (F,) px by camera, mean vertical reprojection residual at each step.
+    agreement : figures of how well the cameras' views of a point, and the charts, agree, as JSON values.
     warnings : sentences for the operator.
     """
 
-    series: Series
+    series: SurfaceSeries
     rig: CalibratedRig
     errors: dict[tuple[str, str], ReconstructionError]
     drift: dict[str, Floats]
@@ -110,13 +106,11 @@ def match_session(
     stages: Stages | None = None,
     executor: Executor | None = None,
     calibrate: Calibrate = calibrate_rig,
-    merging: Merging = merge_surfaces,
 ) -> SessionMatches:
     """Calibrate the cameras of a session, match its images and triangulate the surface at some steps.
 
     steps : the captures, the reference first. executor : runs the tasks; None runs them in this process.
-    calibrate, merging : replace the functions that calibrate the rig and merge the pairs' surfaces, for callers that
-    cache their results.
+    calibrate : replaces the function that calibrates the rig, for callers that cache its results.
     """
     stages, steps = stages or Stages(_WEIGHTS, silent), tuple(steps)
     compile_once(lambda done, count, _: stages.at("prepare", 0.0, f"{COMPILING}; {done} of {count} parts are ready"))
@@ -126,18 +120,9 @@ def match_session(
     rig = calibrate(session, settings.calibration, lambda done, who: stages.at("calibrate", done, who))
     errors, warnings = _usable_pairs(session, rig, steps)
     matching = _Matching(session, rig, tuple(errors), steps, settings, stages, executor)
-    series: Series
-    if settings.surface.method == "global":
-        surface = _global_surface(matching)
-        series, drift, agreement = InMemorySeries(surface.results), surface.drift, surface.agreement
-        more_warnings = surface.warnings
-    elif settings.surface.method == "charts":
-        series, drift, agreement, more_warnings = _charts_surface(matching)
-    else:
-        pairs, more_warnings = _pair_surfaces(matching)
-        series, agreement = pairs_surface(session.rig.name, matching.cameras, pairs, matching.names, settings, merging)
-        drift = {"-".join(pair.shape.ids): pair.drift for pair in pairs}
-    return SessionMatches(series, rig, errors, drift, agreement, (*rig.warnings, *warnings, *more_warnings))
+    series = _charts_surface(matching)
+    warnings = (*rig.warnings, *warnings, *series.warnings)
+    return SessionMatches(series, rig, errors, series.drift, series.agreement, warnings)
 
 
 def _deform(
@@ -248,16 +233,6 @@ class _Matching:
         """Capture ids of the steps."""
         return [step.id for step in self.steps]
 
-    @property
-    def search(self) -> DepthSearch:
-        """Where and how the surface is searched for, from the settings and the target."""
-        surface = self.settings.surface
-        return DepthSearch(
-            radius=surface.radius_mm or self.session.rig.target.radius_mm,
-            reach=surface.reach_mm,
-            incidence=surface.incidence_deg,
-        )
-
     def run(self, tasks: Sequence[Task]) -> None:
         """Run tasks and report their progress, then remove old outputs beyond the size limit of the work folder."""
         total_cost = sum(task.cost for task in tasks)
@@ -275,65 +250,17 @@ class _Matching:
         tidy(work_folder(self.session.path), tasks)
 
 
-def _pair_surfaces(matching: _Matching) -> tuple[list[PairSurface], list[str]]:
-    """Match every pair at every step, as tasks, and triangulate; a sentence for each pair without a surface."""
-    session, settings, steps = matching.session, matching.settings, matching.steps
-    cameras = {camera.id: camera for camera in matching.cameras}
-    correlation = CorrelationSettings(**settings.correlation.keywords)
-    jobs = pair_jobs(session, cameras, matching.pairs, steps, matching.search, correlation)
-    matching.run(ordered_tasks(jobs))
-    cache = StepCache(work_folder(session.path))
-
-    def reconstruct(job: PairJob) -> PairSurface | str:
-        try:
-            grid, reference = job.at_reference()
-        except ComputationError as error:
-            return str(error)
-        shape = pair_shape(job.cameras, grid.xy, grid.faces, reference, correlation.step, settings.surface.sigma_max_px)
-        return reconstruct_pair(shape, lambda k: job.step(k, reference) if k else reference, len(steps), cache)
-
-    surfaces: list[PairSurface] = []
-    warnings: list[str] = []
-    for k, surface in enumerate(map_in_order(lambda k: reconstruct(jobs[k]), range(len(jobs))), start=1):
-        matching.stages.at("triangulate", k / len(jobs), f"pair {jobs[k - 1].name}")
-        if isinstance(surface, str):
-            warnings.append(surface)
-        else:
-            surfaces.append(surface)
-    if not surfaces:
-        raise ComputationError(f"{session.path}: no camera pair gave a surface: {'; '.join(warnings)}")
-    return surfaces, warnings
-
-
-def _global_surface(matching: _Matching) -> MultiviewSurface:
-    """Match all cameras that have a reference image together, as tasks, and triangulate one surface."""
-    from ringdic.multiview.surface import surface_of_tracks  # imported here, since matching by pairs needs none of it
-    from ringdic.multiview.tasks import multiview_job
-
-    session, settings, pairs, steps = matching.session, matching.settings, matching.pairs, matching.steps
-    cameras = [camera for camera in matching.cameras if camera.id in steps[0].images]
-    job = multiview_job(session, cameras, pairs, steps, matching.search, settings)
-    matching.run(job.tasks)
-    shape, tracks = job.outputs()
-    matching.stages.at("triangulate", 0.0)
-    return surface_of_tracks(session.rig.name, cameras, pairs, matching.names, shape, tracks, settings)
-
-
-def _charts_surface(matching: _Matching) -> tuple[Series, dict[str, Floats], dict[str, Any], list[str]]:
-    """Match every camera's part of the surface in all cameras that see it, as tasks, and triangulate one surface."""
-    from ringdic.charts.series import SurfaceSeries
-    from ringdic.charts.surface import ReferenceSurface
-    from ringdic.charts.tasks import charts_job
-    from ringdic.tasks import read_output
-
+def _charts_surface(matching: _Matching) -> SurfaceSeries:
+    """Match every chart in all cameras that see it, track it in time, as tasks, and triangulate one surface."""
     session, settings, steps = matching.session, matching.settings, matching.steps
     cameras = [camera for camera in matching.cameras if camera.id in steps[0].images]
-    job = charts_job(session, cameras, steps, settings)
+    job = charts_job(session, cameras, matching.pairs, steps, settings)
     matching.run(job.tasks)
     matching.stages.at("triangulate", 0.0)
-    surface = ReferenceSurface.from_arrays(read_output(job.surface.output))
+    found = read_output(job.surface.output)
+    surface, unmeasured = ReferenceSurface.from_arrays(found), places_of_arrays(cameras, found)
     cache = StepCache(work_folder(session.path))
-    series = SurfaceSeries(
-        session.rig.name, cameras, matching.pairs, matching.names, surface, job.matches, settings, cache
-    )
-    return series, series.drift, series.agreement, series.warnings
+    return SurfaceSeries(
+        session.rig.name, cameras, matching.pairs, job.names, matching.names, surface, job.matches, settings, cache,
+        unmeasured, found["unmatched"].tolist(),
+    )  # fmt: skip

@@ -15,6 +15,7 @@ from ringdic.calibration.quality import ReconstructionError
 from ringdic.measure.window_study import gauge
 from ringdic.results.fields import available
 from ringdic.results.results import Results
+from ringdic.results.unmeasured import unmeasured_areas, unmeasured_rows, unmeasured_sentences
 from ringdic.strain.deformation import Deformation
 from ringdic.strain.rigid_motion import RigidMotion
 
@@ -64,11 +65,14 @@ def summarise(
     }
     names = tuple(step.row["step"] for step in steps)
     last = [step for step in steps if step.row["measured"]][-1]
+    area_mm2 = float(reference.mesh.areas.sum())
+    unmeasured = unmeasured_areas(reference.unmeasured, area_mm2) if reference.unmeasured else None
     figures = {
         "points": len(reference.vertices_ref),
         "faces": len(reference.faces),
         "pairs": len(reference.pairs),
-        "area_mm2": round(float(reference.mesh.areas.sum()), 1),
+        "area_mm2": round(area_mm2, 1),
+        "unmeasured": unmeasured,
         "control_points": control,
         "cameras": [asdict(row) for row in rig.quality],
         "calibration": _calibration(rig),
@@ -77,7 +81,7 @@ def summarise(
         "strain": _strain(reference),
         "uncertainty": {**last.uncertainty, "why": None if rig.bundle is not None else ALONE},
         "steps": [step.row for step in steps],
-        "warnings": [*warnings, *drift_sentences(drift, names)],
+        "warnings": [*warnings, *unmeasured_sentences(unmeasured), *drift_sentences(drift, names)],
     }
     return {**figures, "table": _table(figures)}
 
@@ -170,6 +174,7 @@ def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
     rows = [
         ("camera pairs, points, triangles", f"{figures['pairs']}, {figures['points']:,}, {figures['faces']:,}"),
         ("measured area", f"{figures['area_mm2'] / 100:,.1f} cm²"),
+        *unmeasured_rows(figures["unmeasured"]),
         ("control points: mean vector, RMS", f"{control['mean_mm']:.4f}, {control['rms_mm']:.4f} mm"),
     ]
     if bundle is not None:

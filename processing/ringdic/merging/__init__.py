@@ -1,6 +1,6 @@
-"""Merging of camera pairs' surfaces (after Solav et al. 2018): overlaps removed, gaps stitched, small holes filled."""
+"""Merging of surfaces into one (after Solav et al. 2018): overlaps removed, gaps stitched, small holes filled."""
 
-from ringdic.merging.merge import HEURISTICS, MergedSurface, Seam, SurfacePart, merge
+from ringdic.merging.merge import HEURISTICS, MergedSurface, Seam, SurfacePart, merge, side_by_side
 from ringdic.merging.mismatch import Mismatch, mismatches
 
-__all__ = ["HEURISTICS", "MergedSurface", "Mismatch", "Seam", "SurfacePart", "merge", "mismatches"]
+__all__ = ["HEURISTICS", "MergedSurface", "Mismatch", "Seam", "SurfacePart", "merge", "mismatches", "side_by_side"]

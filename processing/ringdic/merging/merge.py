@@ -125,6 +125,13 @@ def merge(
         return MergedSurface(faces, pair, np.unique(faces), np.flatnonzero(~living), added, distances.result())
 
 
+def side_by_side(parts: Sequence[SurfacePart]) -> MergedSurface:
+    """Several surfaces as one mesh, one over the other where they overlap, with their distances there."""
+    mesh, owner, _ = _concatenate(parts)
+    distances = mismatches(parts, Seam().layers * Seam.mean_edge(parts))
+    return MergedSurface(mesh.faces, owner, np.arange(len(mesh.vertices)), np.zeros(0, np.int64), 0, distances)
+
+
 def _concatenate(parts: Sequence[SurfacePart]) -> tuple[Mesh, Indices, Floats]:
     """All parts as one mesh, with the part and the largest correlation coefficient, NaN if lost, of each
     triangle (M,).

@@ -18,6 +18,7 @@ from ringdic.report.document import Document, figure
 from ringdic.report.gathered import Gathered, gather
 from ringdic.report.hardware import camera_facts
 from ringdic.report.noise import STATED, noise, noise_rows
+from ringdic.report.unmeasured import unmeasured
 from ringdic.results.evaluation import EvaluatedResults, evaluate_results
 from ringdic.results.results import Results
 from ringdic.session.folder import Session, newest_results, open_session
@@ -103,6 +104,7 @@ def _describe(document: Document, session: Session, results: Results, gathered: 
     noise(document, results, gathered)
     document.section("measured", "Steps")
     tables.steps(document, session, results)
+    unmeasured(document, session, results)
 
 
 def _pictures(

@@ -83,10 +83,9 @@ def analysis(document: Document, results: Results, version: str, floor: dict[str
     alone, over = gauge(results, 0.0), gauge(results, results.window_mm)
     width = 2 * correlation.radius_px + 1
     shape = {1: "affine (first order)", 2: "quadratic (second order)"}[correlation.order]
-    if surface.method == "global" and settings.tracking.two_pass:
-        shape += "; in time a second pass with the curvature that the neighbours' displacements show"
-    if surface.method == "global" and surface.curvature == "geometry":
-        shape += "; between cameras with the curvature of the measured surface"
+    if settings.method == "best":
+        shape = "affine (first order); between cameras with the curvature of the measured surface held, in time with "
+        shape += "that of the neighbours' displacements"
     window = "none: each triangle alone" if not settings.strain.window_mm else f"{settings.strain.window_mm:g} mm"
     document.facts(
         "analysis-table",
@@ -100,9 +99,10 @@ def analysis(document: Document, results: Results, version: str, floor: dict[str
             f"compositional Gauss-Newton, least ZNCC {correlation.zncc_min:g}",
             "Interpolation": f"{correlation.interpolation} B-spline",
             "Surface": {
-                "pairs": f"camera pairs, overlaps merged: {surface.merge}",
-                "global": "one lattice over the surface, every point from all cameras that see it",
-            }[surface.method],
+                "best": "each camera's part of the surface, every point from all cameras that see it",
+                "paper": "each camera pair's surface",
+            }[settings.method]
+            + f"; overlaps merged: {surface.merge}",
             "Steepest view used": f"{surface.incidence_deg:g}° to the surface's normal",
             "Strain window": window,
             "Virtual strain gauge": f"{figure(alone.length, 3)} mm by the triangle"

@@ -8,6 +8,7 @@
 ``ranges``         ranges of the fields over all steps, for colour scales
 ``evaluation``     results with another reference step, strain window or family of strains than the run's
 ``uncertainty``    completes results with the standard deviations that follow from their matches and cameras
+``unmeasured``     textured places that were not measured, and why
 ``noise_floor``    statistics of a specimen at rest
 ``colours``        colours of field values
 ``json_values``    arrays and numbers as JSON values

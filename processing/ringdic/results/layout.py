@@ -10,6 +10,8 @@
         faces, pair, vertex_pair
         rigid_motion/R, t        per step, the motion that takes it back onto the reference
         cameras/<id>/            P, size, and K, distortion where the lens is known
+        unmeasured/<id>/         textured places of a camera's reference image without a measurement: px, status, area
+                                 (mm², the camera's share), attribute spacing (px); absent where not determined
         matches/<k>/             2D matches of a camera pair, or of a camera alone: xy, px, c_ls, sigma, status, vertex
         settings, calibration, summary    text: TOML, JSON, JSON
 

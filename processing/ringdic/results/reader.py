@@ -22,6 +22,7 @@ from ringdic.results.fields import OPTIONAL_ARRAYS, Field, available
 from ringdic.results.fields import field as field_of
 from ringdic.results.layout import SCHEMA
 from ringdic.results.results import MATCH_ARRAYS, Matches, Results
+from ringdic.results.unmeasured import UnmeasuredPlaces
 from ringdic.strain.rigid_motion import RigidMotion
 
 
@@ -56,6 +57,7 @@ def read_results(path: Path, matches: bool = True) -> Results:
             settings=_text(own, "settings"),
             calibration=json.loads(_text(own, "calibration")),
             summary=json.loads(_text(own, "summary")),
+            unmeasured=_read_unmeasured(own),
             **optional,
         )
 
@@ -80,6 +82,12 @@ def read_summary(path: Path) -> dict[str, Any]:
             "fields": json.loads(own.attrs["fields"]),
             "summary": json.loads(_text(own, "summary")),
         }
+
+
+def read_unmeasured(path: Path) -> tuple[UnmeasuredPlaces, ...]:
+    """Textured places of each camera's reference image that were not measured; empty in a file without them."""
+    with _open(path) as file:
+        return _read_unmeasured(file["ringdic"])
 
 
 def read_mesh(path: Path) -> Mesh:
@@ -196,6 +204,19 @@ def _read_camera(cameras: h5py.Group, name: str) -> Camera:
     size = (int(group["size"][0]), int(group["size"][1]))
     lens = Intrinsics(group["K"][:], group["distortion"][:], size) if "K" in group else None
     return Camera(name, group["P"][:], size, lens)
+
+
+def _read_unmeasured(own: h5py.Group) -> tuple[UnmeasuredPlaces, ...]:
+    """Unmeasured places of all cameras, in the order of the cameras."""
+    groups = own.get("unmeasured", {})
+    return tuple(
+        UnmeasuredPlaces(
+            name, groups[name]["px"][:].astype(float), float(groups[name].attrs["spacing"]),
+            groups[name]["status"][:], groups[name]["area"][:],
+        )
+        for name in json.loads(own.attrs["cameras"])
+        if name in groups
+    )  # fmt: skip
 
 
 def _read_matches(groups: h5py.Group) -> tuple[Matches, ...]:

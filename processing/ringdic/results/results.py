@@ -12,6 +12,7 @@ from ringdic.arrays import Floats, Indices, Pixels, Points
 from ringdic.geometry.camera import Camera
 from ringdic.mesh.mesh import Mesh
 from ringdic.results.fields import OPTIONAL_ARRAYS, StepFields, StepQuality, compute_fields
+from ringdic.results.unmeasured import UnmeasuredPlaces
 from ringdic.settings import settings_of_run
 from ringdic.strain.deformation import Deformation, deformation
 from ringdic.strain.rigid_motion import RigidMotion, motion_to_reference
@@ -69,6 +70,7 @@ class Results:
     matches : the 2D matches, of each pair or of each camera. settings : TOML text. calibration, summary : JSON values.
     sigma_displacement : (F, N, 3) mm, and sigma_lambda : (F, M, 2), of λ1 and λ2, both due to image noise alone.
     chi2 : (F, N) reprojection residual of the point, χ² a degree of freedom.
+    unmeasured : textured places of the cameras' reference images that were not measured.
     sigma_calibration, sigma_displacement_calibration : (F, N, 3) mm, and sigma_lambda_calibration : (F, M, 2), due to
         the covariance of the cameras' parameters alone.
 
@@ -92,6 +94,7 @@ class Results:
     settings: str = ""
     calibration: dict[str, Any] = field(default_factory=dict)
     summary: dict[str, Any] = field(default_factory=dict)
+    unmeasured: tuple[UnmeasuredPlaces, ...] = ()
     sigma_displacement: Floats | None = None
     sigma_lambda: Floats | None = None
     chi2: Floats | None = None

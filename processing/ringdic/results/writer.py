@@ -173,6 +173,10 @@ class ResultsWriter:
         own["settings"] = reference.settings
         own["calibration"] = json.dumps(json_value(calibration), allow_nan=False)
         own["summary"] = json.dumps(json_value(summary), allow_nan=False)
+        for one in reference.unmeasured:
+            group = own.create_group(f"unmeasured/{one.camera}")
+            group.attrs["spacing"] = one.spacing
+            group["px"], group["status"], group["area"] = one.px.astype(np.float32), one.status, one.area
         cameras = own.create_group("cameras")
         for camera in reference.cameras:
             group = cameras.create_group(camera.id)

@@ -8,7 +8,3 @@
 ``window``       standard deviations of stretches over a strain window
 ``calibration``  standard deviations due to the covariance of the camera parameters
 """
-
-from ringdic.uncertainty.position import position_sigma
-
-__all__ = ["position_sigma"]

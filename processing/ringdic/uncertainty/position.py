@@ -20,10 +20,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ringdic.arrays import Floats, Indices, Pixels, Points, Vectors
+from ringdic.arrays import Floats, Indices, Mask, Pixels, Points, Vectors
 from ringdic.geometry import kernels
 from ringdic.geometry.camera import Camera
-from ringdic.geometry.triangulation import LinearSystem
+
+_BLOCK = 8192  # points that are treated at a time
 
 
 def position_gain(cameras: Sequence[Camera], xyz: Points, sigma: Pixels) -> Floats:
@@ -98,58 +99,18 @@ def step_covariance(
     reference : (n,) index of the reference camera. label : (n, 3, 2) mm a px, of `along_surface`.
     Returns (n, 3, 3) mm².
     """
-    gain_reference, gain_step = gains
-    sigma_reference, sigma_step = tracked
-    total = covariance(gain_step, sigma_step)
-    for k in range(len(gain_step)):
-        before, after = gain_reference[k].any(axis=(1, 2)), gain_step[k].any(axis=(1, 2))
-        index = np.flatnonzero(before | after | (reference == k))
-        own_label = np.where((reference[index] == k)[:, None, None], label[index], 0.0)
-        at_reference, at_step = gain_reference[k, index], gain_step[k, index]
-        whole = np.nan_to_num(sigma_reference[k, index])
-        narrow = np.nan_to_num(sigma[k, index])
+    n = len(reference)
+    total = np.empty((n, 3, 3))
+    for begin in range(0, n, _BLOCK):
+        at = slice(begin, begin + _BLOCK)
+        own, step = gains[0][:, at].copy(), gains[1][:, at]
+        whole, narrow = np.nan_to_num(tracked[0][:, at]), np.nan_to_num(sigma[:, at])
         # Errors cancel only where the camera took part at the reference and at the step.
-        common = np.where((before & after)[index, None], np.minimum(whole, narrow), 0.0)
-        parts = (
-            (at_reference - at_step - own_label, common),
-            (at_reference - own_label, np.sqrt(np.maximum(narrow**2 - common**2, 0.0))),
-            (at_step, np.sqrt(np.maximum(whole**2 - common**2, 0.0))),
-        )
-        for slope, part_sigma in parts:
-            scaled = slope * part_sigma[:, None, :]
-            total[index] += scaled @ scaled.transpose(0, 2, 1)
+        both: Mask = np.asarray(own.any(axis=(2, 3)) & step.any(axis=(2, 3)))
+        common = np.where(both[..., None], np.minimum(whole, narrow), 0.0)
+        defined = np.flatnonzero(reference[at] >= 0)
+        own[reference[at][defined], defined] -= label[at][defined]
+        total[at] = covariance(own - step, common)
+        total[at] += covariance(own, np.sqrt(np.maximum(narrow**2 - common**2, 0.0)))
+        total[at] += covariance(step, np.sqrt(tracked[1][:, at] ** 2 + np.maximum(whole**2 - common**2, 0.0)))
     return total
-
-
-def position_sigma(cameras: Sequence[Camera], px: Pixels, sigma: Pixels) -> Floats:
-    """Standard deviations of linearly triangulated positions from those of their pixels, taken as independent.
-
-    Parameters
-    ----------
-    cameras : the C cameras.
-    px, sigma : (C, n, 2) image pixels and their standard deviations, px; NaN where a camera did not match.
-
-    Returns
-    -------
-    (n, 3) mm, world frame; NaN where fewer than two cameras have a pixel and its standard deviation.
-    """
-    px = np.where(np.isfinite(sigma), np.asarray(px, dtype=float), np.nan)
-    return linear_sigma(cameras, LinearSystem.of(cameras, px), sigma)
-
-
-def linear_sigma(cameras: Sequence[Camera], system: LinearSystem, sigma: Pixels) -> Floats:
-    """Standard deviations of positions from the linear equations by which they were triangulated.
-
-    cameras : the C cameras. system : the equations of the n points. sigma : (C, n, 2) px, standard deviations of the
-    pixels, which are independent. Returns (n, 3) mm, world frame.
-
-    The linear solution minimises ``|A(px) X - b(px)|²``; for consistent pixels its change is ``dX = -(AᵀA)⁻¹ Aᵀ dr``
-    with ``dr = (dA) X - db``, and the residual of a camera moves by ``-(p3 · (X, 1))`` times the change of its pixel.
-    """
-    slopes = np.full((*system.undistorted.shape, 2), np.nan)
-    for k, camera in enumerate(cameras):
-        if camera.intrinsics is not None:
-            slopes[k] = camera.intrinsics.jacobian(system.undistorted[k])
-    scatter = np.ascontiguousarray(sigma, dtype=float)
-    solved = system.normal, system.solvable, system.solution
-    return np.sqrt(kernels.linear_variance(system.P, system.undistorted, slopes, *solved, scatter))

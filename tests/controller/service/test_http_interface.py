@@ -291,3 +291,20 @@ def test_a_run_has_a_report_that_is_made_once_and_kept_beside_the_results(proces
     assert "Larger stretch λ2" in first.text
     assert second.headers["last-modified"] == first.headers["last-modified"]
     assert processed.get(f"{API}/sessions/limb/results/0099/report").status_code == 404
+
+
+def test_what_a_run_did_not_measure_is_told_by_reason_and_drawn_on_the_photograph(processed) -> None:
+    run = processed.get(f"{API}/sessions/limb/results").json()[-1]["run"]
+    address = f"{API}/sessions/limb/results/{run}/unmeasured"
+    found = processed.get(address).json()
+    assert [(row["reason"], row["cm2"], row["counted"]) for row in found["reasons"]] == [
+        ("the images do not look alike", 0.7, True),
+        ("the lines of sight miss one another", 0.5, True),
+    ]
+    assert found["cameras"] == ["01"]
+    picture = processed.get(f"{address}/01")
+    assert picture.headers["content-type"] == "image/jpeg"
+    drawn = cv2.imdecode(np.frombuffer(picture.content, np.uint8), cv2.IMREAD_COLOR)
+    assert np.ptp(drawn[20, 30].astype(int)) > 40
+    assert np.ptp(drawn[5, 5].astype(int)) < 12
+    assert processed.get(f"{address}/02").status_code == 404

@@ -2,13 +2,15 @@
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import pytest
 from ringdic.charts.depth_map import DepthImages, DepthMap, measure_depths
 from ringdic.charts.images import ChartImages
 from ringdic.charts.matching import ChartMatches, match_chart
+from ringdic.charts.patches import Patches, optical_axis
 from ringdic.charts.plane_sweep import DepthRange
-from ringdic.charts.views import ChartPlan, plan_chart
+from ringdic.charts.views import ChartPlan, chart_region, plan_chart
 from ringdic.correlation import CorrelationSettings
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.geometry.outliers import LostPoint
@@ -96,15 +98,15 @@ def test_the_slants_of_a_depth_map_are_those_of_the_limb(maps: list[DepthMap]) -
 
 
 def test_each_camera_gets_what_it_faces_most_squarely(maps: list[DepthMap], plans: list[ChartPlan]) -> None:
-    """The cameras stand at 0, 30 and 60°; charts exceed their share by two steps of the lattice, 9 mm or 9°."""
+    """The cameras stand at 0, 30 and 60°; charts exceed their share by a step of the lattice, 5 mm or 5°."""
     azimuth = []
     for k, (depth_map, plan) in enumerate(zip(maps, plans, strict=True)):
         xyz = places(k, depth_map)[plan.inside]
         azimuth.append(np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])))
         assert not plan.sees[:, k].any()
-    assert np.percentile(azimuth[0], 95) < 15.0 + 14.0
-    assert np.percentile(np.abs(azimuth[1] - 30.0), 95) < 15.0 + 14.0
-    assert np.percentile(azimuth[2], 5) > 45.0 - 14.0
+    assert np.percentile(azimuth[0], 95) < 15.0 + 10.0
+    assert np.percentile(np.abs(azimuth[1] - 30.0), 95) < 15.0 + 10.0
+    assert np.percentile(azimuth[2], 5) > 45.0 - 10.0
     assert np.histogram(np.concatenate(azimuth), np.arange(-20.0, 81.0, 10.0))[0].min() > 20
     assert plans[1].sees[plans[1].inside][:, [0, 2]].all(axis=1).mean() > 0.6
 
@@ -121,7 +123,7 @@ def test_a_chart_is_matched_without_the_bias_of_flat_subsets(middle: ChartMatche
     scatter, bias = 1.4826 * float(np.median(np.abs(distance))), float(np.median(distance))
     figures("chart of a limb at 0.3 scale: distance from the surface, robust", f"{scatter:.4f} mm", "≤ 0.006")
     figures("chart of a limb at 0.3 scale: bias", f"{bias:+.4f} mm", "≤ 0.003")
-    assert known.mean() > 0.97
+    assert known.mean() > 0.95  # the others lie at the rim of the pattern
     assert np.abs(distance).max() < 1.0
     assert scatter <= 0.006
     assert abs(bias) <= 0.003
@@ -142,6 +144,20 @@ def test_an_image_without_texture_gives_no_depth(images: list[np.ndarray]) -> No
     assert len(depths.textured) == 0
 
 
+def test_edges_alone_are_no_pattern(images: list[np.ndarray], maps: list[DepthMap]) -> None:
+    """Bright rails beside the limb have contrast, but vary in one direction only."""
+    with_rails = images[0].copy()
+    rows = np.arange(len(with_rails)) % 60 < 6
+    with_rails[rows, :200] = 230
+    reduced = DepthImages.of(CAMERAS, lambda k: with_rails if k == 0 else images[k], SETTINGS)
+    found = measure_depths(reduced, 0, (1,), SPACE, None)
+    rails = found.textured[:, 0] < 160
+    assert rails.sum() > 100
+    before = maps[0].patterned[maps[0].textured[:, 0] < 160].sum()
+    assert found.patterned[rails].sum() <= before + 2
+    assert maps[0].patterned.mean() > 0.5  # the rest is the rig
+
+
 def test_a_view_more_oblique_than_the_limit_is_not_used(
     images: list[np.ndarray], maps: list[DepthMap], plans: list[ChartPlan]
 ) -> None:
@@ -157,3 +173,31 @@ def test_a_view_more_oblique_than_the_limit_is_not_used(
         incidence = np.degrees(np.arccos(CAMERAS[c].incidence_cosine(xyz, normals)[used]))
         assert np.percentile(incidence, 98) < 48.0  # the normal of a measured surface is good to 3°, not at its rim
     assert (chart.status == LostPoint.OBLIQUE).any()
+
+
+def test_subsets_keep_away_from_the_silhouette_but_points_come_close_to_it() -> None:
+    """The contrast between a plate and what stands behind it is not the plate's own."""
+    rng = np.random.default_rng(3)
+    grey = np.full((400, 400), 20, np.uint8)
+    grey[100:300, 100:300] = cv2.resize(rng.integers(60, 255, (50, 50)).astype(np.uint8), (200, 200))
+    px = np.stack(np.meshgrid(np.arange(105.0, 300.0, 15.0), np.arange(105.0, 300.0, 15.0)), axis=-1).reshape(-1, 2)
+    n = len(px)
+    patches = Patches(px, np.full(n, 1 / 400), np.zeros((n, 2)), np.zeros((n, 3)))
+    plate = DepthMap(15, patches, np.full(n, 1e-7), px, np.ones(len(px), bool), 1.0)
+    subsets, points = chart_region(grey, plate, np.ones(n, bool), RADIUS)
+    for mask, least, most in ((subsets, 2, 6), (points, -1, 2)):
+        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        from_border = [rows[0] - 100, 299 - rows[-1], columns[0] - 100, 299 - columns[-1]]
+        assert least <= min(from_border)
+        assert max(from_border) <= most
+    assert points[subsets].mean() > 0.99
+
+
+def test_cameras_that_look_in_parallel_have_a_finite_middle() -> None:
+    first = CAMERAS[0]
+    P = first.P.copy()
+    P[:, 3] -= P[:, :3] @ np.array([0.0, 40.0, 0.0])
+    second = Camera("beside", P, first.size, first.intrinsics)
+    centre = DepthRange.of([first, second]).centre
+    assert np.isfinite(centre).all()
+    assert np.linalg.norm(np.cross(centre - 0.5 * (first.centre + second.centre), optical_axis(first))) < 1e-6

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.geometry.triangulation import reprojection_residuals, triangulate
-from ringdic.uncertainty import position_sigma
 
 SIZE = (1640, 1232)
 
@@ -49,36 +48,3 @@ def test_parallel_lines_of_sight_are_lost_points() -> None:
     camera = ring(1)[0]
     px = np.stack([camera.project(cloud())] * 2)
     assert np.isnan(triangulate([camera, camera], px)).all()
-
-
-def test_the_scatter_of_noisy_points_is_the_predicted_sigma() -> None:
-    cameras, rng, noise = ring(3), np.random.default_rng(5), 0.05
-    xyz = np.array([[30.0, 20.0, 10.0]])
-    px = np.stack([camera.project(xyz) for camera in cameras])
-    trials = np.repeat(px, 4000, axis=1) + rng.normal(0.0, noise, (3, 4000, 2))
-    observed = triangulate(cameras, trials).std(axis=0)
-    predicted = position_sigma(cameras, px, np.full_like(px, noise))[0]
-    np.testing.assert_allclose(observed, predicted, rtol=0.035)  # 4000 trials: 1.1 % a standard deviation
-
-
-def test_sigma_is_lost_with_the_point() -> None:
-    cameras = ring(2)
-    px = np.stack([camera.project(cloud()) for camera in cameras])
-    px[0, 0] = np.nan
-    sigma = position_sigma(cameras, px, np.full_like(px, 0.01))
-    assert np.isnan(sigma[0]).all()
-    assert np.isfinite(sigma[1:]).all()
-
-
-def test_the_predicted_sigma_is_the_first_order_law_of_the_triangulation_itself() -> None:
-    cameras, xyz, h = ring(3), cloud(), 1e-4
-    px = np.stack([camera.project(xyz) for camera in cameras])
-    sigma = np.random.default_rng(0).uniform(0.01, 0.1, px.shape)
-    variance = np.zeros((len(xyz), 3))
-    for camera in range(3):
-        for axis in range(2):
-            d = np.zeros_like(px)
-            d[camera, :, axis] = h
-            slope = (triangulate(cameras, px + d) - triangulate(cameras, px - d)) / (2 * h)
-            variance += (slope * sigma[camera, :, axis, None]) ** 2
-    np.testing.assert_allclose(position_sigma(cameras, px, sigma), np.sqrt(variance), rtol=1e-6)

@@ -11,15 +11,21 @@ from playwright.sync_api import Browser, Page
 from ringdic.errors import InputError
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.measure.region import Everything, region_statistics
+from ringdic.pictures.unmeasured import COLOURS, unmeasured_legend, unmeasured_picture
 from ringdic.report import write_report
 from ringdic.results.evaluation import evaluate_results
 from ringdic.results.results import Results
+from ringdic.results.unmeasured import UnmeasuredPlaces, unmeasured_areas
 from ringdic.results.writer import write_results
 
 RADIUS, AROUND, ALONG = 50.0, 60, 21
 STEPS = ("0001-specimen", "0002-specimen", "0003-specimen")
 LOST = (30, 31, 700)
 SIZE = (240, 320)
+BARE = UnmeasuredPlaces(
+    "2", np.array([[60.0, 60.0], [75.0, 60.0], [90.0, 60.0]]), 15.0, np.array([3, 16, 33], np.int8),
+    np.array([150.0, 320.0, 90.0]),
+)  # fmt: skip
 
 
 def camera(id_: str, azimuth: float) -> Camera:
@@ -48,7 +54,11 @@ def twisted_tube() -> Results:
         pair=np.zeros(len(faces), dtype=np.int64), vertex_pair=np.zeros(len(reference), dtype=np.int64),
         correlation=np.where(known, 0.013, np.nan), sigma_xyz=np.where(known[..., None], [0.002, 0.001, 0.002], np.nan),
         status=status, settings='[correlation]\nradius_px = 17\nstep_px = 9\n[surface]\nmethod = "pairs"\n',
-        summary={"warnings": ["camera 3 <b>moved</b> & was told"], "table": [{"figure": "points", "value": "1,260"}]},
+        summary={
+            "warnings": ["camera 3 <b>moved</b> & was told"], "table": [{"figure": "points", "value": "1,260"}],
+            "unmeasured": unmeasured_areas((BARE,), 14_500.0),
+        },
+        unmeasured=(BARE,),
     )  # fmt: skip
 
 
@@ -134,6 +144,26 @@ def test_what_was_lost_is_counted_by_its_reason(page: Page) -> None:
     head, *rows = table(page, "lost")
     assert head == ["step", "measured", "the images do not look alike there"]
     assert rows == [[STEPS[0], "1260", "0"], [STEPS[1], "1260", "0"], [STEPS[2], "1257", "3"]]
+
+
+@pytest.mark.browser
+def test_what_was_not_measured_is_told_by_its_reason_and_shown(page: Page) -> None:
+    head, *rows = table(page, "unmeasured-areas")
+    assert head == ["why", "cm²", "in the total"]
+    assert [row[1:] for row in rows] == [["3.2", "yes"], ["1.5", "yes"], ["0.9", "no"]]
+    assert rows[0][0] == "the lines of sight miss one another"
+    assert page.locator("#unmeasured-picture img").count() == 1
+
+
+def test_unmeasured_places_are_drawn_in_the_colours_of_their_reasons() -> None:
+    grey = np.full((SIZE[1], SIZE[0]), 100, np.uint8)
+    drawn = unmeasured_picture(grey, BARE)
+    assert (drawn[200] == 100).all()
+    colours = [drawn[60, int(x)] for x in BARE.px[:, 0]]
+    assert len({tuple(colour) for colour in colours}) == 3
+    assert np.ptp(colours[2]) == 0  # what is not counted is grey
+    legend = {row.colour for row in unmeasured_legend(unmeasured_areas((BARE,), 0.0))}
+    assert legend == {COLOURS[code] for code in BARE.status.tolist()}
 
 
 @pytest.mark.browser

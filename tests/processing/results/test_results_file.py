@@ -8,11 +8,20 @@ import numpy as np
 import pytest
 from ringdic.errors import InputError
 from ringdic.geometry.camera import Camera, Intrinsics
+from ringdic.geometry.outliers import LostPoint
 from ringdic.results.fields import FIELDS, OPTIONAL_ARRAYS, Field
 from ringdic.results.layout import SCHEMA
-from ringdic.results.reader import read_field, read_mesh, read_positions, read_results, read_summary
+from ringdic.results.reader import (
+    read_field,
+    read_mesh,
+    read_positions,
+    read_results,
+    read_summary,
+    read_unmeasured,
+)
 from ringdic.results.results import Matches, Results
 from ringdic.results.series import select_steps
+from ringdic.results.unmeasured import UnmeasuredPlaces
 from ringdic.results.writer import ResultsWriter, write_results
 from ringdic.strain.window import strain_window
 
@@ -79,6 +88,21 @@ def test_what_is_written_comes_back(written: Path) -> None:
     for before, after in zip(result.cameras, found.cameras, strict=True):
         assert (after.id, after.size) == (before.id, before.size)
         np.testing.assert_array_equal(after.project(point), before.project(point))
+
+
+def test_unmeasured_places_come_back(tmp_path: Path) -> None:
+    px, area = np.array([[20.0, 35.0], [50.0, 5.0]]), np.array([4.0, 2.5])
+    places = UnmeasuredPlaces("202", px, 15.0, np.array([int(LostPoint.RESIDUAL), 32], np.int8), area)
+    write_results(tmp_path / "results.h5", replace(a_result(), unmeasured=(places,)))
+    (read,) = read_unmeasured(tmp_path / "results.h5")
+    assert (read.camera, read.spacing) == ("202", 15.0)
+    for name in ("px", "status", "area"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(places, name))
+    assert len(read_results(tmp_path / "results.h5").unmeasured) == 1
+
+
+def test_a_file_without_unmeasured_places_has_none(written: Path) -> None:
+    assert read_unmeasured(written) == ()
 
 
 def test_an_existing_file_is_never_replaced(written: Path) -> None:

@@ -1,13 +1,10 @@
 """Steps taken out of results and put together again, and the cache of values on disk."""
 
-from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
 
 import numpy as np
 import pytest
-from ringdic.pairs.reconstruction import PairShape, PairStep
-from ringdic.pairs.surfaces import reconstruct_pair
 from ringdic.results.fields import OPTIONAL_ARRAYS
 from ringdic.results.results import Matches, Results
 from ringdic.results.series import InMemorySeries, StepCache, join_steps, select_steps
@@ -88,36 +85,3 @@ def test_cached_values_come_back_whichever_thread_asks(tmp_path: Path) -> None:
         np.testing.assert_array_equal(values, np.full(5000, 100 * key + step))
     with pytest.raises(KeyError):
         cache.get("nothing")
-
-
-@dataclass(frozen=True)
-class Step(PairStep):
-    """A step that is its own matches."""
-
-    px: np.ndarray = field(default_factory=lambda: np.zeros((2, 4, 2)))
-
-
-class FixedShape(PairShape):
-    """A pair that is matched where it is."""
-
-    @property
-    def ids(self) -> tuple[str, str]:
-        return "1", "2"
-
-    def step(self, found: Step) -> Step:
-        return found
-
-
-def test_a_point_is_as_good_as_its_worst_step_and_a_step_that_failed_says_nothing(tmp_path: Path) -> None:
-    c_ls = np.array([[0.1, 0.2, 0.3, 0.4], [0.3, 0.1, np.nan, 0.1], [np.nan, np.nan, 0.9, np.nan]], np.float32)
-    lost = np.where(np.isnan(c_ls), 5, 0).astype(np.int8)
-    sigma = np.full((2, 4, 2), 0.01, np.float32)
-    steps = [Step(np.zeros((4, 3)), own, sigma, status, 0.5) for own, status in zip(c_ls, lost, strict=True)]
-    shape = FixedShape(
-        (None, None), np.zeros((4, 2)), np.arange(4), np.zeros((0, 3), int), steps[0], None, None, None, 1.0
-    )
-    pair = reconstruct_pair(shape, steps.__getitem__, 3, StepCache(tmp_path))
-    np.testing.assert_array_equal(pair.correlation, np.float32([0.3, 0.2, np.nan, 0.4]))
-    np.testing.assert_array_equal(pair.at(1)[0].correlation, c_ls[1])
-    np.testing.assert_allclose(pair.noise, 0.01, rtol=1e-6)
-    np.testing.assert_array_equal(pair.drift, 0.5)

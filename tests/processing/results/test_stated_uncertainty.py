@@ -7,28 +7,27 @@ together and by a pair.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from tempfile import gettempdir
 
 import numpy as np
 import pytest
-from ringdic.charts.tracking import CameraGrid, CameraPixels, interpolate_matches
+from ringdic.charts.chart import Chart, chart_with_uncertainty
+from ringdic.charts.depth_map import DepthImages, measure_depths
+from ringdic.charts.images import ChartImages
+from ringdic.charts.matching import match_chart
+from ringdic.charts.plane_sweep import DepthRange
+from ringdic.charts.series import SurfaceSeries, camera_view
+from ringdic.charts.surface import ReferenceSurface, reference_surface
+from ringdic.charts.tracked_points import tracked_points
+from ringdic.charts.tracking import CameraMatches, match_in_two_passes, surface_grid
+from ringdic.charts.views import plan_chart
 from ringdic.correlation import CorrelationSettings, prepare_reference
 from ringdic.geometry.camera import Camera, Intrinsics
-from ringdic.multiview.motion import Motion
-from ringdic.multiview.shape import ReferenceShape, reference_shape
-from ringdic.multiview.uncertainty import SurfaceUncertainty, surface_uncertainty
-from ringdic.pairs.matching import PairGrid, StepMatches, Stereo, match_reference, step_matches
-from ringdic.pairs.reconstruction import pair_shape
-from ringdic.pairs.surfaces import pairs_surface
-from ringdic.pairs.surfaces import reconstruct_pair as follow_pair
-from ringdic.pairs.tracking import camera_grid, match_camera
 from ringdic.results.results import Results
 from ringdic.results.series import StepCache, join_steps
-from ringdic.results.uncertainty import add_uncertainty
 from ringdic.settings import Settings
-from ringdic.strain.deformation import deformation
-from ringdic.sweep.sweep import DepthSearch
 from ringdic_node.virtual_rig.lens import VirtualCamera
 from ringdic_node.virtual_rig.render import radiance
 from ringdic_node.virtual_rig.rig import paper_rig
@@ -87,8 +86,8 @@ def spread(values: np.ndarray, sigma: np.ndarray) -> Spread:
 def shared_places(labels: list[np.ndarray]) -> list[np.ndarray]:
     """Where each of several runs has the places that all of them have.
 
-    labels : for each run (n, m), whole numbers that name a place, such as its lattice node and its reference camera's
-    pixel. Returns for each run the indices (k,) of the common places, in one order.
+    labels : for each run (n, m), whole numbers that name a place, such as its camera and its pixel there.
+    Returns for each run the indices (k,) of the common places, in one order.
     """
     named = [{tuple(row): k for k, row in enumerate(run.tolist())} for run in labels]
     common = sorted(set(named[0]).intersection(*named[1:]))
@@ -97,12 +96,10 @@ def shared_places(labels: list[np.ndarray]) -> list[np.ndarray]:
 
 @dataclass(frozen=True)
 class Run:
-    """What one repeat measured, by all cameras and by the first two as a pair."""
+    """What one repeat measured: the surface at the reference and the results of all steps, σ due to noise alone."""
 
-    shape: ReferenceShape
-    motion: Motion
-    sure: SurfaceUncertainty
-    pair: Results
+    surface: ReferenceSurface
+    results: Results
 
 
 def real(camera: VirtualCamera) -> Camera:
@@ -122,74 +119,97 @@ def cropped(camera: VirtualCamera, xyz: np.ndarray) -> VirtualCamera:
 
 
 @pytest.fixture(scope="module")
-def runs(motion_of_shape: Callable[..., Motion]) -> list[Run]:
+def exposures() -> tuple[list[Camera], DepthRange, list[dict[tuple[int, int], np.ndarray]]]:
+    """Cameras, where the surface may be, and for each repeat the images by camera's index and step."""
     limb, rig = Limb(), paper_rig(12, 1.0)
     reach = HALF / 9.3  # mm: so many px a mm there
     theta, z = np.meshgrid(np.linspace(-reach, reach, 5) / 55.0, 120.0 + np.linspace(-reach, reach, 5))
     patch = np.concatenate([limb.position(theta, z, step).reshape(-1, 3) for step in (0, 1)])
     views = [cropped(rig.cameras[k], patch) for k in (11, 0, 1)]
-    light = {(v.id, step): radiance(v, Specimen(limb, step)) for v in views for step in (0, 1)}
-    light |= {(v.id, 2): light[v.id, 1] for v in views}
-    cameras = [real(v) for v in views]
-    return [measure(cameras, exposed(light, repeat), motion_of_shape) for repeat in range(REPEATS)]
+    light = {(k, step): radiance(v, Specimen(limb, step)) for k, v in enumerate(views) for step in (0, 1)}
+    light |= {(k, 2): light[k, 1] for k in range(len(views))}
+    repeats = [
+        {key: expose(image, 1000 * repeat + k) for k, (key, image) in enumerate(light.items())}
+        for repeat in range(REPEATS)
+    ]
+    return [real(v) for v in views], DepthRange.of([real(v) for v in rig.cameras]), repeats
 
 
-def exposed(light: dict, repeat: int) -> Callable[[str, int], np.ndarray]:
-    seeds = {key: 1000 * repeat + k for k, key in enumerate(light)}
-    grey = {key: expose(image, seeds[key]) for key, image in light.items()}
-    return lambda id_, step: grey[id_, step]
+@pytest.fixture(scope="module")
+def runs(exposures) -> list[Run]:
+    """Of all three cameras, each with a chart of its own."""
+    cameras, space, repeats = exposures
+    return [measure(cameras, space, grey, {0: (1, 2), 1: (0, 2), 2: (1, 0)}, "best") for grey in repeats]
+
+
+@pytest.fixture(scope="module")
+def pair_runs(exposures) -> list[Run]:
+    """Of the first two cameras as the paper's pair: one chart of flat subsets with one partner."""
+    cameras, space, repeats = exposures
+    return [measure(cameras[:2], space, grey, {0: (1,)}, "paper") for grey in repeats]
 
 
 def measure(
-    cameras: list[Camera], image: Callable[[str, int], np.ndarray], motion_of_shape: Callable[..., Motion]
+    cameras: list[Camera], space: DepthRange, grey: dict, partners: dict[int, tuple[int, ...]], method: str
 ) -> Run:
-    search = DepthSearch(radius=55.0, reach=6.0, incidence=65.0)
-    shape = reference_shape(cameras, lambda id_: image(id_, 0), {}, [(0, 1), (1, 2)], search, CORRELATION)
-    motion = motion_of_shape(cameras, shape, image, STEPS, CORRELATION, 0.05)
-    return Run(
-        shape,
-        motion,
-        surface_uncertainty(cameras, shape, motion, CORRELATION.radius, 1),
-        by_pair(cameras, image, search),
-    )
+    curved = method == "best"
+    reduced = DepthImages.of(cameras, lambda k: grey[k, 0], CORRELATION)
+    others = [tuple(c for c in range(len(cameras)) if c != k) for k in range(len(cameras))]
+    maps = [measure_depths(reduced, k, others[k], space, None) for k in range(len(cameras))]
+    images = ChartImages(cameras, lambda k: grey[k, 0], CORRELATION)
+    charts = []
+    for k, seen_by in partners.items():
+        plan = plan_chart(k, cameras, maps, 65.0, seen_by, whole=not curved)
+        matches = match_chart(images, k, maps[k], plan, None, curved=curved)
+        charts.append(chart_with_uncertainty(images, matches, np.array([maps[c].grey_noise for c in matches.cameras])))
+    surface = reference_surface(cameras, charts, CORRELATION.step, 0.05)
+    surface = replace(surface, scatter=noise_of_matches(surface, charts))
+    later = [tracked(camera, k, surface, grey, curved=curved) for k, camera in enumerate(cameras)]
+    ids = [camera.id for camera in cameras]
+    series = SurfaceSeries(
+        "patch", cameras, list(pairwise(ids)), [ids[k] for k in partners], [str(step) for step in range(STEPS)],
+        surface, lambda camera, step: later[camera][step - 1], Settings(method=method), StepCache(Path(gettempdir())),
+    )  # fmt: skip
+    return Run(surface, join_steps([series.at(k) for k in range(STEPS)]))
 
 
-def by_pair(cameras: list[Camera], image: Callable[[str, int], np.ndarray], search: DepthSearch) -> Results:
-    pair = (cameras[0], cameras[1])
-    grid, steps = matched(Stereo(pair, search, CORRELATION), image)
-    shape = pair_shape(pair, grid.xy, grid.faces, steps[0], CORRELATION.step, 0.05)
-    followed = follow_pair(shape, steps.__getitem__, STEPS, StepCache(Path(gettempdir())))
-    series, _ = pairs_surface("patch", cameras, [followed], [str(step) for step in range(STEPS)], Settings())
-    return add_uncertainty(join_steps([series.at(k) for k in range(STEPS)]), None)
+def noise_of_matches(surface: ReferenceSurface, charts: list[Chart]) -> np.ndarray:
+    """Standard deviations (C, N, 2) px of the surface's matches due to noise alone: other causes do not vary here."""
+    out = np.full(surface.px.shape, np.nan)
+    for chart in charts:
+        row = {tuple(xy): k for k, xy in enumerate(np.rint(chart.xy).astype(int).tolist())}
+        vertex = np.flatnonzero(surface.own == chart.cameras[0])
+        pixel = np.rint(surface.px[chart.cameras[0], vertex]).astype(int).tolist()
+        out[np.ix_(chart.cameras, vertex)] = chart.noise[:, [row[tuple(xy)] for xy in pixel]]
+    return np.where(np.isfinite(surface.px), out, np.nan)
 
 
-def matched(stereo: Stereo, image: Callable[[str, int], np.ndarray]) -> tuple[PairGrid, list[StepMatches]]:
-    first, second = stereo.cameras
-    grid, found = match_reference(stereo, image(first.id, 0), image(second.id, 0), None)
-    own = camera_grid(first.size, CORRELATION.step, [(grid.region, grid.xy[found.good])], [])
-    other = camera_grid(second.size, CORRELATION.step, [], [(found.second_px, grid.faces)])
-
-    def seen(id_: str, points: CameraGrid, xy: np.ndarray, step: int) -> CameraPixels:
-        reference = prepare_reference(image(id_, 0), points.region, CORRELATION)
-        return interpolate_matches(match_camera(reference, image(id_, step), points, CORRELATION), xy)
-
-    later = [
-        step_matches(found, (seen(first.id, own, grid.xy, k), seen(second.id, other, found.second_px, k)))
-        for k in range(1, STEPS)
+def tracked(camera: Camera, k: int, surface: ReferenceSurface, grey: dict, *, curved: bool) -> list[CameraMatches]:
+    view = camera_view(camera, k, surface)
+    px = np.full((len(surface.xyz), 2), np.nan)
+    px[view.vertex] = view.px
+    grid = surface_grid(camera.size, CORRELATION.step, [(px, surface.faces.astype(np.int32))])
+    reference = prepare_reference(grey[k, 0], grid.region, CORRELATION)
+    points = tracked_points(reference, grid.xy, CORRELATION)
+    return [
+        match_in_two_passes(reference, grey[k, step], points, CORRELATION, curved=curved) for step in range(1, STEPS)
     ]
-    return grid, [found, *later]
+
+
+def named_points(runs: list[Run]) -> list[np.ndarray]:
+    """The points that all runs named by the same pixel of the same camera and saw in the same cameras."""
+    labels = []
+    for run in runs:
+        surface = run.surface
+        pixel = np.rint(surface.px[surface.own, np.arange(len(surface.xyz))])
+        views = (np.isfinite(surface.px[..., 0]) * 2 ** np.arange(len(surface.px))[:, None]).sum(axis=0)
+        labels.append(np.column_stack([surface.own, pixel, views]).astype(np.int64))
+    return shared_places(labels)
 
 
 @pytest.fixture(scope="module")
 def places(runs: list[Run]) -> list[np.ndarray]:
-    """The points that all runs named by the same pixel of the same camera and saw in the same cameras."""
-    labels = []
-    for run in runs:
-        shape = run.shape
-        pixel = np.rint(shape.px[shape.reference, np.arange(len(shape.xyz))])
-        views = (np.isfinite(shape.px[..., 0]) * 2 ** np.arange(len(shape.px))[:, None]).sum(axis=0)
-        labels.append(np.column_stack([shape.node, shape.reference, pixel, views]).astype(np.int64))
-    return shared_places(labels)
+    return named_points(runs)
 
 
 def judge(name: str, found: Spread, figures: Callable[[str, str, str], None]) -> None:
@@ -228,77 +248,76 @@ def test_the_judge_finds_a_true_statement_true_and_a_false_one_false() -> None:
     assert spread(values, sigma).places == 399  # a place lost once is left out
 
 
+def stretches(runs: list[Run], places: list[np.ndarray], *, previous: bool) -> tuple[np.ndarray, np.ndarray]:
+    """λ1 and λ2 at step 2 (R, n, 2), and their stated standard deviations, of the triangles that all runs have."""
+    meshes = [(run.results.faces, at) for run, at in zip(runs, places, strict=True)]
+    values, stated = [], []
+    for run, same in zip(runs, common_faces(meshes), strict=True):
+        face = run.results.fields(2, previous=previous).face
+        values.append(np.column_stack([face["lambda1"], face["lambda2"]])[same])
+        stated.append(np.column_stack([face["sigma_lambda1"], face["sigma_lambda2"]])[same])
+    return np.array(values), np.array(stated)
+
+
+def displacements(
+    runs: list[Run], places: list[np.ndarray], step: int, *, previous: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Displacements (R, n, 3) mm at a step, and their stated standard deviations, of the points that all runs have."""
+    values = [run.results.vertices[step] - run.results.reference_positions(step, previous) for run in runs]
+    stated = [run.results.fields(step, previous=previous).point["sigma_displacement"] for run in runs]
+    return tuple(np.array([one[at] for one, at in zip(each, places, strict=True)]) for each in (values, stated))  # type: ignore[return-value]
+
+
 def test_reference_positions_spread_as_stated(runs, places, figures) -> None:
-    values = taken(runs, places, lambda run: run.shape.xyz)
-    judge("X, between cameras", spread(values, taken(runs, places, lambda run: run.sure.position[0])), figures)
+    values = taken(runs, places, lambda run: run.surface.xyz)
+    judge("X, between cameras", spread(values, taken(runs, places, lambda run: run.results.sigma_xyz[0])), figures)
 
 
 def test_positions_of_a_step_spread_as_stated(runs, places, figures) -> None:
-    values = taken(runs, places, lambda run: run.motion.xyz[1])
-    judge("X, at a later step", spread(values, taken(runs, places, lambda run: run.sure.position[1])), figures)
+    values = taken(runs, places, lambda run: run.results.vertices[1])
+    judge("X, at a later step", spread(values, taken(runs, places, lambda run: run.results.sigma_xyz[1])), figures)
 
 
-def test_displacements_spread_as_stated(runs, places, figures) -> None:
-    values = taken(runs, places, lambda run: run.motion.xyz[1] - run.shape.xyz)
-    judge("displacement", spread(values, taken(runs, places, lambda run: run.sure.displacement[1])), figures)
+STEPS_APART = [(1, False), (2, False), (2, True)]
+
+
+@pytest.mark.parametrize(("step", "previous"), STEPS_APART)
+def test_displacements_spread_as_stated(runs, places, figures, step: int, previous: bool) -> None:
+    found = spread(*displacements(runs, places, step, previous=previous))
+    judge(f"displacement {step - 1 if previous else 0} → {step}", found, figures)
 
 
 def test_stretches_spread_as_stated(runs, places, figures) -> None:
-    values, stated = [], []
-    for run, same in zip(runs, common_faces([(run.shape.faces, at) for run, at in zip(runs, places, strict=True)]),
-                         strict=True):  # fmt: skip
-        found = deformation(run.shape.xyz, run.motion.xyz[1], run.shape.faces)
-        values.append(np.column_stack([found.lambda1, found.lambda2])[same])
-        stated.append(run.sure.stretches[1, same])
-    judge("λ1, λ2", spread(values, stated), figures)
+    judge("λ1, λ2", spread(*stretches(runs, places, previous=False)), figures)
 
 
 @pytest.fixture(scope="module")
-def pixels(runs: list[Run]) -> list[np.ndarray]:
-    """Where each run has the pixels of the pair's grid that all runs have as points."""
-    labels = []
-    for run in runs:
-        (matches,) = run.pair.matches
-        xy = np.full((len(run.pair.vertices_ref), 2), -1.0)
-        held = matches.vertex >= 0
-        xy[matches.vertex[held]] = matches.xy[held]
-        labels.append(np.rint(xy).astype(np.int64))
-    return shared_places(labels)
+def pixels(pair_runs: list[Run]) -> list[np.ndarray]:
+    return named_points(pair_runs)
 
 
-@pytest.mark.parametrize(("step", "previous"), [(1, False), (2, False), (2, True)])
-def test_displacements_of_a_pair_spread_as_stated(runs, pixels, figures, step: int, previous: bool) -> None:
-    values = taken(runs, pixels, lambda run: run.pair.vertices[step] - run.pair.reference_positions(step, previous))
-    sigma = taken(runs, pixels, lambda run: run.pair.fields(step, previous=previous).point["sigma_displacement"])
-    judge(f"pair, displacement {step - 1 if previous else 0} → {step}", spread(values, sigma), figures)
+@pytest.mark.parametrize(("step", "previous"), STEPS_APART)
+def test_displacements_of_a_pair_spread_as_stated(pair_runs, pixels, figures, step: int, previous: bool) -> None:
+    found = spread(*displacements(pair_runs, pixels, step, previous=previous))
+    judge(f"pair, displacement {step - 1 if previous else 0} → {step}", found, figures)
 
 
 @pytest.mark.parametrize("previous", [False, True])
-def test_stretches_of_a_pair_spread_as_stated(runs, pixels, figures, previous: bool) -> None:
+def test_stretches_of_a_pair_spread_as_stated(pair_runs, pixels, figures, previous: bool) -> None:
     # From step 1 to 2 nothing moves: the order of λ1 and λ2 sorts the noise, which takes some 15 % of its spread, and
     # both have one stated deviation. Their sum feels no order.
-    values, stated = [], []
-    for run, same in zip(runs, common_faces([(run.pair.faces, at) for run, at in zip(runs, pixels, strict=True)]),
-                         strict=True):  # fmt: skip
-        face = run.pair.fields(2, previous=previous).face
-        stretches = np.column_stack([face["lambda1"], face["lambda2"]])[same]
-        sigma = np.column_stack([face["sigma_lambda1"], face["sigma_lambda2"]])[same]
-        values.append(stretches.sum(axis=1, keepdims=True) if previous else stretches)
-        stated.append(np.linalg.norm(sigma, axis=1, keepdims=True) if previous else sigma)
+    values, stated = stretches(pair_runs, pixels, previous=previous)
+    if previous:
+        values, stated = values.sum(axis=2, keepdims=True), np.linalg.norm(stated, axis=2, keepdims=True)
     judge("pair, λ1 + λ2 1 → 2" if previous else "pair, λ1, λ2 0 → 2", spread(values, stated), figures)
 
 
-def test_from_step_to_step_all_cameras_spread_as_stated(runs, places, figures) -> None:
-    values = taken(runs, places, lambda run: run.motion.xyz[2] - run.motion.xyz[1])
-    two = taken(runs, places, lambda run: np.sqrt(0.5 * (run.sure.displacement[1:] ** 2).sum(axis=0)))
-    judge("displacement 1 → 2", spread(values, two), figures)
-
-
 def test_chi_square_of_good_points_is_about_one(runs, places, figures) -> None:
-    for name, chi2, degrees in (
-        ("between cameras", lambda run: run.shape.chi2, lambda run: run.shape.degrees),
-        ("in time", lambda run: run.motion.chi2[1], lambda run: run.motion.degrees[1]),
-    ):
-        each = float(np.nansum(taken(runs, places, chi2)) / np.sum(taken(runs, places, degrees)))
-        figures(f"χ² a degree of freedom, {name}", f"{each:.2f}", "0.4 … 1.6")
-        assert 0.4 < each < 1.6
+    reference = taken(runs, places, lambda run: run.surface.chi2), taken(runs, places, lambda run: run.surface.degrees)
+    each = float(np.nansum(reference[0]) / np.sum(reference[1]))
+    in_time = float(np.nanmean(taken(runs, places, lambda run: run.results.chi2[1])))
+    # In time the views are weighted by their noise alone; interpolation between the points of the cameras' grids and of
+    # the grey levels, the same in every repeat, adds about as much.
+    for name, value, most in (("between cameras", each, 1.6), ("in time", in_time, 2.5)):
+        figures(f"χ² a degree of freedom, {name}", f"{value:.2f}", f"0.4 … {most}")
+        assert 0.4 < value < most

@@ -1,12 +1,15 @@
 """Results of processing runs as the archive holds them: header (JSON), arrays, the file itself, and the report."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Response
+from fastapi import APIRouter, Depends, Query, Response
 from fastapi.responses import FileResponse, HTMLResponse
-from ringdic.results.reader import read_summary
+from ringdic.results.reader import read_summary, read_unmeasured
+from ringdic.session.folder import open_session
 
+from ringdic_controller.service.preview import picture_jpeg
 from ringdic_controller.service.refusals import NotFoundError
 from ringdic_controller.service.routes.arrays import add_arrays, version_of
 from ringdic_controller.service.routes.desk import TheDesk
@@ -57,6 +60,38 @@ def read_report(session: str, run: str, results: RunFile, desk: TheDesk) -> Resp
 
         write_report(desk.catalogue.path(session), path, int(run))
     return FileResponse(path, media_type="text/html", headers={"Cache-Control": "no-cache"})
+
+
+@router.get("/{run}/unmeasured", summary="Texture that was not measured: areas by reason, and the cameras that show it")
+def read_unmeasured_areas(path: RunFile) -> dict[str, Any]:
+    """Reasons with their colours and areas (cm²), and the ids of the cameras whose photographs show them."""
+    from ringdic.pictures.unmeasured import unmeasured_legend
+
+    areas = read_summary(path)["summary"].get("unmeasured")
+    return {
+        "reasons": [asdict(row) for row in unmeasured_legend(areas)] if areas else [],
+        "cameras": [places.camera for places in read_unmeasured(path) if len(places.px)],
+    }
+
+
+@router.get(
+    "/{run}/unmeasured/{camera}",
+    response_class=Response,
+    responses={200: {"content": {"image/jpeg": {}}}},
+    summary="A photograph of the reference with what was not measured, as a JPEG",
+)
+def send_unmeasured_picture(
+    session: str, camera: str, path: RunFile, desk: TheDesk, width: Annotated[int, Query(ge=16, le=4096)] = 480
+) -> Response:
+    """Photograph of a camera at the reference with the places that were not measured, at most ``width`` px wide."""
+    from ringdic.pictures.overlay import photograph
+    from ringdic.pictures.unmeasured import unmeasured_picture
+
+    places = next((one for one in read_unmeasured(path) if one.camera == camera), None)
+    if places is None:
+        raise NotFoundError(f"The run does not tell what camera '{camera}' shows that was not measured.")
+    image = photograph(open_session(desk.catalogue.path(session)), read_summary(path)["steps"][0], camera)
+    return Response(picture_jpeg(unmeasured_picture(image, places), width), media_type="image/jpeg")
 
 
 add_arrays(router, "/{run}", _locate)

@@ -15,7 +15,7 @@ from ringdic.jobs.compiling import compile_once
 from ringdic.progress import Progress, Report, progress_bar
 from ringdic.session.folder import newest_results
 from ringdic.session.rig import parse_rig
-from ringdic.settings import PAPER, Settings
+from ringdic.settings import Settings
 from ringdic_node.virtual_rig.render import load_renderer
 from ringdic_node.virtual_rig.rig import VirtualRig, paper_rig, write_truth
 from ringdic_node.virtual_rig.scenes import Limb
@@ -110,7 +110,7 @@ def _compare(setting: Setting, session: str, rig: VirtualRig, began: float) -> d
 
 def settings_for(scale: float) -> Settings:
     """The paper's settings for images of another scale; the subsets keep the least size that they need."""
-    return PAPER.model_copy(update={"correlation": PAPER.correlation.at_scale(scale)})
+    return Settings().model_copy(update={"correlation": Settings().correlation.at_scale(scale)})
 
 
 def _new_folder(folder: Path) -> Path:

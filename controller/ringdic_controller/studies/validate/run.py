@@ -38,7 +38,7 @@ def run_validation(
     began = time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
     scenery = Scenery(scale, **(_QUICK if quick else {}))
-    ways = {PAPER: scaled(presets.PAPER, scale), BETTER: scaled(presets.BEST, scale)}
+    ways = {PAPER: scaled(presets.PAPER, scale), BETTER: scaled(presets.Settings(), scale)}
     chosen = tuple(only) or EXPERIMENTS
     load_renderer()
     with progress_bar() as progress:

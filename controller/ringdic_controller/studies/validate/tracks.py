@@ -16,10 +16,10 @@ from scipy.spatial import cKDTree
 
 @dataclass(frozen=True)
 class Tracks:
-    """Pixels of all measured points, including those that the merging of the pairs removes.
+    """Pixels of all points of a run's surface.
 
-    cameras : C ids. px : (F, C, N, 2), NaN where a camera did not measure a point. reference : (C, N, 2), as matched
-    between the cameras; by the global method px at step 0 is instead where all views together place the point.
+    cameras : C ids. px : (F, C, N, 2), NaN where a camera did not measure a point; at step 0 where all views together
+    place the point. reference : (C, N, 2), as matched between the cameras.
     """
 
     cameras: tuple[str, ...]
@@ -30,20 +30,14 @@ class Tracks:
     def of(cls, results: Results) -> Tracks:
         """The pixels of the matches that are stored with the results."""
         ids = tuple(camera.id for camera in results.cameras)
-        alone = all(len(matches.cameras) == 1 for matches in results.matches)
-        count = len(results.vertices_ref) if alone else sum(len(matches.xy) for matches in results.matches)
+        count = len(results.vertices_ref)
         px = np.full((len(results.steps), len(ids), count, 2), np.nan)
         reference = np.full((len(ids), count, 2), np.nan)
-        offset = 0
         for matches in results.matches:
-            used = np.flatnonzero(matches.vertex >= 0) if alone else np.arange(len(matches.xy))
-            row = matches.vertex[used] if alone else offset + used
-            good = np.where(matches.status[:, used, None] == 0, 1.0, np.nan)
-            for k, id_ in enumerate(matches.cameras):
-                camera = ids.index(id_)
-                px[:, camera, row] = matches.px[:, k][:, used] * good
-                reference[camera, row] = matches.xy[used] if alone else px[0, camera, row]
-            offset += len(matches.xy)
+            camera = ids.index(matches.cameras[0])
+            good = np.where(matches.status[..., None] == 0, 1.0, np.nan)
+            px[:, camera, matches.vertex] = matches.px[:, 0] * good
+            reference[camera, matches.vertex] = matches.xy
         return cls(ids, px, reference)
 
     def reconstruct(self, cameras: Mapping[str, Camera]) -> Floats:
@@ -70,8 +64,8 @@ class Tracks:
 def mismatch(tracks: Tracks, cameras: Mapping[str, Camera], pairs: tuple[tuple[str, str], ...]) -> Floats:
     """Distances (n,) mm between the surfaces that two camera pairs with a common camera measure (Fig. 7a).
 
-    Vertices that both pairs have are compared. Where there are none, one pair's surface is interpolated at the other's
-    points in the image of the common camera, by cubic interpolation.
+    Points that both pairs see are compared. Where there are none, as where each pair has points of its own, one pair's
+    surface is interpolated at the other's points in the image of the common camera, by cubic interpolation.
     """
     distances = []
     for one, other in tracks.neighbours(pairs):

@@ -118,6 +118,7 @@ async function openChosen(followed = false) {
   facesOf = opened;
   shownPoints = null;
   showFigures();
+  showUnmeasured();
   await show();
 }
 
@@ -225,6 +226,36 @@ function showFigures() {
   );
 }
 
+/** What was not measured: areas by reason, and the photographs, loaded when the part is opened. */
+function showUnmeasured() {
+  const areas = header.place[0] === "live" ? null : header.summary?.unmeasured;
+  const part = byId("unmeasured");
+  part.hidden = !areas;
+  byId("unmeasured-reasons").replaceChildren();
+  byId("unmeasured-pictures").replaceChildren();
+  if (!areas) return;
+  part.firstElementChild.textContent = `Not measured: ${areas.total_cm2.toFixed(1)} cm² of the texture that two cameras see`;
+  if (part.open) attempt(loadUnmeasured);
+}
+
+async function loadUnmeasured() {
+  const of = header;
+  const { reasons, cameras } = await get(own("unmeasured"));
+  if (of !== header) return;
+  byId("unmeasured-reasons").replaceChildren(
+    ...reasons.map(({ reason, colour, cm2, counted: inTotal }) =>
+      element("li", {}, element("i", { style: `background: ${colour}` }), `${reason}: ${cm2.toFixed(1)} cm²${inTotal ? "" : " (not in the total)"}`),
+    ),
+  );
+  byId("unmeasured-pictures").replaceChildren(
+    ...cameras.map((camera) => {
+      const picture = element("img", { src: own("unmeasured", camera), loading: "lazy", alt: `Camera ${camera}: what was not measured` });
+      const large = { href: `${own("unmeasured", camera)}?width=4096`, target: "_blank", rel: "noopener" };
+      return element("figure", {}, element("a", large, picture), element("figcaption", {}, camera));
+    }),
+  );
+}
+
 /** The world's axes as the present view sees them. */
 function drawAxes(axes) {
   for (const [k, [right, up]] of axes.entries()) {
@@ -329,4 +360,7 @@ export function wireResults() {
   });
   byId("reset-view").addEventListener("click", () => surface?.resetView());
   byId("play").addEventListener("click", play);
+  byId("unmeasured").addEventListener("toggle", () => {
+    if (byId("unmeasured").open && header) attempt(loadUnmeasured);
+  });
 }

@@ -139,12 +139,13 @@ def test_two_meshes_of_neighbouring_pairs_are_compared_over_the_image_they_share
         )
         xyz = surface.position(theta, z, 0)
         lifted = xyz * ([1.001, 1.001, 1.0] if k else [1.0, 1.0, 1.0])  # the second pair measures 57 µm too far out
-        px = np.stack([TRUE[id_].project(lifted) for id_ in pair])[None]
         n = len(xyz)
-        parts.append(
-            Matches(pair, px[0, 0], px, np.zeros((1, n)), np.full(px.shape, 0.01), np.zeros((1, n), dtype=np.int8),
-                    offset + np.arange(n))
-        )  # fmt: skip
+        for id_ in pair:
+            px = TRUE[id_].project(lifted)
+            parts.append(
+                Matches((id_,), px, px[None, None], np.zeros((1, n)), np.full((1, 1, n, 2), 0.01),
+                        np.zeros((1, n), dtype=np.int8), offset + np.arange(n))
+            )  # fmt: skip
         vertices.append(lifted)
         offset += n
     xyz = np.concatenate(vertices)

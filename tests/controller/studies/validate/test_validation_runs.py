@@ -88,7 +88,7 @@ def test_the_settings_of_full_scale_shrink_with_the_image_but_not_below_what_a_s
     half, tenth = scaled(presets.PAPER, 0.5), scaled(presets.PAPER, 0.1)
     assert (half.correlation.radius_px, half.correlation.step_px) == (10, 5)
     assert (tenth.correlation.radius_px, tenth.correlation.step_px) == (10, 5)
-    assert scaled(presets.BEST, 1.0) == presets.BEST
+    assert scaled(presets.Settings(), 1.0) == presets.Settings()
 
 
 def test_an_unknown_experiment_is_refused(tmp_path: Path) -> None:

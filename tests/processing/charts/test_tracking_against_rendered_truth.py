@@ -1,4 +1,4 @@
-"""One camera's points followed through rendered images of bodies whose motion is known exactly."""
+"""One camera's points tracked through rendered images of bodies whose motion is known exactly."""
 
 import json
 from collections.abc import Callable
@@ -6,27 +6,38 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ringdic.correlation import CorrelationSettings, Status
+from ringdic.charts.tracked_points import tracked_points
+from ringdic.charts.tracking import CameraPixels, match_in_two_passes
+from ringdic.correlation import CorrelationSettings, Status, prepare_reference
 from ringdic.geometry.camera import Camera, Intrinsics
-from ringdic.multiview.tracking import CameraTrack, Tracking
 from ringdic.session.images import read_gray
 from ringdic_node.virtual_rig.render import render
 from ringdic_node.virtual_rig.rig import paper_rig
 from ringdic_node.virtual_rig.scenes.damage import Bar, Damage, SpoiltPatch
 from ringdic_node.virtual_rig.scenes.specimen import Cylinder, Limb, Specimen
 
-ONE_PASS, SECOND, TWO_PASS = Tracking(two_pass=False), Tracking(two_pass=False, order=2), Tracking()
+Tracks = dict[str, list[CameraPixels]]
 
 
-def errors(result: CameraTrack, step: int, truth: np.ndarray, keep: np.ndarray) -> np.ndarray:
+def tracks_by_way(track: Callable, images: list[np.ndarray], x0: np.ndarray, radius: int, step: int) -> Tracks:
+    """The points in the later images, by subsets of either order alone and with the field's curvature held."""
+    first, second = (CorrelationSettings(radius=radius, step=step, order=order) for order in (1, 2))
+    return {
+        "first order": track(images, x0, first, curved=False),
+        "second order": track(images, x0, second, curved=False),
+        "two passes": track(images, x0, first),
+    }
+
+
+def errors(seen: CameraPixels, truth: np.ndarray, keep: np.ndarray | slice) -> np.ndarray:
     """Measured minus true pixels of the points kept, (k, 2); all of them must have been found."""
-    assert (result.status[step, keep] == Status.GOOD).all()
-    return (result.px[step] - truth)[keep]
+    assert (seen.status[keep] == Status.GOOD).all()
+    return (seen.px - truth)[keep]
 
 
 @pytest.fixture(scope="module")
 def limb(shared_data: Path):
-    """A camera's images of the deforming limb at three steps, where its points truly are, cosine of incidence."""
+    """A camera's images of the deforming limb at its steps, where its points truly are, cosine of incidence."""
     folder = shared_data / "rendered_ring"
     one = json.loads((folder / "cameras_truth.json").read_text())["cameras"][0]
     K = np.array([[one["fx"], one["skew"], one["cx"]], [0.0, one["fy"], one["cy"]], [0.0, 0.0, 1.0]])
@@ -43,18 +54,26 @@ def limb(shared_data: Path):
     return images, [each[keep] for each in px], cosine[keep]
 
 
+def at_points(
+    images: list[np.ndarray], x0: np.ndarray, settings: CorrelationSettings, *, curved: bool = True
+) -> list[CameraPixels]:
+    """Points matched where they are, with no grid between: what a match alone is worth."""
+    reference = prepare_reference(images[0], None, settings)
+    points = tracked_points(reference, x0, settings)
+    later = [match_in_two_passes(reference, image, points, settings, curved=curved) for image in images[1:]]
+    return [CameraPixels(x0 + one.uv, one.sigma, one.c_ls, one.status) for one in later]
+
+
 @pytest.fixture(scope="module")
-def tracks(limb, track_camera: Callable[..., CameraTrack]) -> dict[str, CameraTrack]:
+def tracks(limb) -> Tracks:
     images, px, _ = limb
-    settings = CorrelationSettings(radius=20, step=13)
-    ways = {"first order": ONE_PASS, "second order": SECOND, "two passes": TWO_PASS}
-    return {name: track_camera(images, px[0], settings, way) for name, way in ways.items()}
+    return tracks_by_way(at_points, [images[0], images[2]], px[0], 20, 13)
 
 
 def test_two_passes_are_unbiased_and_as_quiet_as_the_noise_allows(limb, tracks, figures: Callable) -> None:
     _, px, cosine = limb
     facing = cosine > np.cos(np.radians(50))
-    e = {name: errors(result, 2, px[2], facing) for name, result in tracks.items()}
+    e = {name: errors(result[0], px[2], facing) for name, result in tracks.items()}
     for name, each in e.items():
         mean, std = each.mean(axis=0), each.std(axis=0)
         figures(
@@ -67,19 +86,21 @@ def test_two_passes_are_unbiased_and_as_quiet_as_the_noise_allows(limb, tracks, 
     assert (np.abs(e["two passes"].mean(axis=0)) < 0.0015).all()
     # The images' own noise alone is 0.0025 px before compression.
     assert (e["two passes"].std(axis=0) < 0.005).all()
-    assert (e["two passes"].std(axis=0) < 0.75 * e["second order"].std(axis=0)).all()
-    assert np.abs(e["two passes"]).max() < 0.03
+    # The curvature, from displacements of the neighbours in the same two images, adds a tenth to the noise of a subset.
+    assert (e["two passes"].std(axis=0) < 0.8 * e["second order"].std(axis=0)).all()
+    assert np.abs(e["two passes"]).max() < 0.04  # the worst of 2453 points
 
 
 def test_the_stated_uncertainty_is_the_scatter_observed_at_every_incidence(limb, tracks, figures: Callable) -> None:
     _, px, cosine = limb
     for low, high in ((0, 45), (45, 55), (55, 60)):
         band = (cosine <= np.cos(np.radians(low))) & (cosine > np.cos(np.radians(high)))
-        two = tracks["two passes"]
-        measured = two.status[2] == Status.GOOD
-        assert measured[band].mean() > 0.97
+        (two,) = tracks["two passes"]
+        measured = two.status == Status.GOOD
+        # At the rim the field is so strongly bent that a point may contradict the quadratic of its neighbours.
+        assert measured[band].mean() > (0.97 if high < 60 else 0.9)
         band &= measured
-        ratio = np.sqrt(np.mean((errors(two, 2, px[2], band) / two.sigma[2, band]) ** 2))
+        ratio = np.sqrt(np.mean((errors(two, px[2], band) / two.sigma[band]) ** 2))
         figures(f"limb in time, {low}-{high} degrees, observed / stated", f"{ratio:.2f}", "0.75 to 1.4")
         assert 0.75 < ratio < 1.4
 
@@ -102,25 +123,22 @@ def normals(surface, theta: np.ndarray, z: np.ndarray, step: int) -> np.ndarray:
     return n / np.linalg.norm(n, axis=1, keepdims=True)
 
 
-def test_a_rigid_step_costs_two_passes_no_noise(track_camera: Callable[..., CameraTrack], figures: Callable) -> None:
+def test_a_rigid_step_costs_two_passes_no_noise(track_camera: Callable, figures: Callable) -> None:
     camera, surface = paper_rig(12, 0.25).cameras[0], Cylinder()
     images = [render(camera, Specimen(surface, k), seed=40 + k) for k in (0, 1)]
     theta, z = seen_by(camera, surface, 3.5, 20.0, 230.0)
     x0, truth = (camera.project(surface.position(theta, z, k)) for k in (0, 1))
-    settings = CorrelationSettings(radius=14, step=8)
-    e = {
-        name: errors(track_camera(images, x0, settings, way), 1, truth, slice(None))
-        for name, way in (("one pass", ONE_PASS), ("two passes", TWO_PASS), ("second order", SECOND))
-    }
+    tracks = tracks_by_way(track_camera, images, x0, 14, 8)
+    e = {name: errors(result[0], truth, slice(None)) for name, result in tracks.items()}
     std = {name: float(np.sqrt((each.std(axis=0) ** 2).mean())) for name, each in e.items()}
     figures(
-        "rigid step in time, STD one pass, two passes, second order",
+        "rigid step in time, STD first order, second order, two passes",
         ", ".join(f"{value:.4f}" for value in std.values()) + " px",
-        "two < 1.1 one",
+        "two < 1.1 first",
     )
-    assert std["two passes"] < 1.1 * std["one pass"]
-    assert std["second order"] > 1.5 * std["one pass"]
-    assert (np.abs(e["two passes"].mean(axis=0)) < 4 * std["one pass"] / np.sqrt(len(x0) / 10)).all()
+    assert std["two passes"] < 1.1 * std["first order"]
+    assert std["second order"] > 1.5 * std["first order"]
+    assert (np.abs(e["two passes"].mean(axis=0)) < 4 * std["first order"] / np.sqrt(len(x0) / 10)).all()
 
 
 def damage(step: int) -> Damage:
@@ -134,20 +152,18 @@ def damage(step: int) -> Damage:
     )
 
 
-def test_what_is_worn_hidden_or_glares_is_lost_and_never_wrong(
-    track_camera: Callable[..., CameraTrack], figures: Callable
-) -> None:
+def test_what_is_worn_hidden_or_glares_is_lost_and_never_wrong(track_camera: Callable, figures: Callable) -> None:
     camera, surface = paper_rig(12, 0.3).cameras[0], Limb()
     images = [render(camera, Specimen(surface, k, 0, damage(k)), seed=10 + k) for k in range(3)]
     theta, z = seen_by(camera, surface, 3.0, 8.0, 242.0)
     x0 = camera.project(surface.position(theta, z, 0))
-    result = track_camera(images, x0, CorrelationSettings(radius=14, step=8))
-    for step in (1, 2):
+    tracks = track_camera(images, x0, CorrelationSettings(radius=14, step=8))
+    for step, seen in enumerate(tracks, start=1):
         xyz = surface.position(theta, z, step)
         normal = normals(surface, theta, z, step)
         spoilt = damage(step).worn(theta, z) | damage(step).spoilt(camera.centre, xyz, normal)
-        found = result.status[step] == Status.GOOD
-        off = np.hypot(*(result.px[step] - camera.project(xyz)).T)[found]
+        found = seen.status == Status.GOOD
+        off = np.hypot(*(seen.px - camera.project(xyz)).T)[found]
         figures(
             f"worn, hidden or glaring, step {step}: spoilt and kept, clean kept",
             f"{(spoilt & found).sum()} of {spoilt.sum()}, {(found & ~spoilt).sum()} of {(~spoilt).sum()}",
@@ -158,5 +174,5 @@ def test_what_is_worn_hidden_or_glares_is_lost_and_never_wrong(
         assert not (spoilt & found).any()
         assert off.max() < 0.15
         assert (found & ~spoilt).sum() > 0.85 * (~spoilt).sum()
-    uncovered = (result.status[1] != Status.GOOD) & (result.status[2] == Status.GOOD)
+    uncovered = (tracks[0].status != Status.GOOD) & (tracks[1].status == Status.GOOD)
     assert uncovered.sum() > 20  # the bar has moved on, and what it hid is found again

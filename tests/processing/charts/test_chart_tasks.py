@@ -9,22 +9,21 @@ import cv2
 import numpy as np
 import pytest
 from ringdic.calibration.calibrated_rig import calibrate_rig
-from ringdic.correlation import CorrelationSettings, Status
+from ringdic.charts.tasks import ChartsJob, charts_job
+from ringdic.correlation import Status
 from ringdic.geometry.camera import Camera
 from ringdic.jobs.pipeline import process_session
-from ringdic.pairs.tasks import PairJob, ordered_tasks, pair_jobs
 from ringdic.results.reader import read_results
 from ringdic.results.results import Results
 from ringdic.session.folder import open_session
 from ringdic.settings import Settings, load_settings
-from ringdic.sweep.sweep import DepthSearch
 from ringdic.tasks import LocalExecutor, OnTaskEnd, Task, TaskReport, process_memory
 
 SCALE, STEPS = 0.2, 3  # of the session
+LATER = 2 * (STEPS - 1)  # images after the reference
 SMALL = ["correlation.radius_px=12", "correlation.step_px=8"]
 SETTINGS = load_settings(None, SMALL)
-GLOBAL = load_settings(None, [*SMALL, "surface.method=global"])
-CHARTS = load_settings(None, [*SMALL, "surface.method=charts"])
+PAPER = load_settings(None, [*SMALL, "method=paper"])
 
 
 class Counted:
@@ -45,18 +44,16 @@ class Counted:
         LocalExecutor(1).run(tasks, tell)
 
 
-def jobs(session: Path, settings: Settings = SETTINGS, steps: slice = slice(None), **changed: Camera) -> list[PairJob]:
+def job_of(session: Path, settings: Settings = SETTINGS, steps: slice = slice(None), **changed: Camera) -> ChartsJob:
     """The tasks of a session, with other cameras where they are given."""
     read = open_session(session)
     ring = calibrate_rig(read, settings.calibration)
-    cameras = {id_: changed.get(id_, each.camera) for id_, each in ring.cameras.items()}
-    search = DepthSearch(radius=57.0, reach=settings.surface.reach_mm, incidence=settings.surface.incidence_deg)
-    correlation = CorrelationSettings(**settings.correlation.keywords)
-    return pair_jobs(read, cameras, read.rig.pairs, read.of_kind("specimen")[steps], search, correlation)
+    cameras = [changed.get(id_, each.camera) for id_, each in ring.cameras.items()]
+    return charts_job(read, cameras, read.rig.pairs, read.of_kind("specimen")[steps], settings)
 
 
 def keys(session: Path, settings: Settings = SETTINGS, steps: slice = slice(None), **changed: Camera) -> list[str]:
-    return [task.key for task in ordered_tasks(jobs(session, settings, steps, **changed))]
+    return [task.key for task in job_of(session, settings, steps, **changed).tasks]
 
 
 def same(first: Results, second: Results) -> None:
@@ -68,16 +65,11 @@ def same(first: Results, second: Results) -> None:
         np.testing.assert_array_equal(one.sigma, other.sigma)
 
 
-@pytest.mark.parametrize(
-    ("settings", "count"),
-    [(SETTINGS, 1 + 2 * (STEPS - 1)), (GLOBAL, 1 + 2), (CHARTS, 5 + 2 * (STEPS - 1))],
-    ids=["pairs", "global", "charts"],
-)
+@pytest.mark.parametrize(("settings", "count"), [(SETTINGS, 5 + LATER), (PAPER, 4 + LATER)], ids=["best", "paper"])
 def test_an_interrupted_job_makes_only_what_is_missing_and_the_same_results(
     session: Path, settings: Settings, count: int
 ) -> None:
-    # Pairs: the reference, and each step of each camera. All cameras together: the shape, and each camera's block of
-    # steps. Charts: a depth map and a chart of each camera, the surface, and each step of each camera.
+    # A depth map and a chart of each camera, or one chart of the pair, the surface, and each step of each camera.
     interrupted, resumed, whole = Counted(stop_after=2), Counted(), Counted()
     with pytest.raises(KeyboardInterrupt):
         process_session(session, settings, executor=interrupted)
@@ -96,21 +88,6 @@ def test_an_interrupted_job_makes_only_what_is_missing_and_the_same_results(
     assert again.made == []
 
 
-def test_what_the_reference_does_not_share_is_left_out(session: Path) -> None:
-    process_session(session, SETTINGS, executor=LocalExecutor(1))
-    for job in jobs(session):
-        _, at_reference = job.at_reference()
-        shared = at_reference.status == Status.GOOD
-        assert 0.9 < shared.mean() < 1.0
-        for k in range(1, STEPS):
-            found = job.step(k, at_reference)
-            np.testing.assert_array_equal(found.status[~shared], at_reference.status[~shared])
-            known = np.isfinite(found.px).all(axis=2)
-            assert not known[:, ~shared].any()
-            np.testing.assert_array_equal(known.all(axis=0), found.status == Status.GOOD)
-            assert (found.status[shared] == Status.GOOD).mean() > 0.95
-
-
 def test_a_camera_without_an_image_at_a_step_loses_that_step_alone(session: Path) -> None:
     last = open_session(session).of_kind("specimen")[-1]
     record = last.images["cam_02"].with_name("capture.json")
@@ -119,9 +96,9 @@ def test_a_camera_without_an_image_at_a_step_loses_that_step_alone(session: Path
     record.write_text(json.dumps(told), encoding="utf-8")
     results = read_results(process_session(session, SETTINGS) / "results.h5")
     assert (results.status[:2] == 0).mean() > 0.95
-    assert (results.status[2] == Status.NOT_REACHED).all()
-    (job,) = jobs(session)
-    assert [task is None for task in job.camera_jobs[1].steps] == [False, True]
+    assert (results.status[2] != Status.GOOD).all()
+    assert (results.status[2] == Status.NOT_REACHED).mean() > 0.95
+    assert [task is None for task in job_of(session).steps[1]] == [False, True]
 
 
 def test_threads_side_by_side_make_the_same(session: Path) -> None:
@@ -149,7 +126,7 @@ def _mask(session: Path) -> None:
     assert cv2.imwrite(str(session / "mask" / f"{first}.png"), mask)
 
 
-@pytest.mark.parametrize(("change", "count"), [(_image, 1), (_mask, 1 + 2 * (STEPS - 1))])
+@pytest.mark.parametrize(("change", "count"), [(_image, 1), (_mask, 5 + LATER)])
 def test_another_image_or_mask_is_matched_anew(session: Path, change: Callable[[Path], None], count: int) -> None:
     before = keys(session)
     change(session)
@@ -161,11 +138,9 @@ def test_another_image_or_mask_is_matched_anew(session: Path, change: Callable[[
     [
         ("correlation.radius_px=13", True),
         ("correlation.tolerance=1e-4", True),
-        ("surface.reach_mm=15", True),
         ("strain.window_mm=5", False),
         ("surface.merge=none", False),
         ("surface.sigma_max_px=0.1", False),
-        ("tracking.two_pass=false", False),
     ],
 )
 def test_settings_that_matches_rest_on_make_them_anew(session: Path, setting: str, anew: bool) -> None:
@@ -173,8 +148,14 @@ def test_settings_that_matches_rest_on_make_them_anew(session: Path, setting: st
     assert (set(keys(session)).isdisjoint(keys(session, load_settings(None, told)))) is anew
 
 
+def test_how_the_charts_are_joined_leaves_their_matches(session: Path) -> None:
+    before, after = job_of(session), job_of(session, load_settings(None, [*SMALL, "surface.merge=none"]))
+    assert [task.key for task in before.charts] == [task.key for task in after.charts]
+    assert before.surface.key != after.surface.key
+
+
 def test_another_calibration_makes_all_anew(session: Path) -> None:
-    camera = jobs(session)[0].cameras[1]
+    camera = job_of(session).views.cameras[1]
     P = camera.P.copy()
     P[0, 3] += 1e-9
     moved = Camera(camera.id, P, camera.size, camera.intrinsics)
@@ -184,7 +165,5 @@ def test_another_calibration_makes_all_anew(session: Path) -> None:
 def test_no_image_is_decoded_twice(session: Path) -> None:
     before = process_memory.computations
     process_session(session, SETTINGS, executor=LocalExecutor(2))
-    images, references, later = 2 * STEPS, 2, 2 * (STEPS - 1)
-    assert (
-        process_memory.computations - before == images + references + later
-    )  # the last: what each camera showed, asked for by its pairs
+    images, references = 2 * STEPS, 2
+    assert process_memory.computations - before == images + references

@@ -1,0 +1,270 @@
+"""Figures that tell why a camera's reference image does not match that of its nearest partner.
+
+Features are matched between the whole images with no use of the calibration, and compared with it: how far off the
+epipolar lines they lie, at which depths, and how many of them inside the mask. A blur of standard deviation σ px leaves
+the share ``exp(-σ² ω²)`` of the pattern's power at ω radians a px: σ follows from the ratio of two cameras' spectra.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from ringdic.arrays import Floats, Image, Mask, Pixels
+from ringdic.charts.contrast import contrast
+from ringdic.charts.depth_map import DepthImages, DepthMap, lattice_places
+from ringdic.charts.patches import depths
+from ringdic.charts.plane_sweep import DepthRange
+from ringdic.correlation import prepare_reference
+from ringdic.correlation.features import matched_features
+from ringdic.geometry.camera import Camera
+from ringdic.geometry.triangulation import triangulate
+
+_LEAST_SHARE = 0.05  # of the textured places have a depth: with fewer, it is asked why
+_FEWEST = 15  # matched features from which their epipolar offset and their depths are known
+_WINDOW = 3.0  # px, of the epipolar offsets that agree with one another
+_OVER_CHANCE = 3.0  # number of matches in it, in units of those in a window at random
+_OFF_LINE = 1.0  # px of the reduced images, largest epipolar offset of a match that is used
+_BLUR = 1.5  # px, that stands out
+_FAINT = 0.35  # of the partner's contrast, or of that outside the mask
+_STRONGEST = 75.0  # percentile of the contrast over an image, of the places at which patterns are compared
+_SIDE = 64  # px, of the squares whose spectra are taken
+_SQUARES = 64  # of an image
+_RINGS = np.arange(1, _SIDE // 2)  # frequencies, periods a square
+_OVER_NOISE = 3.0  # power of the pattern, in units of the noise's, at a frequency that counts
+_FEWEST_RINGS = 3
+
+
+@dataclass(frozen=True)
+class MatchEvidence:
+    """Figures of camera number ``camera`` and its nearest partner; NaN where unknown.
+
+    textured, depths : numbers of textured places, inside the mask, and of those with a depth. masked : 1 with a mask.
+    contrast, partner_contrast : of the pattern, grey levels a px; mask_contrast : inside the mask. blur : px, standard
+    deviation by which its image is more blurred than the partner's, negative where less. matches : number of features
+    matched, of which in_mask lie inside the mask and in_range at a depth that is searched. offset : px, their median
+    distance from the epipolar lines; limit : px, that is allowed. near, far : mm, 5th and 95th percentile of their
+    depths; low, high : mm, range of depths searched.
+    """
+
+    camera: float
+    partner: float
+    textured: float
+    depths: float
+    masked: float
+    contrast: float
+    partner_contrast: float
+    mask_contrast: float
+    blur: float
+    matches: float
+    in_mask: float
+    in_range: float
+    offset: float
+    limit: float
+    near: float
+    far: float
+    low: float
+    high: float
+
+    def array(self) -> Floats:
+        """The figures as one array, (18,), px, mm and grey levels as in the class, for a task's output."""
+        return np.array([getattr(self, each.name) for each in fields(self)])
+
+    def sentence(self, ids: Mapping[int, str]) -> str:
+        """What stands out, with its number, then the other figures. ids : of the cameras by number."""
+        partner = f"camera {ids[int(self.partner)]}"
+        inside = " inside its mask" if self.masked else ""
+        figures = [f"{self.textured:.0f} textured places{inside}, {self.depths:.0f} with a depth"]
+        figures.append(f"{self.matches:.0f} features matched in {partner}")
+        if self.matches >= _FEWEST:
+            figures.append(f"epipolar offset {abs(self.offset):.1f} px")
+            figures.append(f"depths {self.near:.0f} to {self.far:.0f} mm")
+        if np.isfinite(self.blur):
+            figures.append(f"blur {self.blur:+.1f} px against it")
+        return f"camera {ids[int(self.camera)]} does not match: {self._verdict(partner)} ({', '.join(figures)})"
+
+    def _verdict(self, partner: str) -> str:
+        """The figure that stands against a match, and what to check."""
+        known = self.matches >= _FEWEST
+        if not self.masked and not self.textured:
+            return f"the strongest contrast of its image is {self.contrast:.1f} grey levels a px; speckle the specimen"
+        if self.masked and known and self.in_mask < 0.1 * self.matches:
+            return f"its mask holds {self.in_mask:.0f} of the {self.matches:.0f} features; draw it on the specimen"
+        if self.masked and self.mask_contrast < _FAINT * self.contrast:
+            return (
+                f"the contrast inside its mask is {self.mask_contrast:.1f} grey levels a px, elsewhere "
+                f"{self.contrast:.1f}; draw the mask on the specimen"
+            )
+        if known and abs(self.offset) > self.limit:
+            return (
+                f"its matches lie {abs(self.offset):.1f} px off the epipolar lines, {self.limit:.0f} px are allowed; "
+                "one of the two moved since the calibration: calibrate again"
+            )
+        if known and self.in_range < 0.5 * self.matches:
+            return (
+                f"its matches lie at depths of {self.near:.0f} to {self.far:.0f} mm, {self.low:.0f} to "
+                f"{self.high:.0f} mm are searched; place the specimen where the cameras' axes meet"
+            )
+        if abs(self.blur) > _BLUR:
+            which, than = ("its image", partner) if self.blur > 0 else (f"the image of {partner}", "its own")
+            return f"{which} is blurred by {abs(self.blur):.1f} px against {than}; focus it"
+        if self.contrast < _FAINT * self.partner_contrast:
+            return (
+                f"the contrast of its image is {self.contrast:.1f} grey levels a px, that of {partner} "
+                f"{self.partner_contrast:.1f}; check where it looks, and the light"
+            )
+        return f"{self.matches:.0f} features of its image are found in that of {partner}; check where both look"
+
+
+def match_evidence(
+    images: DepthImages, depth_map: DepthMap, k: int, partner: int, space: DepthRange, mask: Mask | None
+) -> MatchEvidence | None:
+    """Find out why a camera's depth map is all but empty; None where it is not.
+
+    Parameters
+    ----------
+    images : of all cameras.
+    depth_map : of the camera.
+    k, partner : indices of the camera and of its nearest partner.
+    space : where the surface is searched.
+    mask : (height, width) bool, of the full image, drawn for the camera; None without.
+    """
+    places, known = len(depth_map.textured), len(depth_map.patches.px)
+    if known > max(_FEWEST, _LEAST_SHARE * places):
+        return None
+    cameras, factor = (images.cameras[k], images.cameras[partner]), images.factor
+    pictures = (images.current(k).image, images.current(partner).image)
+    height, width = pictures[0].shape
+    within = np.ones((height, width), bool)
+    if mask is not None:
+        within = mask[factor // 2 :: factor, factor // 2 :: factor][:height, :width]
+    patterns = [_Pattern.of(picture, images.settings.radius) for picture in pictures]
+    first, second, offset = _agreeing_features(images, cameras, pictures)
+    xyz = triangulate(list(cameras), np.stack([first, second])) if len(first) else np.zeros((0, 3))
+    depth = depths(cameras[0], xyz)
+    near, far = np.percentile(depth, [5.0, 95.0]) if len(depth) else (np.nan, np.nan)
+    low, high = space.limits(cameras[0])
+    column, row = np.rint(first).astype(int).T
+    return MatchEvidence(
+        k, partner, places, known, float(mask is not None), patterns[0].contrast, patterns[1].contrast,
+        patterns[0].contrast_inside(within), factor * patterns[0].blur_against(patterns[1]), len(first),
+        int(within[row, column].sum()), int((space.holds(cameras[0], xyz) & space.holds(cameras[1], xyz)).sum()),
+        factor * offset, factor * _OFF_LINE, float(near), float(far), low, high,
+    )  # fmt: skip
+
+
+def why_unmatched(cameras: Sequence[Camera], maps: Sequence[DepthMap], evidence: Sequence[Floats]) -> list[str]:
+    """A sentence for each camera with hardly a depth, which says why; an empty one for the others.
+
+    cameras : the C cameras. maps : their depth maps. evidence : the arrays (18,) of their `MatchEvidence`, px, mm and
+    grey levels, or (0,) without.
+    """
+    ids = {k: camera.id for k, camera in enumerate(cameras)}
+    sentences = []
+    for camera, depth_map, figures in zip(cameras, maps, evidence, strict=True):
+        if len(figures):
+            sentences.append(MatchEvidence(*figures.tolist()).sentence(ids))
+        elif not len(depth_map.patches.px):
+            sentences.append(f"camera {camera.id} does not match: no other camera's view is similar enough")
+        else:
+            sentences.append("")
+    return sentences
+
+
+@dataclass(frozen=True)
+class _Pattern:
+    """The pattern in an image: contrast about n places of a lattice, and the spectrum about the strongest of them.
+
+    places : (n, 2) px. level : (n,) grey levels a px. power : by ring of frequencies, without that of the noise, NaN
+    where this exceeds a third of it.
+    """
+
+    places: Pixels
+    level: Floats
+    power: Floats
+
+    @classmethod
+    def of(cls, image: Image, radius: int) -> _Pattern:
+        """The pattern of an image. radius : px, of the subsets."""
+        places = lattice_places((image.shape[1], image.shape[0]), radius, radius + 2, None)
+        level = contrast(image, places, radius)
+        return cls(places, level, _power(image, places[level >= np.percentile(level, _STRONGEST)]))
+
+    @property
+    def contrast(self) -> float:
+        """Of the textured places: grey levels a px."""
+        return float(np.percentile(self.level, 90.0))
+
+    def contrast_inside(self, mask: Mask) -> float:
+        """Median contrast of the places inside a mask (height, width), grey levels a px; 0 without any."""
+        column, row = self.places.astype(int).T
+        inside = self.level[mask[row, column]]
+        return float(np.median(inside)) if len(inside) else 0.0
+
+    def blur_against(self, other: _Pattern) -> float:
+        """Standard deviation of the blur, px, that this pattern has more than another; negative where less.
+
+        NaN where the noise leaves too few frequencies of either.
+        """
+        ratio = np.log(self.power / other.power)
+        unknown = np.flatnonzero(np.isnan(ratio[1:]))  # the first ring has the shading too
+        end = 1 + (int(unknown[0]) if len(unknown) else len(ratio) - 1)
+        if end - 1 < _FEWEST_RINGS:
+            return np.nan
+        square = -float(np.polyfit((2.0 * np.pi * _RINGS[1:end] / _SIDE) ** 2, ratio[1:end], 1)[0])
+        return math.copysign(math.sqrt(abs(square)), square)
+
+
+def _power(image: Image, px: Pixels) -> Floats:
+    """Power of an image about places (n, 2) px by ring of frequencies, without that of the noise."""
+    half, (height, width) = _SIDE // 2, image.shape
+    px = px[((px >= half) & (px < (width - half, height - half))).all(axis=1)].astype(int)
+    if not len(px):
+        return np.full(len(_RINGS), np.nan)
+    chosen = px[np.linspace(0, len(px) - 1, min(_SQUARES, len(px))).astype(int)]
+    squares = np.stack([image[y - half : y + half, x - half : x + half] for x, y in chosen]).astype(float)
+    squares -= squares.mean(axis=(1, 2), keepdims=True)
+    window = np.hanning(_SIDE)
+    power = np.mean(np.abs(np.fft.fft2(squares * window * window[:, None])) ** 2, axis=0)
+    frequency = np.abs(np.fft.fftfreq(_SIDE, 1.0 / _SIDE))
+    ring = np.rint(np.hypot(frequency, frequency[:, None])).astype(int).ravel()
+    mean = np.bincount(ring, power.ravel())[_RINGS] / np.bincount(ring)[_RINGS]
+    noise = float(mean[-_FEWEST_RINGS:].mean())
+    return np.where(mean > (1.0 + _OVER_NOISE) * noise, mean - noise, np.nan)
+
+
+def _agreeing_features(
+    images: DepthImages, cameras: tuple[Camera, Camera], pictures: tuple[Image, Image]
+) -> tuple[Pixels, Pixels, float]:
+    """Features (n, 2) px of both images that lie equally far from their epipolar lines, and this distance, px."""
+    reference = prepare_reference(pictures[0], np.ones(pictures[0].shape, bool), images.settings)
+    first, second = matched_features(reference, images.current(images.cameras.index(cameras[1])))
+    nothing = np.zeros((0, 2)), np.zeros((0, 2)), np.nan
+    if len(first) < _FEWEST:
+        return nothing
+    offset = _epipolar_offsets(cameras, first, second)
+    ordered = np.sort(offset[np.isfinite(offset)])
+    count = np.searchsorted(ordered, ordered + _WINDOW) - np.arange(len(ordered))
+    by_chance = len(first) * _WINDOW / (0.5 * pictures[1].shape[0])
+    if count.max(initial=0) < max(_FEWEST, _OVER_CHANCE * by_chance):
+        return nothing
+    start = int(np.argmax(count))
+    middle = float(np.median(ordered[start : start + count[start]]))
+    agree = np.abs(offset - middle) < _WINDOW / 2
+    return first[agree], second[agree], middle
+
+
+def _epipolar_offsets(cameras: tuple[Camera, Camera], first: Pixels, second: Pixels) -> Floats:
+    """Distances (n,) px of pixels (n, 2) of the second camera from the epipolar lines of those of the first."""
+    xyz = triangulate(list(cameras), np.stack([first, second]))
+    rays = cameras[0].ray(first)
+    along = np.sum((xyz - cameras[0].centre) * rays, axis=1, keepdims=True)
+    at = cameras[1].project(cameras[0].centre + along * rays)
+    direction = cameras[1].project(cameras[0].centre + 1.001 * along * rays) - at
+    with np.errstate(invalid="ignore", divide="ignore"):
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    miss = second - at
+    return np.asarray(direction[:, 0] * miss[:, 1] - direction[:, 1] * miss[:, 0])

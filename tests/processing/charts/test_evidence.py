@@ -1,0 +1,115 @@
+"""Why two cameras do not match, told from rendered scenes in which one thing is wrong."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from ringdic.charts.depth_map import DepthImages, measure_depths
+from ringdic.charts.evidence import MatchEvidence, match_evidence
+from ringdic.charts.plane_sweep import DepthRange
+from ringdic.correlation import CorrelationSettings
+from ringdic.geometry.camera import Camera, Intrinsics
+from ringdic_node.virtual_rig.render import render
+from ringdic_node.virtual_rig.rig import paper_rig
+from ringdic_node.virtual_rig.scenes.specimen import Limb, Specimen
+
+SCALE = 0.2
+SETTINGS = CorrelationSettings(radius=10, step=5)
+VIRTUAL = paper_rig(12, SCALE).cameras[:2]
+IDS = {0: "1", 1: "2"}
+
+
+def calibrated(camera) -> Camera:
+    """A virtual camera as a perfect calibration has it."""
+    lens = Intrinsics(camera.K, np.array(camera.distortion), (camera.width, camera.height))
+    P = lens.K_undistorted @ np.column_stack([camera.R, camera.t])
+    return Camera(camera.id, P / P[2, 3], lens.size, lens)
+
+
+CAMERAS = [calibrated(camera) for camera in VIRTUAL]
+SPACE = DepthRange.of([calibrated(camera) for camera in paper_rig(12, SCALE).cameras])
+
+
+@pytest.fixture(scope="module")
+def images() -> list[np.ndarray]:
+    return [render(camera, Specimen(Limb(), 0, seed=4), seed=7 + k) for k, camera in enumerate(VIRTUAL)]
+
+
+def evidence(images, k=0, cameras=CAMERAS, space=SPACE, mask=None) -> MatchEvidence | None:
+    reduced = DepthImages.of(cameras, lambda c: images[c], SETTINGS)
+    depth_map = measure_depths(reduced, k, (1 - k,), space, mask)
+    return match_evidence(reduced, depth_map, k, 1 - k, space, mask)
+
+
+def noisy(image: np.ndarray, seed: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(0.0, 1.5, image.shape)
+    return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)
+
+
+def test_cameras_that_match_need_no_evidence(images) -> None:
+    assert evidence(images) is None
+
+
+def test_a_blurred_image_is_told_by_its_blur(images, figures) -> None:
+    blurred = noisy(cv2.GaussianBlur(images[0].astype(float), (0, 0), 6.0), 3)
+    found = evidence([blurred, images[1]])
+    figures("blur of 6 px of one camera of two, found", f"{found.blur:.2f} px", "6 ± 1.2")
+    assert found.blur == pytest.approx(6.0, abs=1.2)
+    assert f"its image is blurred by {found.blur:.1f} px against camera 2; focus it" in found.sentence(IDS)
+    other = evidence([blurred, images[1]], k=1)
+    assert other.blur == pytest.approx(-found.blur, abs=0.5)
+    assert f"the image of camera 1 is blurred by {abs(other.blur):.1f} px" in other.sentence(IDS)
+
+
+def test_a_camera_that_moved_is_told_by_its_epipolar_offset(images, figures) -> None:
+    """Its image is 6 px above where the calibration has it; epipolar lines of a ring lie nearly level."""
+    moved = np.roll(images[1], 6, axis=0)
+    found = evidence([images[0], moved])
+    figures("epipolar offset of an image 6 px off, found", f"{abs(found.offset):.2f} px", "6 ± 0.5")
+    assert abs(found.offset) == pytest.approx(6.0, abs=0.5)
+    assert f"lie {abs(found.offset):.1f} px off the epipolar lines, 1 px are allowed" in found.sentence(IDS)
+    assert abs(found.blur) < 0.5
+
+
+def test_a_mask_on_the_background_is_told_by_what_it_holds(images) -> None:
+    mask = np.zeros(images[0].shape, bool)
+    mask[:, : images[0].shape[1] // 5] = True
+    found = evidence(images, mask=mask)
+    assert found.matches > 100
+    assert found.in_mask == 0
+    assert f"its mask holds 0 of the {found.matches:.0f} features; draw it on the specimen" in found.sentence(IDS)
+
+
+def test_a_body_outside_the_range_of_depths_is_told_by_its_depth(images, figures) -> None:
+    """The limb has a radius of about 45 mm about the point where the axes meet."""
+    middle = float(np.linalg.norm(CAMERAS[0].centre - SPACE.centre))
+    nearer = replace(SPACE, centre=CAMERAS[0].centre + 0.4 * (SPACE.centre - CAMERAS[0].centre), reach=0.3)
+    found = evidence(images, space=nearer)
+    figures("depth of a body outside the range searched", f"{found.near:.0f} to {found.far:.0f} mm", "truth about it")
+    assert middle - 70.0 < found.near < found.far < middle
+    assert found.in_range == 0
+    assert f"lie at depths of {found.near:.0f} to {found.far:.0f} mm" in found.sentence(IDS)
+
+
+def test_a_camera_that_looks_at_a_bare_wall_is_told_by_its_contrast(images) -> None:
+    wall = noisy(np.tile(np.linspace(60.0, 140.0, images[0].shape[1]), (images[0].shape[0], 1)), 5)
+    found = evidence([wall, images[1]])
+    assert found.matches == 0
+    assert found.contrast < 0.3 * found.partner_contrast
+    assert f"the contrast of its image is {found.contrast:.1f} grey levels a px" in found.sentence(IDS)
+
+
+def test_a_camera_that_looks_at_something_else_is_told_by_its_matches(images) -> None:
+    elsewhere = render(VIRTUAL[0], Specimen(Limb(), 0, seed=99), seed=3)
+    found = evidence([elsewhere, images[1]])
+    assert found.matches == 0
+    assert abs(found.blur) < 1.0
+    assert "0 features of its image are found in that of camera 2" in found.sentence(IDS)
+
+
+def test_the_figures_survive_a_task_s_output(images) -> None:
+    wall = np.full_like(images[0], 90)
+    found = evidence([wall, images[1]])
+    again = MatchEvidence(*found.array().tolist())
+    assert again.sentence(IDS) == found.sentence(IDS)
