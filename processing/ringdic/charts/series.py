@@ -27,7 +27,7 @@ from ringdic.geometry.outliers import LostPoint, surface_outliers
 from ringdic.geometry.triangulation import reprojection_residuals
 from ringdic.mesh.mesh import Mesh
 from ringdic.results.results import Matches, Results
-from ringdic.results.series import StepCache, median_deviations
+from ringdic.results.series import StepCache
 from ringdic.results.unmeasured import UnmeasuredPlaces
 from ringdic.results.writer import map_in_order
 from ringdic.settings import Settings
@@ -299,14 +299,6 @@ class SurfaceSeries:
             self.reference, sigma_xyz=sigma[None], sigma_displacement=np.zeros((1, n, 3)),
             sigma_lambda=np.zeros((1, m, 2)),
         )  # fmt: skip
-
-    @property
-    def noise(self) -> list[Floats]:
-        """For each of the matches, (F, 1) px: medians of the standard deviations at each step."""
-        rows = [np.full((len(self.names), 1), np.nan) for _ in self.reference.matches]
-        for row, one in zip(rows, self.reference.matches, strict=True):
-            row[0] = median_deviations(one.sigma[0], one.status[0])
-        return rows
 
     def without_matches(self) -> SurfaceSeries:
         """The series without the matches in the images."""

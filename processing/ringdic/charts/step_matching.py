@@ -40,7 +40,6 @@ _MARGIN = 32.0  # px about the subsets in which a current image is filtered
 _START_ZNCC = 0.6  # least ZNCC under the warp by optical flow that makes it a start value
 _SOME = 0.2  # least share of the knots with start values from which the others can be reached
 _FEWEST = 8  # start values from which an affine fit extrapolates where all points lie
-_ENOUGH = 0.5  # least share of valid start values; with fewer, the images are searched for others
 _BENT = 2.0  # standard deviations by which curvature moves a subset, from which on it matters at the rim
 _CURVED = 20.0  # Σ(c/σ)² of second derivatives below which they may be noise, of 6 numbers of overlapping subsets
 
@@ -79,11 +78,9 @@ def match_tracked_points(
     reference: Reference,
     current: Current,
     points: TrackedPoints,
-    start: Floats | None,
     settings: CorrelationSettings,
     *,
-    two_pass: bool = True,
-    search: bool = True,
+    curved: bool = True,
 ) -> ImageMatches:
     """Match points of the reference image in the current image.
 
@@ -91,17 +88,12 @@ def match_tracked_points(
     ----------
     reference, current : the two images, filtered.
     points : n points of the reference image.
-    start : (n, 12) float64, warps at the points in px and its powers, NaN rows where unknown; None: start values are
-        sought in the images.
-    settings : of the correlation; order 2 with ``two_pass`` False leaves the second derivatives to each subset.
-    two_pass : whether second derivatives of the neighbours' displacement are held fixed in a second, first-order pass.
-    search : whether start values are sought in the images where too few of those given are valid.
+    settings : of the correlation; order 2 with ``curved`` False leaves the second derivatives to each subset.
+    curved : whether second derivatives of the neighbours' displacement are held fixed in a second, first-order pass.
     """
-    pixel_start = None if start is None else shift_warps(start, points.shift)
-    if not two_pass:
-        matches = _match_pixels(reference, current, points.pixels, pixel_start, settings, search)
-        return _reject_outliers(matches, points)
-    first, part = _at_knots(reference, current, points, pixel_start, _of_knots(settings))
+    if not curved:
+        return _reject_outliers(correlate_points(reference, current, points.pixels, settings), points)
+    first, part = _at_knots(reference, current, points, _of_knots(settings))
     if not first.good.any():
         return _lost(points, first.status[points.knots.of_points])
     warp = _predicted_warps(first, points, settings.radius)
@@ -142,17 +134,14 @@ def _of_knots(settings: CorrelationSettings) -> CorrelationSettings:
 
 
 def _at_knots(
-    reference: Reference, current: Current, points: TrackedPoints, start: Floats | None, settings: CorrelationSettings
+    reference: Reference, current: Current, points: TrackedPoints, settings: CorrelationSettings
 ) -> tuple[PointMatches, Current]:
-    """Match the knots from start values or from optical flow, and those that these do not reach from their neighbours.
+    """Match the knots from optical flow, and those that it does not reach from their neighbours.
 
-    start : (n, 12), of all points. Returns the matches, and the part of the current image where all points will lie.
+    Returns the matches, and the part of the current image where all points will lie.
     """
     xy = points.knots.neighbourhoods.xy
-    if start is None:
-        at_knots = as_start_values(flow_start_values(reference, current, xy, settings.radius))[:, :6]
-    else:
-        at_knots = start[points.knots.index, :6]
+    at_knots = as_start_values(flow_start_values(reference, current, xy, settings.radius))[:, :6]
     known = np.flatnonzero(np.isfinite(at_knots).all(axis=1))
     _, zncc, _ = search_warps(reference, current, xy[known], at_knots[known, None], settings.radius)
     at_knots[known[~(zncc > _START_ZNCC)]] = np.nan
@@ -190,27 +179,6 @@ def _about(positions: Pixels, radius: int, part: Current, whole: Current) -> Cur
         if (low >= (x0, y0)).all() and (np.minimum(high, last) <= (x1, y1)).all():
             return part
     return whole.crop_around(known, 2.0 * radius + _MARGIN)
-
-
-def _match_pixels(
-    reference: Reference,
-    current: Current,
-    pixels: Pixels,
-    start: Floats | None,
-    settings: CorrelationSettings,
-    search: bool,
-) -> PointMatches:
-    """Match pixels (n, 2) px in one pass, from start values (n, 12) or, where too few of these hold, by a search."""
-    known: Mask = np.zeros(len(pixels), bool)
-    if start is not None:
-        known = np.asarray(np.isfinite(start).all(axis=1))
-    if start is None or not known.any():
-        return correlate_points(reference, current, pixels, settings)
-    matches = correlate_points(reference, current, pixels, settings, start=start)
-    if not search or matches.good[known].mean() >= _ENOUGH:
-        return matches
-    searched = correlate_points(reference, current, pixels, settings)
-    return searched if searched.good.sum() > matches.good.sum() else matches
 
 
 def _warp(matches: PointMatches) -> Floats:

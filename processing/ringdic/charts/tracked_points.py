@@ -16,7 +16,6 @@ from scipy.spatial import cKDTree
 from ringdic.arrays import Floats, Indices, Mask, Pixels
 from ringdic.correlation import CorrelationSettings, Reference
 from ringdic.correlation.quadratic import LowerQuartiles, Neighbourhoods, QuadraticFit
-from ringdic.correlation.seeds import even_sample
 
 #: Side of the squares with one knot each, in subset radii.
 APART = 1.5
@@ -42,15 +41,11 @@ class Knots:
     neighbourhoods: Neighbourhoods
 
     @classmethod
-    def of(cls, pixels: Pixels, side: float | None, window: float) -> Knots:
+    def of(cls, pixels: Pixels, side: float, window: float) -> Knots:
         """Choose the knots of points.
 
-        pixels : (n, 2) px. side : px, of squares with one knot each; None to make every point one. window : px, radius
-        of the neighbourhoods.
+        pixels : (n, 2) px. side : px, of squares with one knot each. window : px, radius of the neighbourhoods.
         """
-        if side is None:
-            everyone = np.arange(len(pixels))
-            return cls(everyone, everyone, Neighbourhoods(pixels, window))
         index = thin_to_grid(pixels, side)
         _, nearest = cKDTree(pixels[index]).query(pixels)
         return cls(index, np.asarray(nearest, np.int64), Neighbourhoods(pixels[index], window))
@@ -83,16 +78,14 @@ class TrackedPoints:
 
     positions : (n, 2) float64, px. pixels : (n, 2) float64, px, the whole pixels next to them, on which their
     subsets lie. variance : (n,), of the grey levels there, grey levels². least : mean square difference due
-    to rounding to whole grey levels, grey levels². seeds : (s,) int, some points spread evenly. knots : matched before
-    all other points. fine_knots : closer together, with smaller neighbourhoods. quartile : of the knots about each
-    point.
+    to rounding to whole grey levels, grey levels². knots : matched before all other points. fine_knots : closer
+    together, with smaller neighbourhoods. quartile : of the knots about each point.
     """
 
     positions: Pixels
     pixels: Pixels
     variance: Floats
     least: float
-    seeds: Indices
     knots: Knots
     fine_knots: Knots
     quartile: LowerQuartiles
@@ -133,26 +126,18 @@ class TrackedPoints:
         return _UNLIKE * np.fmax(self.quartile(mean_square[self.knots.index]), np.median(mean_square[known]))
 
 
-def tracked_points(
-    reference: Reference,
-    positions: Pixels,
-    settings: CorrelationSettings,
-    window: float | None = None,
-    *,
-    thin: bool = True,
-) -> TrackedPoints:
+def tracked_points(reference: Reference, positions: Pixels, settings: CorrelationSettings) -> TrackedPoints:
     """Prepare points of a reference image for tracking.
 
-    positions : (n, 2) float64, px. window : px, radius of the neighbourhoods; None: 3 subset radii. thin : whether only
-    one point in each square is a knot; otherwise every point is one.
+    positions : (n, 2) float64, px.
     """
     pixels, radius = np.rint(positions), settings.radius
-    knots = Knots.of(pixels, APART * radius if thin else None, window or _REACH * radius)
+    knots = Knots.of(pixels, APART * radius, _REACH * radius)
     fine_knots = Knots.of(pixels, _FINE[0] * radius, _FINE[1] * radius)
     quartile = LowerQuartiles(pixels, knots.neighbourhoods.xy, knots.neighbourhoods.window)
     least = (reference.grey_range / 255.0) ** 2
     variance = _variance(reference, pixels, radius)
-    return TrackedPoints(positions, pixels, variance, least, even_sample(positions), knots, fine_knots, quartile)
+    return TrackedPoints(positions, pixels, variance, least, knots, fine_knots, quartile)
 
 
 def thin_to_grid(xy: Pixels, side: float) -> Indices:

@@ -102,7 +102,7 @@ def match_in_two_passes(
     pass as the settings say.
     """
     current = prepare_current(image, settings=settings)
-    matches = match_tracked_points(reference, current, points, None, settings, two_pass=curved)
+    matches = match_tracked_points(reference, current, points, settings, curved=curved)
     return CameraMatches(
         points.pixels.astype(np.int32),
         settings.step,

@@ -7,7 +7,7 @@ matches them. The room knows images, masks and points only: no camera, no calibr
 ``prepared``       reference and current images with their gradients and B-spline coefficients
 ``seeds``          start values between images of one camera; ``features`` between cameras
 ``hypotheses``     the best of many given affine warps at each point, for start values that come from geometry
-``start_field``    start values of all points from matches on a lattice, by ``lattice_field``
+``lattice_field``  values between matches on a lattice
 ``propagation``    reliability-guided propagation from matched points to their neighbours
 ``neighbours``     neighbours of points, and outliers and extrapolations judged from them
 ``quadratic``      least-squares quadratics of any field over the neighbours of each point

@@ -134,9 +134,9 @@ def _deform(
     path : of the results file. began : start of the run on the monotonic clock, seconds.
     """
     series = matches.series
-    uncertainty = StepUncertainty(series.reference, camera_covariance(matches.rig.bundle), series.noise)
+    uncertainty = StepUncertainty(series.reference, camera_covariance(matches.rig.bundle))
     written = [k for k, step in enumerate(steps) if step.kind != "static"]
-    reference = uncertainty.complete(series.reference, 0)
+    reference = uncertainty.complete(series.reference)
     at_rest = [replace(series.reference, matches=())]
     figures: list[summary.StepFigures] = []
     with ResultsWriter(path, reference, [series.names[k] for k in written]) as file:
@@ -147,7 +147,7 @@ def _deform(
                 return replace(results, matches=())
             last = len(results.steps) - 1
             motion, deformation = results.motion(last), results.deformation(last)
-            results = uncertainty.complete(results, k, deformation) if k else reference
+            results = uncertainty.complete(results, deformation) if k else reference
             return file.record(results, motion, deformation), summary.step_figures(results, motion, deformation)
 
         for k, one in enumerate(map_in_order(compute, range(len(steps)))):

@@ -45,7 +45,7 @@ def run_small_plate() -> None:
         series = SurfaceSeries(
             "plate", cameras, pairs, ("0", "1"), ("0", "1"), surface, lambda k, _: _matches(cameras[k]), settings, cache
         )
-        StepUncertainty(series.reference, None, series.noise).complete(series.at(1), 1)
+        StepUncertainty(series.reference, None).complete(series.at(1))
         write_series(Path(folder) / "results.h5", series, lambda _: None, {}, {})
         cache.close()
 

@@ -17,7 +17,6 @@ from weakref import finalize
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats
 from ringdic.results.fields import OPTIONAL_ARRAYS
 from ringdic.results.results import MATCH_ARRAYS, Results
 
@@ -33,11 +32,6 @@ class Series(Protocol):
     @property
     def reference(self) -> Results:
         """The results of the reference alone."""
-        ...
-
-    @property
-    def noise(self) -> Sequence[Floats]:
-        """For each of the matches, (F, C) px: medians of the standard deviations at each step in each camera."""
         ...
 
     def at(self, step: int) -> Results:
@@ -65,14 +59,6 @@ class InMemorySeries:
         """The results of the reference alone."""
         return self.at(0)
 
-    @property
-    def noise(self) -> list[Floats]:
-        """For each of the matches, (F, C) px: medians of the standard deviations at each step in each camera."""
-        return [
-            np.array([median_deviations(*step) for step in zip(matches.sigma, matches.status, strict=True)])
-            for matches in self.results.matches
-        ]
-
     def at(self, step: int) -> Results:
         """The results of the reference and of a later step; for step 0 those of the reference alone."""
         return select_steps(self.results, [0, step] if step else [0])
@@ -80,15 +66,6 @@ class InMemorySeries:
     def without_matches(self) -> InMemorySeries:
         """The series without the matches in the images."""
         return InMemorySeries(replace(self.results, matches=()))
-
-
-def median_deviations(sigma: NDArray[Any], status: NDArray[np.int8]) -> Floats:
-    """Median standard deviation of the good matches in each of C cameras.
-
-    sigma : (C, n, 2) px. status : (n,), 0 for a good match. Returns (C,) px, NaN where a camera has no good match.
-    """
-    good = [each[np.isfinite(each)] for each in sigma[:, status == 0]]
-    return np.array([np.median(each) if len(each) else np.nan for each in good], dtype=float)
 
 
 def select_steps(results: Results, steps: Sequence[int]) -> Results:

@@ -8,7 +8,7 @@ import pytest
 from ringdic.results.fields import OPTIONAL_ARRAYS
 from ringdic.results.results import Matches, Results
 from ringdic.results.series import InMemorySeries, StepCache, join_steps, select_steps
-from ringdic.results.uncertainty import StepUncertainty, add_uncertainty
+from ringdic.results.uncertainty import StepUncertainty
 
 F, N = 4, 6
 
@@ -62,9 +62,8 @@ def test_the_steps_of_results_one_by_one_are_the_results() -> None:
 
 def test_what_is_known_of_the_uncertainty_is_left_as_it_is() -> None:
     whole = some_results()
-    same(add_uncertainty(whole, None), whole)
-    uncertainty = StepUncertainty(InMemorySeries(whole).reference, None, InMemorySeries(whole).noise)
-    same(uncertainty.complete(InMemorySeries(whole).at(2), 2), select_steps(whole, [0, 2]))
+    uncertainty = StepUncertainty(InMemorySeries(whole).reference, None)
+    same(uncertainty.complete(InMemorySeries(whole).at(2)), select_steps(whole, [0, 2]))
 
 
 def test_cached_values_come_back_whichever_thread_asks(tmp_path: Path) -> None:
