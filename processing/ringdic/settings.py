@@ -173,6 +173,13 @@ class Settings(_Group):
             )
         return self
 
+    def at_scale(self, scale: float) -> Settings:
+        """The settings for smaller images of the same scene.
+
+        scale : size of the images, 1 where these settings hold.
+        """
+        return self.model_copy(update={"correlation": self.correlation.at_scale(scale)})
+
     def to_toml(self) -> str:
         """Write the settings as the text of a TOML file that `load_settings` reads back."""
         lines = [f"method = {_toml(self.method)}", ""]

@@ -158,7 +158,7 @@ def _dilated(depth_map: DepthMap, chosen: Mask) -> Mask:
 def chart_region(grey: Image, depth_map: DepthMap, inside: Mask, radius: int) -> tuple[Mask, Mask]:
     """Region of a chart in its camera's reference image: the textured pixels about its places.
 
-    Beyond the rim of the depth map it exceeds the chart's places by two steps of the lattice, since matches reach
+    Beyond the rim of the depth map it exceeds the chart's places by a step or two of the lattice, since matches reach
     farther on the fine grid; texture tells where the surface really ends.
 
     grey : (height, width) grey levels. depth_map : of the camera. inside : (n,) places that belong to the chart.

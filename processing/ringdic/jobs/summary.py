@@ -54,9 +54,9 @@ def summarise(
     steps : figures of all steps, the reference first.
     rig : the calibrated cameras.
     errors : reconstruction errors of the control points, by pair.
-    drift : (F,) px by pair or camera, the mean vertical reprojection residual at each step, which shows cameras that
+    drift : (F,) px by camera, the mean vertical reprojection residual at each step, which shows cameras that
         moved between the steps.
-    agreement : figures of how well the surfaces of camera pairs, or the cameras' views of a point, agree.
+    agreement : figures of how well the cameras' views of a point, and the charts where they overlap, agree.
     warnings : sentences for the operator.
     """
     control = {

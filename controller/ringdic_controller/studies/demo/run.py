@@ -109,8 +109,8 @@ def _compare(setting: Setting, session: str, rig: VirtualRig, began: float) -> d
 
 
 def settings_for(scale: float) -> Settings:
-    """The paper's settings for images of another scale; the subsets keep the least size that they need."""
-    return Settings().model_copy(update={"correlation": Settings().correlation.at_scale(scale)})
+    """The default settings for images of another scale; the subsets keep the least size that they need."""
+    return Settings().at_scale(scale)
 
 
 def _new_folder(folder: Path) -> Path:

@@ -83,8 +83,7 @@ def run_gallery(
 
 def gallery_settings(scale: float, overrides: Sequence[str] = ()) -> Settings:
     """The default settings, or others where they are given, with subsets for images of a scale."""
-    settings = load_settings(None, overrides)
-    return settings.model_copy(update={"correlation": settings.correlation.at_scale(scale)})
+    return load_settings(None, overrides).at_scale(scale)
 
 
 @dataclass

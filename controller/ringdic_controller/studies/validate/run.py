@@ -71,4 +71,4 @@ def run_validation(
 
 def scaled(settings: Settings, scale: float) -> Settings:
     """Settings for images of a smaller scale; the subsets keep the least size that they need."""
-    return settings.model_copy(update={"correlation": settings.correlation.at_scale(scale)})
+    return settings.at_scale(scale)
