@@ -230,7 +230,8 @@ def test_derivatives_of_a_patch_are_those_of_differences(true_cameras) -> None:
         x = np.zeros(19)
         x[k] = h
         difference = (centroid(x) - centroid(-x)) / (2 * h)
-        assert np.allclose(exact[:, k], difference, rtol=1e-6, atol=1e-6), k
+        # The derivatives' rule has four nodes, the centroid's sixteen.
+        assert np.linalg.norm(exact[:, k] - difference) < 2e-6 * np.linalg.norm(difference) + 2e-6, k
     assert np.allclose(px[0], centroid(np.zeros(19)), rtol=0, atol=1e-9)
 
 
