@@ -17,6 +17,7 @@ GreyImage = Image | Floats
 _SLOPE = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0], dtype=np.float32) / np.float32(60.0)
 #: Mean square of the slopes of white noise of unit variance.
 SLOPE_GAIN = float(np.sum(_SLOPE.astype(float) ** 2))
+_LARGE = 16  # px, radius of a subset with so many pixels that every fourth of them tells its texture
 
 
 @dataclass(frozen=True)
@@ -88,24 +89,30 @@ class TextureMap:
 def texture_map(image: GreyImage, radius: int, *, stride: int | None = None) -> TextureMap:
     """The texture of an image, over square subsets with the area of round ones.
 
+    Of large subsets every second pixel each way counts, for speckle is wider than that.
+
     image : (h, w) grey levels. radius : of the round subsets, px. stride : distance of the grid points, px; by default
     a fifth of the radius, over which the texture changes little.
     """
-    stride = stride or max(1, radius // 5)
-    size = (2 * round(0.5 * np.sqrt(np.pi) * radius) + 1,) * 2
-    grey = np.asarray(image, dtype=np.float32)
+    thin = 2 if radius >= _LARGE else 1
+    step = max(1, (stride or radius // 5) // thin)
+    size = (2 * round(0.5 * np.sqrt(np.pi) * radius / thin) + 1,) * 2
+    grey = image if image.dtype in (np.uint8, np.uint16) else np.asarray(image, dtype=np.float32)
     unit = np.ones(1, dtype=np.float32)
 
-    def mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
-        return np.asarray(cv2.blur(values, size, borderType=cv2.BORDER_REFLECT_101)[::stride, ::stride])
+    def some(values: NDArray) -> NDArray[np.float32]:
+        return np.ascontiguousarray(values[::thin, ::thin], dtype=np.float32)
 
-    centred = grey - np.float32(grey.mean())
-    out = np.empty((*grey[::stride, ::stride].shape, 5), dtype=np.float32)
-    out[..., 0] = np.sqrt(np.maximum(mean(centred * centred) - mean(centred) ** 2, 0.0))
-    fx, fy = cv2.sepFilter2D(grey, cv2.CV_32F, _SLOPE, unit), cv2.sepFilter2D(grey, cv2.CV_32F, unit, _SLOPE)
-    out[..., 2] = mean(fx * fy)
+    def mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.asarray(cv2.blur(values, size, borderType=cv2.BORDER_REFLECT_101)[::step, ::step])
+
+    level = some(grey)
+    level -= level.mean()
+    fx, fy = (some(cv2.sepFilter2D(grey, cv2.CV_32F, *taps)) for taps in ((_SLOPE, unit), (unit, _SLOPE)))
     xx, yy = fx * fx, fy * fy
-    out[..., 1], out[..., 3] = mean(xx), mean(yy)
     total = xx + yy
+    out = np.empty((*level[::step, ::step].shape, 5), dtype=np.float32)
+    out[..., 0] = np.sqrt(np.maximum(mean(level * level) - mean(level) ** 2, 0.0))
+    out[..., 1], out[..., 2], out[..., 3] = mean(xx), mean(fx * fy), mean(yy)
     out[..., 4] = mean(total * total) / np.maximum(out[..., 1] + out[..., 3], 1e-6) ** 2
-    return TextureMap(out, stride, (grey.shape[0], grey.shape[1]))
+    return TextureMap(out, thin * step, (grey.shape[0], grey.shape[1]))

@@ -80,7 +80,7 @@ def test_the_slopes_of_the_noise_are_taken_off() -> None:
     at = np.array([[150.0, 150.0]])
     noisy = texture_map(image + np.random.default_rng(0).normal(0.0, 3.0, image.shape), radius=130).at(at)
     clean = texture_map(image, radius=130).at(at)
-    np.testing.assert_allclose(noisy.clean_slopes(9.0), clean.clean_slopes(0.0), rtol=0.03)  # 53,000 pixels
+    np.testing.assert_allclose(noisy.clean_slopes(9.0), clean.clean_slopes(0.0), rtol=0.06)  # 13,000 pixels: 0.02
     assert (noisy.clean_slopes(0.0) > 1.5 * clean.clean_slopes(0.0)).all()
 
 
