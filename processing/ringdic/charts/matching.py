@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ringdic.arrays import Floats, Indices, Mask, Pixels, Points
+from ringdic.arrays import Floats, Indices, Mask, Pixels, Points, Vectors
 from ringdic.charts.depth_map import DepthMap
 from ringdic.charts.images import ChartImages
 from ringdic.charts.patches import STENCIL, Patches, depths, stencil_rays, warps_between
@@ -133,7 +133,8 @@ def _squarest(others: Sequence[Camera], stencil: Points, sees: Mask) -> Indices:
 
     others : C cameras. stencil : (n, 9, 3) mm. sees : (C, n) bool.
     """
-    cosine = np.stack([_incidence_cosine(other, stencil, np.zeros((1, 2))) for other in others])
+    tangents = _tangents(stencil, np.zeros((1, 2)))
+    cosine = np.stack([_incidence_cosine(other, tangents) for other in others])
     return np.asarray(np.argmax(np.where(sees & np.isfinite(cosine), cosine, -np.inf), axis=0))
 
 
@@ -149,32 +150,37 @@ def _drop_oblique(
     from a point to the rim of its subset.
     """
     limit, steepest = np.cos(np.radians(incidence_deg)), np.cos(np.radians(incidence_deg + _STEEPER))
-    middle = [_incidence_cosine(camera, stencil, np.zeros((1, 2))) for camera in cameras]
-    around = [_incidence_cosine(camera, stencil, rim * STENCIL[1:5]) for camera in cameras]
+    at_middle, at_rim = _tangents(stencil, np.zeros((1, 2))), _tangents(stencil, rim * STENCIL[1:5])
+    middle = [_incidence_cosine(camera, at_middle) for camera in cameras]
+    around = [_incidence_cosine(camera, at_rim) for camera in cameras[1:]]
     good = out.status[1:] == Status.GOOD
     oblique = np.stack([(middle[0] < limit) | (each < limit) for each in middle[1:]])
-    steep = np.stack([each < steepest for each in around[1:]])
+    steep = np.stack([each < steepest for each in around])
     steep &= (good & ~oblique & ~steep).any(axis=0)
     lost = good & (oblique | steep)
     out.px[1:][lost], out.status[1:][lost] = np.nan, LostPoint.OBLIQUE
 
 
-def _incidence_cosine(camera: Camera, stencil: Points, at: Pixels) -> Floats:
-    """Least cosine (n,) of the incidence at some places of patches, from quadratics through their stencils.
+def _tangents(stencil: Points, at: Pixels) -> tuple[Points, Vectors]:
+    """Points (k, n, 3) mm and normals of unit length (k, n, 3) at places of patches, from quadratics through stencils.
 
     stencil : (n, 9, 3) mm. at : (k, 2), the places, in reaches of the stencil.
     """
     centre, right, left, below, above, br, bl, ar, al = np.moveaxis(stencil, 1, 0)
     along, down = 0.5 * (right - left), 0.5 * (below - above)
     xx, xy, yy = right - 2.0 * centre + left, 0.25 * (br - bl - ar + al), below - 2.0 * centre + above
-    least = np.full(len(centre), np.inf)
-    for s, t in at:
-        xyz = centre + s * along + t * down + 0.5 * s * s * xx + s * t * xy + 0.5 * t * t * yy
-        normals = np.cross(along + s * xx + t * xy, down + s * xy + t * yy)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            normals /= -np.linalg.norm(normals, axis=1, keepdims=True)
-        least = np.minimum(least, camera.incidence_cosine(xyz, normals))
-    return least
+    xyz, normals = np.empty((len(at), *centre.shape)), np.empty((len(at), *centre.shape))
+    for k, (s, t) in enumerate(at):
+        xyz[k] = centre + s * along + t * down + 0.5 * s * s * xx + s * t * xy + 0.5 * t * t * yy
+        normals[k] = np.cross(down + s * xy + t * yy, along + s * xx + t * xy)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normals /= np.sqrt(np.einsum("kni,kni->kn", normals, normals))[..., None]
+    return xyz, normals
+
+
+def _incidence_cosine(camera: Camera, tangents: tuple[Points, Vectors]) -> Floats:
+    """Least cosine (n,) of the incidence at some places of patches. tangents : of `_tangents`."""
+    return np.asarray(camera.incidence_cosine(*tangents).min(axis=0))
 
 
 def drop_masked(matches: ChartMatches, masks: Callable[[int], Mask | None]) -> None:

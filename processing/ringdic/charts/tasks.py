@@ -220,10 +220,19 @@ def _depth_map(arrays: Mapping[str, np.ndarray]) -> DepthMap:
     return DepthMap(int(arrays["spacing"]), patches, sigma, textured, patterned, float(arrays["grey_noise"]))
 
 
+def _stored_depth_map(path: Path) -> DepthMap:
+    """The depth map of a task's output file, cached in memory for all charts that need it."""
+
+    def size(value: DepthMap) -> int:
+        return 12 * value.patches.px.nbytes + value.textured.nbytes
+
+    return process_memory.get(("depth map", str(path)), lambda: _depth_map(read_output(path)), size)
+
+
 def chart_task(files: _ReferenceFiles, planned: _PlannedChart, *, inputs: tuple[Path, ...]) -> Arrays:
     """Match a chart in all cameras that see it. inputs : outputs of the depth maps of all cameras."""
     cameras, k, incidence = files.views.cameras, planned.camera, planned.incidence
-    maps = [_depth_map(read_output(path)) for path in inputs]
+    maps = {c: _stored_depth_map(inputs[c]) for c in (k, *planned.partners)}
     plan = plan_chart(k, cameras, maps, incidence, planned.partners, whole=not planned.curved)
     images = ChartImages(cameras, files.image, files.correlation)
     matches = match_chart(images, k, maps[k], plan, files.mask(k), incidence, curved=planned.curved)

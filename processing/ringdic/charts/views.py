@@ -7,7 +7,7 @@ map shows the same depth, or none; where it shows a smaller depth, something sta
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -44,7 +44,8 @@ class ChartPlan:
 
 
 def plan_chart(
-    k: int, cameras: Sequence[Camera], maps: Sequence[DepthMap], incidence_deg: float, partners: Sequence[int],
+    k: int, cameras: Sequence[Camera], maps: Sequence[DepthMap] | Mapping[int, DepthMap], incidence_deg: float,
+    partners: Sequence[int],
     *, whole: bool = False,
 ) -> ChartPlan:  # fmt: skip
     """Determine the part of the surface that a camera faces most squarely, with a margin round it.
@@ -53,7 +54,7 @@ def plan_chart(
     ----------
     k : index of the camera.
     cameras : the C cameras.
-    maps : their depth maps.
+    maps : their depth maps, or at least those of the camera and of these others, by index.
     incidence_deg : degrees, largest angle of incidence of a view that is used.
     partners : indices of the cameras that it may be matched with.
     whole : whether the chart is all that the camera shares with a partner, instead of what it faces most squarely.
@@ -176,9 +177,11 @@ def chart_region(grey: Image, depth_map: DepthMap, inside: Mask, radius: int) ->
     right, bottom = np.ceil(cells.max(axis=0)).astype(int) + half + reach
     part = grey[top:bottom, left:right]
     mask = np.zeros(part.shape, np.uint8)
-    for x, y in np.rint(cells).astype(int) - (left, top):
-        mask[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1] = 1
-    closed = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((2 * reach + 1,) * 2, np.uint8))) > 0
+    column, row = (np.rint(cells).astype(int) - (left, top)).T
+    mask[row, column] = 1
+    side = 2 * reach + 1
+    grown = cv2.dilate(mask, np.ones((side + 2 * half,) * 2, np.uint8))  # of squares about the cells
+    closed = np.asarray(cv2.erode(grown, np.ones((side, side), np.uint8))) > 0
     textured, close = _textured_pixels(part, float(np.median(contrast(grey, px[inside], radius))), radius)
     pattern = (closed & textured).astype(np.uint8)
     region[top:bottom, left:right] = _eroded(pattern, _EDGE * radius)
@@ -195,9 +198,10 @@ def _cells(depth_map: DepthMap, inside: Mask) -> Pixels:
     """Places (k, 2) px of a chart, and textured places without a depth close to them."""
     spacing = depth_map.spacing
     known, textured = depth_map.patches.px, depth_map.textured
-    taken = {tuple(cell) for cell in np.rint(known / spacing).astype(int).tolist()}
-    free = [tuple(cell) not in taken for cell in np.rint(textured / spacing).astype(int).tolist()]
-    beyond = textured[np.array(free, bool)]
+    cell, other = (np.rint(px / spacing).astype(np.int64) for px in (known, textured))
+    taken = np.zeros(np.maximum(cell.max(axis=0), other.max(axis=0, initial=0)) + 1, bool)
+    taken[tuple(cell.T)] = True
+    beyond = textured[~taken[tuple(other.T)]]
     if not len(beyond):
         return known[inside]
     distance = cKDTree(known[inside]).query(beyond, distance_upper_bound=_RIM * spacing)[0]
@@ -210,9 +214,8 @@ def _textured_pixels(grey: Image, usual: float, radius: int) -> tuple[Mask, Mask
 
     usual : contrast of the surface, grey levels a px. radius : px, of the subsets.
     """
-    level = grey.astype(np.float32)
-    along_x, along_y = (cv2.Sobel(level, cv2.CV_32F, *order, scale=0.125) for order in ((1, 0), (0, 1)))
-    square = along_x * along_x + along_y * along_y
+    along_x, along_y = (cv2.Sobel(grey, cv2.CV_32F, *order, scale=0.125) for order in ((1, 0), (0, 1)))
+    square = cv2.add(cv2.multiply(along_x, along_x), cv2.multiply(along_y, along_y))
     size = 2 * round(_GAP * radius) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     steep = (square > (_STRONG * usual) ** 2).astype(np.uint8)

@@ -170,7 +170,8 @@ class Camera:
         surface faces the camera, negative where it faces away.
         """
         towards = self.centre - xyz
-        return np.sum(towards * normals, axis=-1) / np.linalg.norm(towards, axis=-1)
+        along, square = (np.einsum("...i,...i->...", towards, each) for each in (normals, towards))
+        return np.asarray(along / np.sqrt(square))
 
 
 def signed_degrees(angle: float) -> float:
