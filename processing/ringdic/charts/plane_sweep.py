@@ -25,6 +25,7 @@ _REDUCED_RADIUS = 8  # px of a subset in the reduced images
 _RADII = 1.6  # subset's radius in the reduced images, in radii of a subset in the full ones
 _KNOTS = 14  # depths at which warps are computed exactly
 _SPACING = 2.0  # px of the reduced image between the matches of successive depths
+_TOGETHER = 50  # places that are tried at one spacing of the depths
 _STEEPEST = 60.0  # degrees of incidence at which a surface is still to be matched
 _UPWARDS = 32.0  # degrees by which slants are turned out of the plane of the two lines of sight
 _AROUND = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=float)
@@ -109,33 +110,36 @@ def sweep_planes(
     first, second = cameras
     nearest, farthest = space.limits(first)
     knots = np.linspace(1.0 / farthest, 1.0 / nearest, _KNOTS)
-    warps = np.concatenate(
-        [_plane_warps(first, second, px, normal, knots, factor) for normal in _slants(cameras, space.centre)], axis=1
-    )
-    count = max(2, math.ceil(_travel(warps[:, :_KNOTS]) / (_SPACING * factor)))
-    along = np.linspace(0.0, _KNOTS - 1.0, count)
-    coordinates = np.concatenate([k * _KNOTS + along for k in range(warps.shape[1] // _KNOTS)])
+    warps = _plane_warps(first, second, px, np.array(_slants(cameras, space.centre)), knots, factor)
+    moves = _moves(warps)
+    warps[..., :2] /= factor
     at = np.rint((px + 0.5) / factor - 0.5)
-    small = warps.copy()
-    small[..., :2] /= factor
-    best = search_hypotheses(
-        images[0].image, images[1], at, WarpHypotheses(small, coordinates), _REDUCED_RADIUS,
-        stride=1, zncc_min=_LEAST_ZNCC,
-    )  # fmt: skip
-    with np.errstate(invalid="ignore"):
-        good = (best.zncc > _LEAST_ZNCC) & (best.second_peak < _SECOND * best.zncc)
-    out = np.where(good[:, None], best.warps, np.nan)
+    out = np.full((len(px), 6), np.nan)
+    for some in np.array_split(np.argsort(moves.max(axis=1)), -(-len(px) // _TOGETHER)):
+        along = _along_knots(moves[some].max(axis=0) / (_SPACING * factor))
+        coordinates = np.concatenate([k * _KNOTS + along for k in range(warps.shape[1])])
+        hypotheses = WarpHypotheses(warps[some].reshape(len(some), -1, 6), coordinates)
+        best = search_hypotheses(
+            images[0].image, images[1], at[some], hypotheses, _REDUCED_RADIUS, stride=1, zncc_min=_LEAST_ZNCC
+        )
+        with np.errstate(invalid="ignore"):
+            good = (best.zncc > _LEAST_ZNCC) & (best.second_peak < _SECOND * best.zncc)
+        out[some[good]] = best.warps[good]
     out[:, :2] *= factor
     return SweepMatches(out)
 
 
-def _travel(warps: Floats) -> float:
-    """Median distance over which the match moves from the first knot to the last, px. warps : (n, J, 6), one slant."""
-    whole = np.linalg.norm(warps[:, -1, :2] - warps[:, 0, :2], axis=1)
-    steps = np.linalg.norm(np.diff(warps[..., :2], axis=1), axis=2)
-    longest = np.nanmax(steps) * (_KNOTS - 1) if np.isfinite(steps).any() else 0.0
-    known = whole[np.isfinite(whole)]
-    return float(max(np.median(known) if len(known) else 0.0, longest))
+def _moves(warps: Floats) -> Floats:
+    """Distances (n, J - 1) px between the matches of successive knots. warps : (n, S, J, 6), of S slants."""
+    steps = np.linalg.norm(np.diff(warps[..., :2], axis=2), axis=3)
+    return np.asarray(np.max(np.nan_to_num(steps), axis=1))
+
+
+def _along_knots(moves: Floats) -> Floats:
+    """Coordinates between the knots that lie no more than one unit of the moves (J - 1,) apart, no unit."""
+    counts = np.maximum(np.ceil(moves).astype(int), 1)
+    between = [k + np.arange(count) / count for k, count in enumerate(counts)]
+    return np.append(np.concatenate(between), float(len(counts)))
 
 
 def _slants(cameras: tuple[Camera, Camera], centre: Points) -> list[Vectors]:
@@ -157,19 +161,19 @@ def _slants(cameras: tuple[Camera, Camera], centre: Points) -> list[Vectors]:
     return normals
 
 
-def _plane_warps(first: Camera, second: Camera, px: Pixels, normal: Vectors, inverse: Floats, reach: float) -> Floats:
-    """Warps (n, J, 6) from the first camera into the second under planes of one normal at J inverse depths, 1/mm."""
+def _plane_warps(first: Camera, second: Camera, px: Pixels, normals: Vectors, inverse: Floats, reach: float) -> Floats:
+    """Warps (n, S, J, 6) from the first camera into the second under planes of S normals at J inverse depths, 1/mm."""
     rays = axial_rays(first, px[:, None] + 4.0 * reach * _AROUND)  # (n, 5, 3)
-    slant = rays @ normal
-    scale = slant[:, :1] / slant  # depth of the plane, in units of that at the place
-    xyz = first.centre + (rays * scale[..., None])[:, None] / inverse[:, None, None]
-    at = second.project(xyz) - px[:, None, None]  # (n, J, 5, 2)
-    size = 2.0 * 4.0 * reach
-    by_x, by_y = (at[:, :, 1] - at[:, :, 2]) / size, (at[:, :, 3] - at[:, :, 4]) / size
-    warps = np.stack(
-        [at[..., 0, 0], at[..., 0, 1], by_x[..., 0] - 1, by_y[..., 0], by_x[..., 1], by_y[..., 1] - 1], axis=-1
-    )
-    position = px[:, None] + warps[..., :2]
-    inside = ((position >= 0) & (position < np.array(second.size))).all(axis=-1)
-    warps[~(inside & (scale.min(axis=1) > 0)[:, None] & (np.abs(warps[..., 2:]).max(axis=-1) < 3.0))] = np.nan
+    by_x, by_y = (rays[:, 1] - rays[:, 2]) / (8.0 * reach), (rays[:, 3] - rays[:, 4]) / (8.0 * reach)
+    towards, slant = np.stack([by_x, by_y], axis=-1), rays @ normals.T  # (n, 3, 2), (n, 5, S)
+    at, jacobian = second.project_with_jacobian(first.centre + rays[:, :1] / inverse[:, None])
+    # Along the plane the depth changes by the share -n·∂r / n·r a pixel.
+    share = np.einsum("sa,nai->nsi", normals, towards) / slant[:, 0, :, None]
+    tangents = towards[:, None] - rays[:, 0, None, :, None] * share[:, :, None]  # (n, S, 3, 2)
+    slopes = np.einsum("njba,nsai->nsjbi", jacobian, tangents, optimize=True) / inverse[:, None, None] - np.eye(2)
+    warps = np.empty((*slopes.shape[:3], 6))
+    warps[..., :2], warps[..., 2:] = (at - px[:, None])[:, None], slopes.reshape(*slopes.shape[:3], 4)
+    inside: Mask = np.asarray(((at >= 0) & (at < np.array(second.size))).all(axis=-1))
+    before: Mask = np.asarray((slant * slant[:, :1] > 0).all(axis=1))
+    warps[~(inside[:, None] & before[..., None] & (np.abs(slopes).max(axis=(-2, -1)) < 3.0))] = np.nan
     return warps

@@ -123,7 +123,9 @@ def correlate_points(
         began = time.perf_counter()
         assert reference.gradient  # computed on first use
         seconds = {"prepare": time.perf_counter() - began, "start": 0.0, "refine": 0.0}
-        points = Propagation(reference, current, xy, settings, progress)
+        # Where start values are given, the kernel's own test of each subset is enough.
+        textureless = None if start is None else np.zeros(len(xy), bool)
+        points = Propagation(reference, current, xy, settings, progress, textureless=textureless)
         if start is None:
             _match_automatically(points, seconds)
         else:

@@ -17,6 +17,7 @@ _QUANTISED = 1.0 / 12.0  # grey levels², the variance of rounding to whole ones
 _CROSSED = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]).astype(np.float32) / np.float32(
     6.0
 )  # keeps the variance of white noise
+_MANY = 2**18  # pixels, of which every second one each way tells enough
 _FLAT = 0.2  # share of the dark and of the bright pixels that count as flat
 _TRULY_FLAT = 3.0  # slopes there, in units of those that the noise alone would make
 _CLIP = 3.0
@@ -38,9 +39,10 @@ def flat_noise(image: GreyImage) -> float:
         raise ValueError(f"an image of {grey.shape} px shows no noise; at least 16 x 16 are needed")
     smooth = cv2.blur(grey, (3, 3))
     fx, fy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.125)
-    slope = cv2.blur(fx * fx + fy * fy, (5, 5))[4:-4, 4:-4].ravel()
-    wave = cv2.filter2D(grey, cv2.CV_32F, _CROSSED)[4:-4, 4:-4].ravel()
-    level = cv2.blur(grey, (5, 5))[4:-4, 4:-4].ravel()
+    some = (slice(4, -4, 1 if grey.size < _MANY else 2),) * 2
+    slope = cv2.blur(fx * fx + fy * fy, (5, 5))[some].ravel()
+    wave = cv2.filter2D(grey, cv2.CV_32F, _CROSSED)[some].ravel()
+    level = cv2.blur(grey, (5, 5))[some].ravel()
     dark = level < 0.5 * np.percentile(level, [10, 90]).sum()
     estimates = []
     for half in (dark, ~dark):
