@@ -7,7 +7,7 @@ the newest step alone, leaves the outputs of all other steps valid.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +38,7 @@ from ringdic.tasks.step_images import Digests, step_image
 _WIDEST = 72.0  # degrees between the views of two cameras that are matched with one another
 _MOST = 2  # cameras, those with the most similar views, that a depth map is measured with
 _CHART_COST = 2.0  # of a depth map and of a chart, in units of one camera's step
+_LOOSER = 2.5  # tolerance of matches between cameras, in units of that between steps: their noise is as much larger
 _MATCHES = ("xy", "uv", "gradient", "sigma", "c_ls", "status")
 
 
@@ -234,7 +235,8 @@ def chart_task(files: _ReferenceFiles, planned: _PlannedChart, *, inputs: tuple[
     cameras, k, incidence = files.views.cameras, planned.camera, planned.incidence
     maps = {c: _stored_depth_map(inputs[c]) for c in (k, *planned.partners)}
     plan = plan_chart(k, cameras, maps, incidence, planned.partners, whole=not planned.curved)
-    images = ChartImages(cameras, files.image, files.correlation)
+    settings = replace(files.correlation, tolerance=_LOOSER * files.correlation.tolerance)
+    images = ChartImages(cameras, files.image, settings)
     matches = match_chart(images, k, maps[k], plan, files.mask(k), incidence, curved=planned.curved)
     drop_masked(matches, files.mask)
     noise = np.array([maps[c].grey_noise for c in matches.cameras])
