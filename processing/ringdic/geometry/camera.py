@@ -10,7 +10,9 @@ are those of the same camera without distortion and skew: ``u = fx x + cx``, ``v
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -77,14 +79,6 @@ class Intrinsics:
         xy_d = self.distort_normalised((px - np.array([cx, cy])) / np.array([fx, fy]))
         return np.stack([fx * xy_d[..., 0] + s * xy_d[..., 1] + cx, fy * xy_d[..., 1] + cy], axis=-1)
 
-    def jacobian(self, px: Pixels) -> Floats:
-        """Jacobian d(image pixel)/d(undistorted pixel) at undistorted pixels.
-
-        px : (..., 2) px. Returns (..., 2, 2), px per px.
-        """
-        K = np.ascontiguousarray(self.K)
-        return np.asarray(lens.pixel_jacobians(_rows(px), K, self.distortion)).reshape(*np.shape(px), 2)
-
 
 @dataclass(frozen=True)
 class Camera:
@@ -104,7 +98,7 @@ class Camera:
     centre: Points = field(init=False)
 
     def __post_init__(self) -> None:
-        P = np.asarray(self.P, dtype=float).reshape(3, 4)
+        P = np.ascontiguousarray(self.P, dtype=float).reshape(3, 4)
         object.__setattr__(self, "P", P)
         object.__setattr__(self, "centre", -np.linalg.solve(P[:, :3], P[:, 3]))
 
@@ -121,6 +115,13 @@ class Camera:
             lens_of_image = Intrinsics(S @ self.intrinsics.K, self.intrinsics.distortion, size)
         return Camera(self.id, S @ self.P, size, lens_of_image)
 
+    @cached_property
+    def optics(self) -> tuple[Floats, Floats]:
+        """Camera matrix (3, 3) px and distortion (5,) of the lens; the identity and zeros where there is none."""
+        if self.intrinsics is None:
+            return np.eye(3), np.zeros(5)
+        return np.ascontiguousarray(self.intrinsics.K), np.ascontiguousarray(self.intrinsics.distortion)
+
     @property
     def azimuth_deg(self) -> float:
         """Azimuth of the projection centre about the world's +z axis, counted from +x, -180 to 180 degrees."""
@@ -133,20 +134,16 @@ class Camera:
 
     def project(self, xyz: Points) -> Pixels:
         """Image pixels of world points. xyz : (..., 3) mm. Returns (..., 2) px."""
-        px = self.project_undistorted(xyz)
-        return px if self.intrinsics is None else self.intrinsics.to_distorted(px)
+        px = lens.projections(self.P, *self.optics, _points(xyz))
+        return np.asarray(px).reshape(*np.shape(xyz)[:-1], 2)
 
     def project_with_jacobian(self, xyz: Points) -> tuple[Pixels, Floats]:
         """Image pixels of world points, and the Jacobian of the projection.
 
         xyz : (..., 3) mm. Returns pixels (..., 2) px and d(pixel)/d(point) (..., 2, 3) px/mm.
         """
-        h = np.asarray(xyz, dtype=float) @ self.P[:, :3].T + self.P[:, 3]
-        px = h[..., :2] / h[..., 2:]
-        jacobian = (self.P[:2, :3] - px[..., None] * self.P[2, :3]) / h[..., 2, None, None]
-        if self.intrinsics is None:
-            return px, jacobian
-        return self.intrinsics.to_distorted(px), self.intrinsics.jacobian(px) @ jacobian
+        jacobian = lens.projection_slopes(self.P, *self.optics, _points(xyz))
+        return self.project(xyz), np.asarray(jacobian).reshape(*np.shape(xyz)[:-1], 2, 3)
 
     def undistort(self, px: Pixels) -> Pixels:
         """Undistorted pixels of image pixels. px : (..., 2) px. Returns (..., 2) px, NaN where the lens shows none."""
@@ -174,9 +171,24 @@ class Camera:
         return np.asarray(along / np.sqrt(square))
 
 
+def stacked_optics(cameras: Sequence[Camera]) -> tuple[Floats, Floats, Floats]:
+    """Projections P (C, 3, 4), camera matrices (C, 3, 3) px and distortions (C, 5) of several cameras, for kernels."""
+    optics = [camera.optics for camera in cameras]
+    return (
+        np.stack([camera.P for camera in cameras]),
+        np.stack([K for K, _ in optics]),
+        np.stack([distortion for _, distortion in optics]),
+    )
+
+
 def signed_degrees(angle: float) -> float:
     """Wrap an angle in degrees to the interval -180 ≤ angle < 180."""
     return (angle + 180.0) % 360.0 - 180.0
+
+
+def _points(xyz: Points) -> Points:
+    """Points (..., 3) as contiguous rows (n, 3)."""
+    return np.ascontiguousarray(xyz, dtype=float).reshape(-1, 3)
 
 
 def _rows(xy: Floats) -> Floats:

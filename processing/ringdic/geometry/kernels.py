@@ -1,7 +1,8 @@
 """Compiled loops over points: triangulation, propagation of pixel errors to points, residuals against neighbours.
 
 The equations are explained where the kernels are called: :mod:`ringdic.geometry.triangulation`,
-:mod:`ringdic.uncertainty.position` and :mod:`ringdic.geometry.outliers`.
+:mod:`ringdic.geometry.weighted_triangulation`, :mod:`ringdic.uncertainty.position` and
+:mod:`ringdic.geometry.outliers`.
 """
 
 from __future__ import annotations
@@ -11,8 +12,13 @@ import math
 import numba as nb
 import numpy as np
 
+from ringdic.geometry.lens import projection_of_point, slopes_of_projection, undistort_point
+
 # A positive semi-definite N with det N > s (tr N)³ has no eigenvalue below s times the largest one.
 _SURE = 1e-9
+_STEPS = 8  # most Gauss-Newton steps; two or three are enough unless a match is wrong
+_SETTLED = 1e-7  # mm, step at which the iteration has converged
+_CROSSING = 1e-10  # least 27 det N / (tr N)³ of a normal matrix N; 1 where all directions are known equally well
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -91,38 +97,148 @@ def solve_normal_equations(normal, right, which, xyz):  # type: ignore[no-untype
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def gain(slopes, sigma, out):  # type: ignore[no-untyped-def]
+def weighted_points(P, K, lens, px, sigma, xyz, covariance, chi2, degrees):  # type: ignore[no-untyped-def]
+    """Points of least χ² of their pixels, by Gauss-Newton steps from the weighted linear solution.
+
+    P (C, 3, 4), K (C, 3, 3), lens (C, 5): projections, camera matrices and distortions of the cameras. px, sigma
+    (C, n, 2) px, not finite for a camera that is not used. Filled: xyz (n, 3), covariance (n, 3, 3), chi2
+    (n,), NaN where a point is not determined, and degrees (n,) of freedom, 0 there.
+    """
+    normal, inverse, right, at = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    for n in range(px.shape[1]):
+        views = _weighted_linear_equations(P, K, lens, px, sigma, n, normal, right)
+        settled = views >= 2 and _determined(normal)
+        if settled:
+            _inverse(normal, inverse)
+            for i in range(3):
+                at[i] = inverse[i, 0] * right[0] + inverse[i, 1] * right[1] + inverse[i, 2] * right[2]
+            settled, chi2[n] = _gauss_newton(P, K, lens, px, sigma, n, normal, inverse, right, at)
+        if settled and math.isfinite(at[0] + at[1] + at[2]) and math.isfinite(chi2[n]) and _determined(normal):
+            xyz[n], covariance[n], degrees[n] = at, inverse, 2 * views - 3
+        else:
+            xyz[n], covariance[n], chi2[n], degrees[n] = np.nan, np.nan, np.nan, 0
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _gauss_newton(P, K, lens, px, sigma, n, normal, inverse, right, at):  # type: ignore[no-untyped-def]
+    """Move the position ``at`` (3,) mm of point n to its least χ²; returns whether it converged, and χ² there.
+
+    normal, inverse (3, 3) and right (3,) are overwritten: of the last step.
+    """
+    chi2, longest = np.nan, np.inf
+    for _ in range(_STEPS):
+        chi2 = _weighted_equations(P, K, lens, px, sigma, n, at, normal, right)
+        if not _inverse(normal, inverse) > 0:
+            return False, np.nan
+        longest = 0.0
+        for i in range(3):
+            step = inverse[i, 0] * right[0] + inverse[i, 1] * right[1] + inverse[i, 2] * right[2]
+            at[i] += step
+            chi2 -= step * right[i]  # χ² at the minimum of its quadratic; exact where the step was small
+            longest = max(longest, abs(step))
+        if not longest > _SETTLED:
+            break
+    return longest <= 1e3 * _SETTLED, max(chi2, 0.0)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _weighted_linear_equations(P, K, lens, px, sigma, n, normal, right):  # type: ignore[no-untyped-def]
+    """Weighted normal equations of the linear triangulation of point n, into normal (3, 3) and right (3,).
+
+    A row's residual is the pixel's times the depth, which is 1 at the world's origin and about 1 on a specimen. Returns
+    the number of cameras in which the pixel and its standard deviation are known.
+    """
+    views, row = 0, np.empty(4)
+    normal[:], right[:] = 0.0, 0.0
+    for c in range(len(P)):
+        if not math.isfinite(px[c, n, 0] + px[c, n, 1] + sigma[c, n, 0] + sigma[c, n, 1]):
+            continue
+        views += 1
+        fx, fy, cx, cy = K[c, 0, 0], K[c, 1, 1], K[c, 0, 2], K[c, 1, 2]
+        y = (px[c, n, 1] - cy) / fy
+        x, y = undistort_point((px[c, n, 0] - cx - K[c, 0, 1] * y) / fx, y, lens[c])
+        if math.isnan(x):
+            continue
+        for k in range(2):
+            at = fy * y + cy if k else fx * x + cx
+            for i in range(4):
+                row[i] = (P[c, k, i] - at * P[c, 2, i]) / sigma[c, n, k]
+            for i in range(3):
+                right[i] -= row[i] * row[3]
+                for j in range(3):
+                    normal[i, j] += row[i] * row[j]
+    return views
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _weighted_equations(P, K, lens, px, sigma, n, at, normal, right):  # type: ignore[no-untyped-def]
+    """Normal matrix JᵀWJ (3, 3), right side JᵀWr (3,) with the residuals r, and χ² of point n at a position (3,) mm."""
+    chi2, row = 0.0, np.empty((2, 3))
+    normal[:], right[:] = 0.0, 0.0
+    for c in range(len(P)):
+        if not math.isfinite(px[c, n, 0] + px[c, n, 1] + sigma[c, n, 0] + sigma[c, n, 1]):
+            continue
+        u, v = projection_of_point(P[c], K[c], lens[c], at[0], at[1], at[2])
+        row[0, 0], row[0, 1], row[0, 2], row[1, 0], row[1, 1], row[1, 2] = slopes_of_projection(
+            P[c], K[c], lens[c], at[0], at[1], at[2]
+        )
+        for k in range(2):
+            weight = 1.0 / (sigma[c, n, k] * sigma[c, n, k])
+            residual = px[c, n, 1] - v if k else px[c, n, 0] - u
+            chi2 += residual * weight * residual
+            for i in range(3):
+                right[i] += row[k, i] * weight * residual
+                for j in range(3):
+                    normal[i, j] += row[k, i] * weight * row[k, j]
+    return chi2
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _determined(N):  # type: ignore[no-untyped-def]
+    """Whether the lines of sight of a point cross, by its normal matrix N (3, 3)."""
+    determinant = (
+        N[0, 0] * (N[1, 1] * N[2, 2] - N[1, 2] * N[1, 2])
+        - N[0, 1] * (N[0, 1] * N[2, 2] - N[1, 2] * N[0, 2])
+        + N[0, 2] * (N[0, 1] * N[1, 2] - N[0, 2] * N[1, 1])
+    )
+    return 27.0 * determinant > _CROSSING * (N[0, 0] + N[1, 1] + N[2, 2]) ** 3
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def gain(P, K, lens, xyz, sigma, out):  # type: ignore[no-untyped-def]
     """Sensitivities d(point)/d(pixel) of the weighted triangulation, ``(Σ Jᵀ W J)⁻¹ J_cᵀ W_c`` for camera c.
 
-    slopes (C, n, 2, 3) px/mm, Jacobians J of the projections. sigma (C, n, 2) px, W = diag(σ⁻²). out (C, n, 3, 2) mm/px
-    is filled: zero for a camera in which either is not finite.
+    P (C, 3, 4), K (C, 3, 3), lens (C, 5): projections, camera matrices and distortions of the cameras.
+    J is the Jacobian of the projection at xyz (n, 3) mm, W = diag(σ⁻²) of sigma (C, n, 2) px. out (C, n, 3, 2) mm/px is
+    filled: zero for a camera in which either is not finite.
     """
-    normal, inverse, weighted = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 2))
-    for n in range(slopes.shape[1]):
+    normal, inverse, slopes = np.empty((3, 3)), np.empty((3, 3)), np.empty((len(P), 2, 3))
+    for n in range(len(xyz)):
         normal[:] = 0.0
-        for c in range(len(slopes)):
-            J, s = slopes[c, n], sigma[c, n]
-            if not math.isfinite(s[0] + s[1] + J[0, 0]):
+        for c in range(len(P)):
+            s = sigma[c, n]
+            if not math.isfinite(s[0] + s[1] + xyz[n, 0] + xyz[n, 1] + xyz[n, 2]):
                 continue
+            J = slopes[c]
+            J[0, 0], J[0, 1], J[0, 2], J[1, 0], J[1, 1], J[1, 2] = slopes_of_projection(
+                P[c], K[c], lens[c], xyz[n, 0], xyz[n, 1], xyz[n, 2]
+            )
             for k in range(2):
                 for i in range(3):
                     for j in range(i, 3):
                         normal[i, j] += J[k, i] / (s[k] * s[k]) * J[k, j]
-        determinant = _inverse(normal, inverse)
-        if not determinant > 0:
+        if not _inverse(normal, inverse) > 0:
             inverse[:] = np.nan
-        for c in range(len(slopes)):
-            J, s = slopes[c, n], sigma[c, n]
-            if not math.isfinite(s[0] + s[1] + J[0, 0]):
+        for c in range(len(P)):
+            J, s = slopes[c], sigma[c, n]
+            if not math.isfinite(s[0] + s[1] + xyz[n, 0] + xyz[n, 1] + xyz[n, 2]):
                 out[c, n] = 0.0
                 continue
             for k in range(2):
+                weight = 1.0 / (s[k] * s[k])
                 for i in range(3):
-                    weighted[i, k] = J[k, i] / (s[k] * s[k])
-            for i in range(3):
-                for k in range(2):
-                    out[c, n, i, k] = (
-                        inverse[i, 0] * weighted[0, k] + inverse[i, 1] * weighted[1, k] + inverse[i, 2] * weighted[2, k]
+                    out[c, n, i, k] = weight * (
+                        inverse[i, 0] * J[k, 0] + inverse[i, 1] * J[k, 1] + inverse[i, 2] * J[k, 2]
                     )
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels, Points, Vectors
 from ringdic.geometry import kernels
-from ringdic.geometry.camera import Camera
+from ringdic.geometry.camera import Camera, stacked_optics
 
 _BLOCK = 8192  # points that are treated at a time
 
@@ -35,12 +35,8 @@ def position_gain(cameras: Sequence[Camera], xyz: Points, sigma: Pixels) -> Floa
     Returns (C, n, 3, 2) mm a px; zero for a camera that was not used.
     """
     sigma = np.ascontiguousarray(sigma, dtype=float)
-    slopes = np.full((len(cameras), len(xyz), 2, 3), np.nan)
-    for k, camera in enumerate(cameras):
-        index = np.flatnonzero(np.isfinite(sigma[k]).all(axis=1) & np.isfinite(xyz).all(axis=1))
-        slopes[k, index] = camera.project_with_jacobian(xyz[index])[1]
     gain = np.empty((len(cameras), len(xyz), 3, 2))
-    kernels.gain(slopes, sigma, gain)
+    kernels.gain(*stacked_optics(cameras), np.ascontiguousarray(xyz, dtype=float), sigma, gain)
     return gain
 
 
