@@ -269,6 +269,50 @@ def fill_covariance(gain, sigma):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
+def fill_step_covariance(before, after, narrow, whole, current, reference, label, total):  # type: ignore[no-untyped-def]
+    """Covariances of positions at a later step, into total (n, 3, 3) mm²; NaN where fewer than two cameras take part.
+
+    before, after (C, n, 3, 2) mm/px: the sensitivities at the reference and at the step, zero for a camera that does
+    not see the point. narrow, whole, current (C, n, 2) px: of the matches between the cameras, and of those in time due
+    to the reference image and to the step's; NaN in the first two counts as 0. reference (n,): the camera whose pixel
+    defines the point, -1 for none. label (n, 3, 2) mm/px: what that pixel moves.
+    """
+    own = np.empty((3, 2))
+    for n in range(len(reference)):
+        total[n] = 0.0
+        first, later, between = 0, 0, 0  # cameras that take part
+        for c in range(len(before)):
+            step, seen = after[c, n], _any(after[c, n])
+            own[:] = before[c, n]
+            both = seen and _any(own)
+            if c == reference[n]:
+                own -= label[n]
+            elif not (seen or _any(own)):
+                continue
+            first, later, between = first + _any(own), later + seen, between + _any(own - step)
+            for k in range(2):
+                a, b = narrow[c, n, k] ** 2, whole[c, n, k] ** 2
+                a, b = a if a >= 0 else 0.0, b if b >= 0 else 0.0
+                common = min(a, b) if both else 0.0  # of errors that cancel
+                rest = current[c, n, k] ** 2 + b - common if seen else 0.0
+                for i in range(3):
+                    for j in range(3):
+                        total[n, i, j] += (
+                            (own[i, k] - step[i, k]) * (own[j, k] - step[j, k]) * common
+                            + own[i, k] * own[j, k] * (a - common)
+                            + step[i, k] * step[j, k] * rest
+                        )
+        if min(first, later, between) < 2:
+            total[n] = np.nan
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _any(A):  # type: ignore[no-untyped-def]
+    """Whether a sensitivity A (3, 2) is not zero."""
+    return A[0, 0] != 0 or A[0, 1] != 0 or A[1, 0] != 0 or A[1, 1] != 0 or A[2, 0] != 0 or A[2, 1] != 0
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def fill_midpoint_residuals(pairs, values, doubt, rows):  # type: ignore[no-untyped-def]
     """Distance (r,) of the values of some grid points from a prediction by their neighbours.
 

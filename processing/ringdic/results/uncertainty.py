@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ringdic.arrays import Floats, Indices, Points
+from ringdic.arrays import Floats, Indices, Mask, Points
 from ringdic.calibration.bundle import BundleFit
 from ringdic.calibration.parameters import PER_CAMERA
 from ringdic.results.results import Results
@@ -24,7 +24,7 @@ from ringdic.uncertainty.calibration import (
     sensitivity_sigma,
     stretch_sigma_by_cameras,
 )
-from ringdic.uncertainty.position import position_gain
+from ringdic.uncertainty.position import Gain, position_gain
 
 # Triangles, about, at which the part of the calibration is computed.
 _SAMPLE = 3000
@@ -74,12 +74,12 @@ class _CalibrationUncertainty:
         every = max(1, len(reference.faces) // _SAMPLE)
         self._vertex, corners = np.unique(reference.faces[::every], return_inverse=True)
         self._faces = corners.reshape(-1, 3)
-        self._middles = reference.mesh.centroids[::every]
+        at, centroids = reference.vertices_ref[self._vertex], reference.mesh.centroids
+        self._points, self._triangles = _Nearest(at, reference.vertices_ref), _Nearest(centroids[::every], centroids)
         self._at_reference: Sensitivity = position_sensitivity(
-            reference.cameras, reference.vertices_ref[self._vertex], _gain(reference, 0, self._vertex), known
+            reference.cameras, at, _gain(reference, 0, self._vertex), known
         )
-        at = reference.vertices_ref[self._vertex]
-        self._position = _from_nearest(at, sensitivity_sigma(self._at_reference), reference.vertices_ref)
+        self._position = self._points.spread(sensitivity_sigma(self._at_reference))
 
     def arrays(self, results: Results, deformed: Deformation) -> dict[str, Any]:
         """The standard deviations at the reference and at the step, by the names of the arrays of `Results`."""
@@ -94,8 +94,7 @@ class _CalibrationUncertainty:
             sample = deformation(reference, current, self._faces)
             stretches = stretch_sigma_by_cameras(sample, reference, self._faces, self._at_reference, at_step)
             both = np.concatenate([sensitivity_sigma(at_step), sensitivity_sigma(at_step - self._at_reference)], axis=1)
-            of_points = _from_nearest(reference, both, results.vertices_ref)
-            of_triangles = _from_nearest(self._middles, stretches, results.mesh.centroids)
+            of_points, of_triangles = self._points.spread(both), self._triangles.spread(stretches)
             of_points[~np.isfinite(results.vertices[1]).all(axis=1)] = np.nan
             of_triangles[~np.isfinite(deformed.J)] = np.nan
             rows.append((of_points[:, :3], of_points[:, 3:], of_triangles))
@@ -103,26 +102,35 @@ class _CalibrationUncertainty:
         return {name: np.stack(values) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
 
 
-def _from_nearest(at: Points, values: Floats, xyz: Points) -> Floats:
-    """Values (n, k) at positions xyz (n, 3) mm: those of the nearest of the positions ``at`` (m, 3) mm that has some.
+class _Nearest:
+    """Positions xyz (n, 3) mm, to which values known at some of the positions ``at`` (m, 3) mm are spread."""
 
-    values : (m, k), NaN where there are none.
-    """
-    known = np.flatnonzero(np.isfinite(values).all(axis=1))
-    if not len(known):
-        return np.full((len(xyz), values.shape[1]), np.nan)
-    return np.asarray(values[known[cKDTree(at[known]).query(xyz)[1]]])
+    def __init__(self, at: Points, xyz: Points) -> None:
+        self._at, self._xyz = at, xyz
+        self._nearest: Indices = np.asarray(cKDTree(at).query(xyz)[1])
+
+    def spread(self, values: Floats) -> Floats:
+        """Values (n, k): those (m, k) of the nearest position that has some, NaN where none has."""
+        known: Mask = np.asarray(np.isfinite(values).all(axis=1))
+        nearest, lost = self._nearest, np.flatnonzero(~known[self._nearest])
+        if len(lost) and known.any():
+            some = np.flatnonzero(known)
+            nearest = nearest.copy()
+            nearest[lost] = some[cKDTree(self._at[some]).query(self._xyz[lost])[1]]
+        return np.asarray(values[nearest])
 
 
-def _gain(results: Results, step: int, vertex: Indices) -> Floats:
+def _gain(results: Results, step: int, vertex: Indices) -> Gain:
     """Gain from the pixels of each camera to the positions of some vertices at a step, (C, k, 3, 2) mm a px.
 
-    vertex : (k,) indices.
+    vertex : (k,) indices, ascending.
     """
     index = {camera.id: k for k, camera in enumerate(results.cameras)}
-    sigma = np.full((len(results.cameras), len(results.vertices_ref), 2), np.nan)
+    sigma = np.full((len(results.cameras), len(vertex), 2), np.nan)
+    number = np.full(len(results.vertices_ref) + 1, -1)  # of a vertex among these; the last stands for no vertex
+    number[vertex] = np.arange(len(vertex))
     for matches in results.matches:
-        used = (matches.vertex >= 0) & (matches.status[step] == 0)
+        used = np.flatnonzero((number[matches.vertex] >= 0) & (matches.status[step] == 0))
         for view, id_ in enumerate(matches.cameras):
-            sigma[index[id_], matches.vertex[used]] = matches.sigma[step, view, used]
-    return position_gain(results.cameras, results.vertices[step, vertex], sigma[:, vertex])
+            sigma[index[id_], number[matches.vertex[used]]] = matches.sigma[step, view, used]
+    return position_gain(results.cameras, results.vertices[step, vertex], sigma)

@@ -21,12 +21,13 @@ from ringdic.arrays import Floats, Indices, Mask, Points
 from ringdic.calibration.parameters import PER_CAMERA, CameraParameters, projection_jacobians
 from ringdic.geometry.camera import Camera
 from ringdic.strain.deformation import Deformation
+from ringdic.uncertainty.position import Gain
 from ringdic.uncertainty.strain import stretch_slopes
 
 #: Derivatives (..., S) of quantities with respect to S independent errors of unit variance, in single precision.
 Sensitivity = NDArray[np.float32]
 
-_BLOCK = 4096  # points or triangles at a time, which bounds the memory
+_BLOCK = 4096  # triangles at a time, which bounds the memory
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class CameraCovariance:
 def position_sensitivity(
     cameras: Sequence[Camera],
     xyz: Points,
-    gain: Floats,
+    gain: Gain,
     known: CameraCovariance,
     tracked_from: tuple[Points, Sensitivity] | None = None,
 ) -> Sensitivity:
@@ -84,29 +85,48 @@ def position_sensitivity(
     missing = [camera.id for camera in cameras if camera.id not in known.ids]
     if missing:
         raise ValueError(f"no covariance of camera {', '.join(missing)}; it took no part in the adjustment")
-    root = known.root.astype(np.float32)
-    out = np.full((len(xyz), 3, len(root)), np.nan, dtype=np.float32)
     visible: Mask = np.asarray(gain.any(axis=(2, 3)) & np.isfinite(xyz).all(axis=1))
-    for first in range(0, len(xyz), _BLOCK):
-        part = slice(first, first + _BLOCK)
-        moved = np.zeros((len(xyz[part]), 3, len(root)), dtype=np.float32)
-        follows = np.zeros((len(moved), 3, 3))
-        for k, camera in enumerate(cameras):
-            index = np.flatnonzero(visible[k, part])
-            parameters = CameraParameters.of(camera)
-            by_camera = -projection_jacobians(parameters, xyz[part][index])[1]
-            if tracked_from is not None:
-                _, at_first, by_place = projection_jacobians(parameters, tracked_from[0][part][index])
-                by_camera += at_first
-                follows[index] += gain[k, part][index] @ by_place
-            at = PER_CAMERA * known.ids.index(camera.id)
-            moved[index, :, at : at + PER_CAMERA] = gain[k, part][index] @ by_camera
-        moved = moved @ root
+    by_camera, follows = _errors_by_camera(
+        cameras, xyz, gain, visible, None if tracked_from is None else tracked_from[0]
+    )
+    place = np.cumsum(visible, axis=1) - 1  # of each point among those that the camera sees
+    root = known.root.astype(np.float32).reshape(len(known.ids), PER_CAMERA, -1)
+    out = np.full((len(xyz), 3, root.shape[2]), np.nan, dtype=np.float32)
+    same = np.zeros(len(xyz), np.int64)  # number of the set of cameras that see a point
+    for row in visible:
+        same = np.unique(2 * same + row, return_inverse=True)[1]
+    for k in range(int(same.max(initial=-1)) + 1):
+        index = np.flatnonzero(same == k)
+        seen = np.flatnonzero(visible[:, index[0]]).tolist()
+        if not seen:
+            continue
+        errors = np.concatenate([by_camera[c][place[c, index]] for c in seen], axis=2).reshape(3 * len(index), -1)
+        roots = np.concatenate([root[known.ids.index(cameras[c].id)] for c in seen])
+        moved = (errors @ roots).reshape(len(index), 3, -1)
         if tracked_from is not None:
-            moved += follows.astype(np.float32) @ tracked_from[1][part]
-        moved[np.flatnonzero(~np.any(visible[:, part], axis=0))] = np.nan
-        out[part] = moved
+            moved += follows[index] @ tracked_from[1][index]
+        out[index] = moved
     return out
+
+
+def _errors_by_camera(
+    cameras: Sequence[Camera], xyz: Points, gain: Gain, visible: Mask, reference: Points | None
+) -> tuple[list[NDArray[np.float32]], NDArray[np.float32]]:
+    """Derivatives of positions with respect to the parameters of each camera, and to their reference positions.
+
+    visible : (C, n) bool. reference : (n, 3) mm, positions from whose projections the points were tracked, or None.
+    Returns for each camera (k, 3, 16) mm a unit of the parameter for the k points that it sees, and (n, 3, 3).
+    """
+    by_camera, follows = [], np.zeros((len(xyz), 3, 3), np.float32)
+    for camera, own, seen in zip(cameras, gain, visible, strict=True):
+        parameters, index = CameraParameters.of(camera), np.flatnonzero(seen)
+        errors = -projection_jacobians(parameters, xyz[index])[1]
+        if reference is not None:
+            _, at_first, by_place = projection_jacobians(parameters, reference[index])
+            errors += at_first
+            follows[index] += (own[index] @ by_place).astype(np.float32)
+        by_camera.append((own[index] @ errors).astype(np.float32))
+    return by_camera, follows
 
 
 def sensitivity_sigma(sensitivity: Sensitivity) -> Floats:

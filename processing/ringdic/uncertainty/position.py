@@ -19,35 +19,36 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Indices, Mask, Pixels, Points, Vectors
+from ringdic.arrays import Floats, Indices, Pixels, Points, Vectors
 from ringdic.geometry import kernels
 from ringdic.geometry.camera import Camera, stacked_optics
 
-_BLOCK = 8192  # points that are treated at a time
+#: Sensitivities (C, n, 3, 2) of positions to the pixels of each camera, mm a px.
+Gain = NDArray[np.float32] | Floats
 
 
-def position_gain(cameras: Sequence[Camera], xyz: Points, sigma: Pixels) -> Floats:
+def position_gain(cameras: Sequence[Camera], xyz: Points, sigma: Pixels) -> Gain:
     """Gain ``A_c`` from the pixels of each camera to positions triangulated from all cameras with weights 1 / σ².
 
     xyz : (n, 3) mm, the positions. sigma : (C, n, 2) px, standard deviations of the pixels that they were triangulated
     from, NaN for a camera that was not used.
-    Returns (C, n, 3, 2) mm a px; zero for a camera that was not used.
+    Returns (C, n, 3, 2) mm a px, in single precision; zero for a camera that was not used.
     """
     sigma = np.ascontiguousarray(sigma, dtype=float)
-    gain = np.empty((len(cameras), len(xyz), 3, 2))
+    gain = np.empty((len(cameras), len(xyz), 3, 2), np.float32)
     kernels.gain(*stacked_optics(cameras), np.ascontiguousarray(xyz, dtype=float), sigma, gain)
     return gain
 
 
-def covariance(gain: Floats, sigma: Pixels) -> Floats:
+def covariance(gain: Gain, sigma: Pixels) -> Floats:
     """Covariance ``Σ A_c diag(σ_c²) A_cᵀ`` of positions from independent errors of the pixels.
 
     gain : (C, n, 3, 2) mm a px, of `position_gain`. sigma : (C, n, 2) px, standard deviations of the pixels.
     Returns (n, 3, 3) mm²; NaN where fewer than two cameras take part.
     """
-    gain, sigma = np.ascontiguousarray(gain, dtype=float), np.ascontiguousarray(sigma, dtype=float)
-    return np.asarray(kernels.fill_covariance(gain, sigma))
+    return np.asarray(kernels.fill_covariance(np.ascontiguousarray(gain), np.ascontiguousarray(sigma)))
 
 
 def along_surface(cameras: Sequence[Camera], reference: Indices, xyz: Points, normals: Vectors) -> Floats:
@@ -71,7 +72,7 @@ def along_surface(cameras: Sequence[Camera], reference: Indices, xyz: Points, no
     return out
 
 
-def reference_covariance(gain: Floats, sigma: Pixels, reference: Indices, label: Floats) -> Floats:
+def reference_covariance(gain: Gain, sigma: Pixels, reference: Indices, label: Floats) -> Floats:
     """Covariance due to image noise of reference positions, each defined by a pixel of its reference camera.
 
     gain : (C, n, 3, 2) mm a px, of `position_gain`. sigma : (C, n, 2) px, due to the noise of each image alone.
@@ -84,7 +85,7 @@ def reference_covariance(gain: Floats, sigma: Pixels, reference: Indices, label:
 
 
 def step_covariance(
-    gains: tuple[Floats, Floats], sigma: Pixels, tracked: tuple[Pixels, Pixels], reference: Indices, label: Floats
+    gains: tuple[Gain, Gain], sigma: Pixels, tracked: tuple[Pixels, Pixels], reference: Indices, label: Floats
 ) -> Floats:
     """Covariance of positions at a later step due to image noise.
 
@@ -95,18 +96,6 @@ def step_covariance(
     reference : (n,) index of the reference camera. label : (n, 3, 2) mm a px, of `along_surface`.
     Returns (n, 3, 3) mm².
     """
-    n = len(reference)
-    total = np.empty((n, 3, 3))
-    for begin in range(0, n, _BLOCK):
-        at = slice(begin, begin + _BLOCK)
-        own, step = gains[0][:, at].copy(), gains[1][:, at]
-        whole, narrow = np.nan_to_num(tracked[0][:, at]), np.nan_to_num(sigma[:, at])
-        # Errors cancel only where the camera took part at the reference and at the step.
-        both: Mask = np.asarray(own.any(axis=(2, 3)) & step.any(axis=(2, 3)))
-        common = np.where(both[..., None], np.minimum(whole, narrow), 0.0)
-        defined = np.flatnonzero(reference[at] >= 0)
-        own[reference[at][defined], defined] -= label[at][defined]
-        total[at] = covariance(own - step, common)
-        total[at] += covariance(own, np.sqrt(np.maximum(narrow**2 - common**2, 0.0)))
-        total[at] += covariance(step, np.sqrt(tracked[1][:, at] ** 2 + np.maximum(whole**2 - common**2, 0.0)))
+    total = np.empty((len(reference), 3, 3))
+    kernels.fill_step_covariance(*gains, np.ascontiguousarray(sigma), *tracked, reference, label, total)
     return total

@@ -10,11 +10,15 @@ displacements δx_k of its corners change it by ``δλ = Σ_k g_k · δx_k``, ``
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
+from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Pixels, Points
 from ringdic.strain import kernels
 from ringdic.strain.deformation import Deformation, directors
+from ringdic.uncertainty.position import Gain
 
 # Exponent on the correlation of two discs. Slopes are not spread evenly over a subset, and its gradient is fitted
 # together with its position: both make neighbours a little less correlated than the overlap of the discs. Measured on
@@ -39,27 +43,30 @@ def subset_correlation(distance: Floats, radius: float, order: int = 1) -> Float
     return np.asarray(np.interp(h, grid, values))
 
 
-def corner_correlations(px: Pixels, faces: Indices, radius: float, order: int = 1) -> Floats:
+def corner_correlations(px: Pixels, faces: Indices, radius: float, order: int = 1) -> NDArray[np.float32]:
     """Correlation coefficients of the errors of corners 0 and 1, 1 and 2, 2 and 0 of each triangle, in each camera.
 
     px : (C, N, 2) px, the vertices in the reference image of each camera, NaN where it does not see them.
     faces : (M, 3) vertex indices. radius : of the subsets, px. order : of their shape functions, 1 or 2.
     Returns (C, M, 3); 0 where a camera does not see both corners.
     """
-    out = np.empty((len(px), len(faces), 3))
-    for camera, at in enumerate(px):
+    out = np.zeros((len(px), len(faces), 3), np.float32)
+    for at, correlation in zip(px, out, strict=True):
+        seen = np.isfinite(at[:, 0])
         for k in range(3):
-            apart = at[faces[:, k]] - at[faces[:, (k + 1) % 3]]
-            out[camera, :, k] = subset_correlation(np.hypot(apart[:, 0], apart[:, 1]), radius, order)
-    return np.nan_to_num(out, copy=False)
+            first, second = faces[:, k], faces[:, (k + 1) % 3]
+            both = np.flatnonzero(seen[first] & seen[second])
+            apart = at[first[both]] - at[second[both]]
+            correlation[both, k] = subset_correlation(np.hypot(apart[:, 0], apart[:, 1]), radius, order)
+    return out
 
 
 def stretch_sigma(
     deformed: Deformation,
     reference: Points,
     faces: Indices,
-    gain: Floats,
-    correlation: Floats,
+    gain: Gain,
+    correlation: NDArray[np.floating],
     sigma: Pixels,
 ) -> Floats:
     """Standard deviations of the stretches λ1 and λ2 at one step due to image noise.
@@ -82,8 +89,10 @@ def stretch_sigma(
     """
     variance = np.zeros((len(faces), 2))
     slopes = stretch_slopes(deformed, reference, faces, current_only=True)[0]
-    gain, sigma = np.ascontiguousarray(gain, dtype=float), np.ascontiguousarray(sigma, dtype=float)
-    kernels.stretch_variance(slopes, gain, sigma, correlation, np.ascontiguousarray(faces), variance)
+    kernels.stretch_variance(
+        slopes, np.ascontiguousarray(gain), np.ascontiguousarray(sigma), correlation, np.ascontiguousarray(faces),
+        variance,
+    )  # fmt: skip
     return np.sqrt(np.maximum(variance, 0.0))
 
 
@@ -108,6 +117,7 @@ def stretch_slopes(
     return current, before
 
 
+@cache
 def _second_order_correlation() -> tuple[Floats, Floats]:
     """Autocorrelation (k,) of the weight 4 - 6 ρ² on a disc at distances (k,) from 0 to 1 diameter, both returned."""
     n = 40
