@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ringdic.arrays import Image, Mask
+from ringdic.arrays import Image, Mask, Points
 from ringdic.charts.chart import Chart, chart_with_uncertainty
 from ringdic.charts.depth_map import DepthMap, depths_at_fitting_size
 from ringdic.charts.evidence import match_evidence, why_unmatched
@@ -20,8 +21,7 @@ from ringdic.charts.images import ChartImages
 from ringdic.charts.matching import drop_masked, match_chart
 from ringdic.charts.patches import Patches
 from ringdic.charts.plane_sweep import DepthRange
-from ringdic.charts.series import camera_view
-from ringdic.charts.surface import ReferenceSurface, reference_surface
+from ringdic.charts.surface import reference_surface
 from ringdic.charts.tracked_points import TrackedPoints, tracked_points
 from ringdic.charts.tracking import CameraMatches, match_in_two_passes, surface_grid
 from ringdic.charts.unmeasured import arrays_of_places, unmeasured_places
@@ -284,13 +284,14 @@ def _reference_and_points(
     camera = cameras[k]
 
     def make() -> tuple[Reference, TrackedPoints]:
-        measured = ReferenceSurface.from_arrays(read_output(surface))
-        view = camera_view(camera, k, measured)
-        if not len(view.vertex):
+        xyz, faces, seen = process_memory.get(
+            ("surface", str(surface)), lambda: _seen_surface(surface), lambda value: sum(each.nbytes for each in value)
+        )
+        if not seen[k].any():
             raise ComputationError(f"camera {camera.id}: it shares no measured point of the surface with another")
-        px = np.full((len(measured.xyz), 2), np.nan)
-        px[view.vertex] = view.px
-        grid = surface_grid(camera.size, settings.step, [(px, measured.faces.astype(np.int32))])
+        px = np.full((len(xyz), 2), np.nan)
+        px[seen[k]] = camera.project(xyz[seen[k]])
+        grid = surface_grid(camera.size, settings.step, [(px, faces)])
         prepared = prepare_reference(step_image(image, camera), grid.region, settings)
         assert prepared.gradient  # computed here once, when first used
         return prepared, tracked_points(prepared, grid.xy, settings)
@@ -300,3 +301,9 @@ def _reference_and_points(
         return reference_bytes(prepared, len(points.positions), settings)
 
     return process_memory.get(("tracked reference", camera.id, str(surface)), make, size)
+
+
+def _seen_surface(path: Path) -> tuple[Points, NDArray[np.int32], Mask]:
+    """Points (N, 3) mm, triangles (M, 3) of a surface, and which of the points each of C cameras sees, (C, N) bool."""
+    arrays = read_output(path)
+    return arrays["xyz"], arrays["faces"].astype(np.int32), np.asarray(np.isfinite(arrays["px"][..., 0]))

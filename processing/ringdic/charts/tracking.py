@@ -78,10 +78,11 @@ def surface_grid(size: tuple[int, int], step: int, views: Sequence[ChartView]) -
     region = np.zeros((height, width), np.uint8)
     wanted = np.zeros((width // step + 2, height // step + 2), bool)
     for px, faces in views:
-        corners = px[faces]
-        triangles = corners[np.isfinite(corners).all(axis=(1, 2))]
-        cv2.fillPoly(region, list(np.rint(triangles * 2**_DIGITS).astype(np.int32)), 1, shift=_DIGITS)
-        at = px[np.isfinite(px).all(axis=1)]
+        seen: Mask = np.asarray(np.isfinite(px).all(axis=1))
+        first, second, third = seen[faces.T]
+        corners = np.rint(np.where(seen[:, None], px, 0.0) * 2**_DIGITS).astype(np.int32)
+        cv2.fillPoly(region, list(corners[faces[first & second & third]]), 1, shift=_DIGITS)
+        at = px[seen]
         at = at[(at >= 0).all(axis=1) & (at <= (width - 1, height - 1)).all(axis=1)]
         column, row = np.floor(at / step).astype(np.int64).T
         for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
