@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels
-from ringdic.charts.tracked_points import APART, TrackedPoints, robust_quadratics
+from ringdic.charts.tracked_points import APART, TrackedPoints, contradiction_limit, robust_quadratics
 from ringdic.correlation import (
     CorrelationSettings,
     Current,
@@ -99,7 +99,7 @@ def match_tracked_points(
     warp = _predicted_warps(first, points, settings.radius)
     part = _about(points.pixels + warp[:, :2], settings.radius, part, current)
     second = correlate_independently(reference, part, points.pixels, settings, warp, repeated=True)
-    mended, again = _mend_curvature(second, points, settings.radius)
+    mended, again = _mend_curvature(second, warp[:, :2], points, settings.radius)
     if len(again):
         settings = replace(settings, order=2)
         third = correlate_independently(reference, part, points.pixels[again], settings, _warp(mended)[again])
@@ -222,14 +222,20 @@ def _change_of_curvature(fit: QuadraticFit, matches: PointMatches, held: Floats,
         return change * _shrinkage(change, sigma.reshape(-1, 6), _CURVED), known
 
 
-def _mend_curvature(second: PointMatches, points: TrackedPoints, radius: int) -> tuple[PointMatches, Indices]:
+def _mend_curvature(
+    second: PointMatches, predicted: Pixels, points: TrackedPoints, radius: int
+) -> tuple[PointMatches, Indices]:
     """Correct the second pass for the curvature of its own displacements, over smaller neighbourhoods.
 
-    Returns the matches, and the points (k,) int at the rim of a strongly curved field, where it is unknown.
+    predicted : (n, 2) px, the displacements that it started from; what contradicts them is left out. Returns the
+    matches, and the points (k,) int at the rim of a strongly curved field, where it is unknown.
     """
     knots = points.fine_knots
+    distance = np.hypot(*(second.uv - predicted).T)
+    with np.errstate(invalid="ignore"):
+        agreeing = distance <= contradiction_limit(distance)
     own = second.part(knots.index)
-    fit = robust_quadratics(knots.neighbourhoods, own.uv, np.hypot(*own.sigma.T))
+    fit = knots.neighbourhoods.fit(np.where(agreeing[knots.index, None], own.uv, np.nan), np.hypot(*own.sigma.T))
     change, known = _change_of_curvature(fit, own, own.curvature.reshape(-1, 6), radius)
     if not known.any():
         return second, np.zeros(0, np.int64)

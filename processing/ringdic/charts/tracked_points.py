@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels
 from ringdic.correlation import CorrelationSettings, Reference
-from ringdic.correlation.quadratic import LowerQuartiles, Neighbourhoods, QuadraticFit
+from ringdic.correlation.quadratic import Neighbourhoods, QuadraticFit
 
 #: Side of the squares with one knot each, in subset radii.
 APART = 1.5
@@ -47,8 +47,7 @@ class Knots:
         pixels : (n, 2) px. side : px, of squares with one knot each. window : px, radius of the neighbourhoods.
         """
         index = thin_to_grid(pixels, side)
-        _, nearest = cKDTree(pixels[index]).query(pixels)
-        return cls(index, np.asarray(nearest, np.int64), Neighbourhoods(pixels[index], window))
+        return cls(index, _nearest(pixels, index, side), Neighbourhoods(pixels[index], window))
 
     @property
     def one_sided(self) -> Mask:
@@ -79,7 +78,7 @@ class TrackedPoints:
     positions : (n, 2) float64, px. pixels : (n, 2) float64, px, the whole pixels next to them, on which their
     subsets lie. variance : (n,), of the grey levels there, grey levels². least : mean square difference due
     to rounding to whole grey levels, grey levels². knots : matched before all other points. fine_knots : closer
-    together, with smaller neighbourhoods. quartile : of the knots about each point.
+    together, with smaller neighbourhoods.
     """
 
     positions: Pixels
@@ -88,7 +87,6 @@ class TrackedPoints:
     least: float
     knots: Knots
     fine_knots: Knots
-    quartile: LowerQuartiles
 
     @property
     def shift(self) -> Pixels:
@@ -109,13 +107,13 @@ class TrackedPoints:
         own = np.hypot(*fit.leave_one_out.T)
         distance[index] = np.where(np.isfinite(own), own, distance[index])
         with np.errstate(invalid="ignore"):
-            return np.asarray(distance > _limit(distance))
+            return np.asarray(distance > contradiction_limit(distance))
 
     def largest_difference(self, mean_square: Floats) -> Floats:
         """Limit of the mean square difference of a good match at each point, from those of its neighbours.
 
         A point whose subsets differ by far more than those about it is partly covered or worn; next to an obstacle
-        only the best of its neighbours are unobstructed, so the lower quartile about a point is taken. Noise
+        only the best of its neighbours are unobstructed, so the lower quartile about its knot is taken. Noise
         contributes equally in weak and in strong texture, so weak texture is not mistaken for a difference.
 
         mean_square : (n,) grey levels², NaN where unknown. Returns (n,) grey levels², NaN where nothing is known.
@@ -123,7 +121,8 @@ class TrackedPoints:
         known = np.isfinite(mean_square)
         if not known.any():
             return np.full(len(mean_square), np.nan)
-        return _UNLIKE * np.fmax(self.quartile(mean_square[self.knots.index]), np.median(mean_square[known]))
+        quartile = self.knots.neighbourhoods.lower_quartile(mean_square[self.knots.index])
+        return _UNLIKE * np.fmax(quartile[self.knots.of_points], np.median(mean_square[known]))
 
 
 def tracked_points(reference: Reference, positions: Pixels, settings: CorrelationSettings) -> TrackedPoints:
@@ -134,10 +133,9 @@ def tracked_points(reference: Reference, positions: Pixels, settings: Correlatio
     pixels, radius = np.rint(positions), settings.radius
     knots = Knots.of(pixels, APART * radius, _REACH * radius)
     fine_knots = Knots.of(pixels, _FINE[0] * radius, _FINE[1] * radius)
-    quartile = LowerQuartiles(pixels, knots.neighbourhoods.xy, knots.neighbourhoods.window)
     least = (reference.grey_range / 255.0) ** 2
     variance = _variance(reference, pixels, radius)
-    return TrackedPoints(positions, pixels, variance, least, knots, fine_knots, quartile)
+    return TrackedPoints(positions, pixels, variance, least, knots, fine_knots)
 
 
 def thin_to_grid(xy: Pixels, side: float) -> Indices:
@@ -152,6 +150,23 @@ def thin_to_grid(xy: Pixels, side: float) -> Indices:
     return np.sort(order[np.flatnonzero(np.diff(label[order], prepend=-1))])
 
 
+def _nearest(xy: Pixels, index: Indices, side: float) -> Indices:
+    """The knot nearest to each point, of those in its square of a grid and in the eight about it.
+
+    xy : (n, 2) px. index : (m,), the knots among the points, one in every square that is not empty. side : px, of the
+    squares. Returns (n,) numbers of knots.
+    """
+    cell = np.floor((xy - xy.min(axis=0)) / side).astype(np.int64) + 1
+    table = np.full(cell.max(axis=0) + 2, -1)
+    table[tuple(cell[index].T)] = np.arange(len(index))
+    out, least = np.zeros(len(xy), np.int64), np.full(len(xy), np.inf)
+    for shift in np.ndindex(3, 3):
+        knot = table[tuple((cell + shift - 1).T)]
+        distance = np.where(knot >= 0, np.hypot(*(xy - xy[index[knot]]).T), np.inf)
+        out, least = np.where(distance < least, knot, out), np.minimum(distance, least)
+    return out
+
+
 def robust_quadratics(neighbourhoods: Neighbourhoods, values: Pixels, sigma: Floats) -> QuadraticFit:
     """Fit local quadratics of a field with rejection of outlying points.
 
@@ -162,7 +177,7 @@ def robust_quadratics(neighbourhoods: Neighbourhoods, values: Pixels, sigma: Flo
     for factor in _STRICTER:
         with np.errstate(invalid="ignore"):
             distance = np.hypot(*np.where(np.isfinite(agreeing), fit.leave_one_out, values - fit.value).T)
-            contradicting = distance > factor * _limit(distance)
+            contradicting = distance > factor * contradiction_limit(distance)
         if (contradicting == (np.isfinite(values) & ~np.isfinite(agreeing)).any(axis=1)).all():
             continue
         agreeing = np.where(contradicting[:, None], np.nan, values)
@@ -170,8 +185,11 @@ def robust_quadratics(neighbourhoods: Neighbourhoods, values: Pixels, sigma: Flo
     return replace(fit, leave_one_out=np.where(np.isfinite(agreeing), fit.leave_one_out, values - fit.value))
 
 
-def _limit(distance: Floats) -> float:
-    """Distance from a quadratic, px, beyond which a point contradicts it, from the distances (m,) px of all points."""
+def contradiction_limit(distance: Floats) -> float:
+    """Distance from a quadratic, px, beyond which a point contradicts it.
+
+    distance : (m,) px, of all points from their quadratics, NaN where unknown.
+    """
     known = np.isfinite(distance)
     scatter = 1.4826 * float(np.median(distance[known])) if known.any() else 0.0
     return max(_LEAST_OFF, _SCATTERS * scatter)
@@ -180,16 +198,19 @@ def _limit(distance: Floats) -> float:
 def _variance(reference: Reference, xy: Pixels, radius: int) -> Floats:
     """Variance of the grey levels in the squares about points, without the pixels that the mask excludes.
 
-    xy : (n, 2) px. Returns (n,) grey levels².
+    It is taken from every ``thin``-th pixel each way. xy : (n, 2) px. Returns (n,) grey levels².
     """
-    size = (2 * radius + 1,) * 2
-    inside = reference.mask.astype(np.float32)
-    level = (reference.grey - np.float32(reference.grey.mean())).astype(np.float32) * inside
-    column, row = np.rint(xy - reference.origin).astype(np.int64).T
+    thin = max(radius // 8, 1)
+    size = (2 * (radius // thin) + 1,) * 2
+    inside = reference.mask[::thin, ::thin].astype(np.float32)
+    grey = reference.grey[::thin, ::thin].astype(np.float32)
+    level = (grey - grey.mean()) * inside
+    column, row = np.rint((xy - reference.origin) / thin).astype(np.int64).T
+    at = np.minimum(row, inside.shape[0] - 1), np.minimum(column, inside.shape[1] - 1)
 
     def total(values: NDArray[np.float32]) -> Floats:
         summed = cv2.boxFilter(values, cv2.CV_32F, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray(summed[row, column], dtype=np.float64)
+        return np.asarray(summed[at], dtype=np.float64)
 
     count = np.maximum(total(inside), 1.0)
     return np.maximum(total(level * level) / count - (total(level) / count) ** 2, 0.0)

@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels
+from ringdic.correlation.interpolation import FAST
 from ringdic.correlation.lanes import INNER
 from ringdic.correlation.parallel import in_ranges
-from ringdic.correlation.warps import cholesky, solve_cholesky
+from ringdic.correlation.warps import cholesky, solve_cholesky, variance
 
 _MIN_NEIGHBOURS = 10  # for six coefficients, the point itself included
 _MIN_SIGMA = 0.3  # least uncertainty that counts, as a share of the median: bounds the weight of a single point
@@ -98,6 +99,16 @@ class Neighbourhoods:
             c[..., 0], c[..., 1:3] / w, c[..., 3:] / w**2, scatter[:, 0], scatter[:, 3:] / w**2, leave_one_out
         )
 
+    def lower_quartile(self, values: Floats) -> Floats:
+        """Lower quartile of values around every point, of which those with NaN are left out.
+
+        values : (n,) float64, in any unit. Returns (n,) in that unit, NaN where no value is known.
+        """
+        out = np.full(len(self.xy), np.nan)
+        given = np.ascontiguousarray(values, dtype=np.float64)
+        in_ranges(_quartiles, len(out), self._first, self._members, given, out, least=_LEAST)
+        return out
+
 
 def _weights(known: Mask, sigma: Floats | None) -> Floats:
     """Weights (n,) of the points, 0 where not measured; no point has much less than the median uncertainty."""
@@ -135,23 +146,6 @@ def _cells(xy: Pixels, side: float, columns: int) -> Indices:
     return np.asarray(row * columns + column)
 
 
-class LowerQuartiles:
-    """Lower quartiles of values at points (m, 2) px within a radius ``window`` px of each centre (n, 2) px."""
-
-    def __init__(self, centres: Pixels, xy: Pixels, window: float) -> None:
-        self._first, self._members = neighbours_within(np.asarray(centres, float), np.asarray(xy, float), float(window))
-
-    def __call__(self, values: Floats) -> Floats:
-        """Lower quartile around each centre, of values (m,) of which those with NaN are left out.
-
-        values : (m,) float64, in any unit. Returns (n,) in that unit, NaN where no value is known.
-        """
-        out = np.full(len(self._first) - 1, np.nan)
-        given = np.ascontiguousarray(values, dtype=np.float64)
-        in_ranges(_quartiles, len(out), self._first, self._members, given, out, least=_LEAST)
-        return out
-
-
 @nb.njit(cache=True, nogil=True)
 def _within(centres, xy, window, cell, columns, by_cell, starts):  # type: ignore[no-untyped-def]
     """Neighbourhoods of ``neighbours_within``: where each begins (n + 1,), and the members (k,) of all.
@@ -181,57 +175,70 @@ def _within(centres, xy, window, cell, columns, by_cell, starts):  # type: ignor
 
 
 @nb.njit(cache=True, nogil=True, **INNER)
-def _normal_matrix(xy, i, members, window, weight, M):  # type: ignore[no-untyped-def]
-    """Fill the lower half of the normal matrix M (6, 6) of the neighbours of point i, lengths in units of the window.
+def _gather(xy, i, members, window, weight, values, near):  # type: ignore[no-untyped-def]
+    """Copy the members with a weight into the rows of ``near`` (3 + k, at least their number).
 
-    Returns the number of neighbours with a weight.
+    The rows are x and y from point i in units of the window, the weight, and the k weighted values. Returns the
+    number of these members.
     """
-    count = 0
-    m00 = m10 = m01 = m20 = m11 = m02 = m30 = m21 = m12 = m03 = m40 = m31 = m22 = m13 = m04 = 0.0
+    count, scale = 0, 1.0 / window
     for j in members:
         w = weight[j]
         if w > 0.0:
+            near[0, count], near[1, count] = (xy[j, 0] - xy[i, 0]) * scale, (xy[j, 1] - xy[i, 1]) * scale
+            near[2, count] = w
+            for m in range(len(values)):
+                near[3 + m, count] = w * values[m, j]
             count += 1
-            x, y = (xy[j, 0] - xy[i, 0]) / window, (xy[j, 1] - xy[i, 1]) / window
-            xx, xy_, yy = x * x, x * y, y * y
-            m00 += w
-            m10 += w * x
-            m01 += w * y
-            m20 += w * xx
-            m11 += w * xy_
-            m02 += w * yy
-            m30 += w * xx * x
-            m21 += w * xx * y
-            m12 += w * x * yy
-            m03 += w * yy * y
-            m40 += w * xx * xx
-            m31 += w * xx * xy_
-            m22 += w * xx * yy
-            m13 += w * xy_ * yy
-            m04 += w * yy * yy
+    return count
+
+
+@nb.njit(fastmath=FAST, cache=True, nogil=True, **INNER)
+def _normal_matrix(near, count, M):  # type: ignore[no-untyped-def]
+    """Fill the lower half of the normal matrix M (6, 6) from the neighbours of ``_gather``."""
+    at_x, at_y, weights = near[0], near[1], near[2]
+    m00 = m10 = m01 = m20 = m11 = m02 = m30 = m21 = m12 = m03 = m40 = m31 = m22 = m13 = m04 = 0.0
+    for j in range(np.uint64(count)):
+        x, y, w = at_x[j], at_y[j], weights[j]
+        wx, wy = w * x, w * y
+        wxx, wxy, wyy = wx * x, wx * y, wy * y
+        m00 += w
+        m10 += wx
+        m01 += wy
+        m20 += wxx
+        m11 += wxy
+        m02 += wyy
+        m30 += wxx * x
+        m21 += wxx * y
+        m12 += wyy * x
+        m03 += wyy * y
+        m40 += wxx * x * x
+        m31 += wxx * x * y
+        m22 += wxx * y * y
+        m13 += wyy * x * y
+        m04 += wyy * y * y
     M[0, 0], M[1, 0], M[2, 0], M[1, 1], M[2, 1], M[2, 2] = m00, m10, m01, m20, m11, m02
     M[3, 0], M[3, 1], M[3, 2], M[3, 3] = 0.5 * m20, 0.5 * m30, 0.5 * m21, 0.25 * m40
     M[4, 0], M[4, 1], M[4, 2], M[4, 3], M[4, 4] = m11, m21, m12, 0.5 * m31, m22
     M[5, 0], M[5, 1], M[5, 2], M[5, 3], M[5, 4], M[5, 5] = (
         0.5 * m02, 0.5 * m12, 0.5 * m03, 0.25 * m22, 0.5 * m13, 0.25 * m04,
     )  # fmt: skip
-    return count
 
 
-@nb.njit(cache=True, nogil=True, **INNER)
-def _right_side(xy, i, members, window, weight, values, b):  # type: ignore[no-untyped-def]
-    """Fill the right side b (6,) of the normal equations of point i from the weighted values (n,)."""
+@nb.njit(fastmath=FAST, cache=True, nogil=True, **INNER)
+def _right_side(near, component, count, b):  # type: ignore[no-untyped-def]
+    """Fill the right side b (6,) of the normal equations of one component from the neighbours of ``_gather``."""
+    at_x, at_y, weighted = near[0], near[1], near[3 + component]
     b0 = b1 = b2 = b3 = b4 = b5 = 0.0
-    for j in members:
-        if weight[j] > 0.0:
-            x, y = (xy[j, 0] - xy[i, 0]) / window, (xy[j, 1] - xy[i, 1]) / window
-            v = weight[j] * values[j]
-            b0 += v
-            b1 += v * x
-            b2 += v * y
-            b3 += v * x * x
-            b4 += v * x * y
-            b5 += v * y * y
+    for j in range(np.uint64(count)):
+        x, y, v = at_x[j], at_y[j], weighted[j]
+        vx, vy = v * x, v * y
+        b0 += v
+        b1 += vx
+        b2 += vy
+        b3 += vx * x
+        b4 += vx * y
+        b5 += vy * y
     b[0], b[1], b[2], b[3], b[4], b[5] = b0, b1, b2, 0.5 * b3, b4, 0.5 * b5
 
 
@@ -242,25 +249,25 @@ def _fit(begin, end, xy, first, members, window, weight, values, c, scatter):  #
     Lengths are in units of the window. scatter : square roots of the diagonal of the inverse normal matrix.
     values : (k, n). weight : (n,), 0 where not measured.
     """
-    k = len(values)
+    k, most = len(values), 0
     for i in range(begin, end):
-        about = members[first[i] : first[i + 1]]
-        M, e = np.empty((6, 6)), np.empty(6)
-        if _normal_matrix(xy, i, about, window, weight, M) < _MIN_NEIGHBOURS:
+        most = max(most, first[i + 1] - first[i])
+    near, M, e = np.empty((3 + k, most)), np.empty((6, 6)), np.empty(6)
+    for i in range(begin, end):
+        count = _gather(xy, i, members[first[i] : first[i + 1]], window, weight, values, near)
+        if count < _MIN_NEIGHBOURS:
             continue
+        _normal_matrix(near, count, M)
         trace = M[0, 0] + M[1, 1] + M[2, 2] + M[3, 3] + M[4, 4] + M[5, 5]
         for p in range(6):
             M[p, p] += _RIDGE * trace
         if not cholesky(M, 6):
             continue
         for m in range(k):
-            _right_side(xy, i, about, window, weight, values[m], c[i, m])
+            _right_side(near, m, count, c[i, m])
             solve_cholesky(M, c[i, m], 6)
         for p in range(6):
-            e[:] = 0.0
-            e[p] = 1.0
-            solve_cholesky(M, e, 6)
-            scatter[i, p] = math.sqrt(e[p])
+            scatter[i, p] = math.sqrt(variance(M, e, 6, p))
 
 
 @nb.njit(cache=True, nogil=True)

@@ -162,8 +162,8 @@ def test_another_calibration_makes_all_anew(session: Path) -> None:
     assert set(keys(session)).isdisjoint(keys(session, **{camera.id: moved}))
 
 
-def test_no_image_is_decoded_twice_and_no_depth_map_read_twice(session: Path) -> None:
+def test_no_image_is_decoded_and_no_map_or_surface_read_twice(session: Path) -> None:
     before = process_memory.computations
     process_session(session, SETTINGS, executor=LocalExecutor(2))
-    images, references, depth_maps = 2 * STEPS, 2, 2
-    assert process_memory.computations - before == images + references + depth_maps
+    images, references, depth_maps, surfaces = 2 * STEPS, 2, 2, 1
+    assert process_memory.computations - before == images + references + depth_maps + surfaces
