@@ -234,42 +234,30 @@ def _positions(shape, x0, y0, warp, px, n, radius, nearest, at, share):  # type:
 
 
 @nb.njit(cache=True, nogil=True, fastmath=_FAST, **INNER)
-def _grey_levels(image, columns, n, nearest, at, share, level):  # type: ignore[no-untyped-def]
-    """Grey levels of a flat image at n positions, into level (n,): of the nearest pixel, or interpolated bilinearly.
-
-    at (n,) and share (2, n) are as ``_positions`` fills them; columns : the width of the image.
-    """
-    kind, one = np.float32, np.uint64(1)
-    if nearest:
-        for m in range(np.uint64(n)):
-            level[m] = kind(image[np.uint64(at[m])])
-        return
-    for m in range(np.uint64(n)):
-        above = np.uint64(at[m])
-        below = above + np.uint64(columns)
-        g, h = kind(image[above]), kind(image[below])
-        g += share[0, m] * (kind(image[above + one]) - g)
-        h += share[0, m] * (kind(image[below + one]) - h)
-        level[m] = g + share[1, m] * (h - g)
-
-
-@nb.njit(cache=True, nogil=True, fastmath=_FAST, **INNER)
-def _zncc(image, shape, x0, y0, warp, px, n, norm, radius, nearest, at, share, level):  # type: ignore[no-untyped-def]
+def _zncc(image, shape, x0, y0, warp, px, n, norm, radius, nearest, at, share):  # type: ignore[no-untyped-def]
     """ZNCC of a subset of n pixels px (3, n) with the flat current image under a warp (6,).
 
     Grey levels are those of the nearest pixels (``nearest``) or bilinear. norm : of the subset's levels about their
-    mean. -1 where a pixel lies outside the image, the warp is NaN or the image is even. at, share, level : scratch.
+    mean. -1 where a pixel lies outside the image, the warp is NaN or the image is even. at, share : scratch.
     """
     if n < 8 or not norm > 0.0 or not _positions(shape, x0, y0, warp, px, n, radius, nearest, at, share):
         return -1.0
-    _grey_levels(image, shape[1], n, nearest, at, share, level)
-    s_g = s_gg = s_fg = 0.0
+    kind, first = np.float32, np.float32(image[np.uint64(at[0])])  # about a level of them, single precision is enough
+    s_g, s_gg, s_fg, one = kind(0), kind(0), kind(0), np.uint64(1)
     for m in range(np.uint64(n)):
-        g = float(level[m])
+        above = np.uint64(at[m])
+        g = kind(image[above])
+        if not nearest:
+            below = above + np.uint64(shape[1])
+            h = kind(image[below])
+            g += share[0, m] * (kind(image[above + one]) - g)
+            h += share[0, m] * (kind(image[below + one]) - h)
+            g += share[1, m] * (h - g)
+        g -= first
         s_g += g
         s_gg += g * g
         s_fg += g * px[2, m]
-    variance = s_gg - s_g * s_g / n
+    variance = float(s_gg) - float(s_g) * float(s_g) / n
     return s_fg / (norm * math.sqrt(variance)) if variance > 1e-9 * (n + s_gg) else -1.0
 
 
@@ -302,7 +290,7 @@ def _best_warps(  # type: ignore[no-untyped-def]
         jx, iy = math.floor(x0 + 0.5), math.floor(y0 + 0.5)
         most = (2 * (radius // stride) + 1) ** 2
         px, share = np.empty((3, most), np.float32), np.empty((2, most), np.float32)
-        pixel, level = np.empty(most, np.int32), np.empty(most, np.float32)
+        pixel = np.empty(most, np.int32)
         score, warp, highest, limit = np.full(count, -1.0), np.empty(6), -1.0, -2.0
         if count >= _MANY:
             n, norm = _pixels(
@@ -310,7 +298,7 @@ def _best_warps(  # type: ignore[no-untyped-def]
             )
             for h in range(count):
                 _interpolate_knots(knots[k], knot_coordinates[h], warp)
-                score[h] = _zncc(flat, image.shape, x0, y0, warp, px, n, norm, radius, True, pixel, share, level)
+                score[h] = _zncc(flat, image.shape, x0, y0, warp, px, n, norm, radius, True, pixel, share)
                 highest = max(highest, score[h])
             limit = max(highest - _DOUBT, -0.99)
         if highest > zncc_min - _DOUBT or count < _MANY:
@@ -318,7 +306,7 @@ def _best_warps(  # type: ignore[no-untyped-def]
             for h in range(count):
                 if score[h] > limit:
                     _interpolate_knots(knots[k], knot_coordinates[h], warp)
-                    score[h] = _zncc(flat, image.shape, x0, y0, warp, px, n, norm, radius, False, pixel, share, level)
+                    score[h] = _zncc(flat, image.shape, x0, y0, warp, px, n, norm, radius, False, pixel, share)
         at = 0
         for h in range(count):
             if score[h] > score[at]:
