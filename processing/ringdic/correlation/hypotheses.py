@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels
-from ringdic.correlation.lanes import INNER
+from ringdic.correlation.lanes import INNER, LANES, floor, load, pointer, store, store_integers
 from ringdic.correlation.parallel import in_ranges
 from ringdic.correlation.prepared import Current, Reference
 
@@ -200,21 +200,24 @@ def _pixels(grey, mask, left_of_mask, top_of_mask, jx, iy, off_x, off_y, radius,
 
 @nb.njit(cache=True, nogil=True, fastmath=_FAST, **INNER)
 def _positions(shape, x0, y0, warp, px, n, radius, nearest, at, share):  # type: ignore[no-untyped-def]
-    """Positions of n pixels of a subset in the current image under a warp; false where one lies outside the image.
+    """Positions of n pixels of a subset in the current image under a warp.
 
     shape : (h, w) of the current image; x0, y0 : the point; warp : (6,); px : (3, n), offsets of the pixels.
-    Fills at (n,), flat index of the pixel to the upper left (``nearest``: of the nearest pixel), and, unless
-    ``nearest``, share (2, n), the fraction of a pixel from there to the position. Positions are measured from the
-    corner of the subset, so that single precision is enough.
+    Fills at (n,), flat index of the pixel to the upper left (``nearest``: of the nearest pixel), counted from that of
+    the subset's corner, and, unless ``nearest``, share (2, n), the fraction of a pixel from there to the position. So
+    single precision is enough. Arrays are long enough for whole vectors. Returns the corner's flat index, and whether
+    all pixels lie inside the image.
     """
     kind, half = np.float32, 0.5 if nearest else 0.0
     wide = (radius + 1.0) * (1.0 + abs(warp[2]) + abs(warp[3]))
     high = (radius + 1.0) * (1.0 + abs(warp[4]) + abs(warp[5]))
     x, y = x0 + warp[0], y0 + warp[1]
-    if not (wide + high < 1e4 and x > -wide and y > -high and x < shape[1] + wide and y < shape[0] + high):
-        return False
+    if not (
+        (wide + high) * shape[1] < 2.0**23 and x > -wide and y > -high and x < shape[1] + wide and y < shape[0] + high
+    ):
+        return 0, False
     left, top = math.floor(x - wide), math.floor(y - high)
-    first, columns = np.int32(top * shape[1] + left), np.int32(shape[1])
+    columns = kind(shape[1])
     xx, xy, x_off = kind(1.0 + warp[2]), kind(warp[3]), kind(x - left + half)
     yx, yy, y_off = kind(warp[4]), kind(1.0 + warp[5]), kind(y - top + half)
     if not (x > wide and y > high and x + wide < shape[1] - 1 and y + high < shape[0] - 1):
@@ -222,15 +225,19 @@ def _positions(shape, x0, y0, warp, px, n, radius, nearest, at, share):  # type:
             x_at = x + (1.0 + warp[2]) * px[0, m] + warp[3] * px[1, m]
             y_at = y + warp[4] * px[0, m] + (1.0 + warp[5]) * px[1, m]
             if not (x_at >= 0.0 and y_at >= 0.0 and x_at < shape[1] - 1 and y_at < shape[0] - 1):
-                return False
-    for m in range(np.uint64(n)):
-        dx, dy = px[0, m], px[1, m]
-        x_at, y_at = x_off + xx * dx + xy * dy, y_off + yx * dx + yy * dy
-        column, row = np.int32(x_at), np.int32(y_at)
-        at[m] = first + row * columns + column
+                return 0, False
+    along, down, number, along_share, down_share = (
+        pointer(px[0]), pointer(px[1]), pointer(at), pointer(share[0]), pointer(share[1]),
+    )  # fmt: skip
+    for v in range(np.uint64(0), np.uint64(n), np.uint64(LANES)):
+        dx, dy = load(along, v), load(down, v)
+        x_at, y_at = dx * xx + dy * xy + x_off, dx * yx + dy * yy + y_off
+        column, row = floor(x_at), floor(y_at)
+        store_integers(number, v, row * columns + column)
         if not nearest:
-            share[0, m], share[1, m] = x_at - kind(column), y_at - kind(row)
-    return True
+            store(along_share, v, x_at - column)
+            store(down_share, v, y_at - row)
+    return top * shape[1] + left, True
 
 
 @nb.njit(cache=True, nogil=True, fastmath=_FAST, **INNER)
@@ -240,12 +247,18 @@ def _zncc(image, shape, x0, y0, warp, px, n, norm, radius, nearest, at, share): 
     Grey levels are those of the nearest pixels (``nearest``) or bilinear. norm : of the subset's levels about their
     mean. -1 where a pixel lies outside the image, the warp is NaN or the image is even. at, share : scratch.
     """
-    if n < 8 or not norm > 0.0 or not _positions(shape, x0, y0, warp, px, n, radius, nearest, at, share):
+    if n < 8 or not norm > 0.0:
         return -1.0
-    kind, first = np.float32, np.float32(image[np.uint64(at[0])])  # about a level of them, single precision is enough
+    corner, inside = _positions(shape, x0, y0, warp, px, n, radius, nearest, at, share)
+    if not inside:
+        return -1.0
+    kind, first = (
+        np.float32,
+        np.float32(image[np.uint64(corner + at[0])]),
+    )  # about a level of them, single precision is enough
     s_g, s_gg, s_fg, one = kind(0), kind(0), kind(0), np.uint64(1)
     for m in range(np.uint64(n)):
-        above = np.uint64(at[m])
+        above = np.uint64(corner + at[m])
         g = kind(image[above])
         if not nearest:
             below = above + np.uint64(shape[1])
@@ -288,7 +301,7 @@ def _best_warps(  # type: ignore[no-untyped-def]
     for k in range(first, last):
         x0, y0 = xy[k, 0], xy[k, 1]
         jx, iy = math.floor(x0 + 0.5), math.floor(y0 + 0.5)
-        most = (2 * (radius // stride) + 1) ** 2
+        most = ((2 * (radius // stride) + 1) ** 2 + LANES - 1) // LANES * LANES
         px, share = np.empty((3, most), np.float32), np.empty((2, most), np.float32)
         pixel = np.empty(most, np.int32)
         score, warp, highest, limit = np.full(count, -1.0), np.empty(6), -1.0, -2.0
