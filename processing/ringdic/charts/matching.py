@@ -31,6 +31,7 @@ from ringdic.correlation import (
     prepare_reference,
 )
 from ringdic.correlation.quadratic import Neighbourhoods
+from ringdic.correlation.refinement import SubsetCache
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.outliers import LostPoint
 from ringdic.geometry.triangulation import triangulate
@@ -103,13 +104,14 @@ def match_chart(
     reference = prepare_reference(images.image(k), region, settings)
     patches, nearest = interpolated_patches(camera, depth_map, xy)
     sees = plan.sees[np.ix_(nearest, partners)].T
+    subsets = SubsetCache(n, 1, transposed=True) if curved else None
     others = [images.cameras[other] for other in partners.tolist()]
     rays = stencil_rays(camera, xy, _reach(settings))
     stencil = patches.stencil(camera, _reach(settings), rays)
     views = [
         _View.of(
             reference, images.current(c), images.cameras[c], images.cameras[c].project(stencil[:, 0]),
-            np.flatnonzero(seen), _MARGIN * settings.radius,
+            np.flatnonzero(seen), _MARGIN * settings.radius, subsets,
         )
         for c, seen in zip(partners.tolist(), sees, strict=True)
     ]  # fmt: skip
@@ -217,8 +219,9 @@ class _View:
     """One camera in which points ``index`` (k,) of a chart are matched.
 
     current : its image in the box about them. held : (k, 6) 1/px, second derivatives that the warps were last held at,
-    NaN for points not tried yet. good : (k,) bool, points that are matched. changed : number of points whose curvature
-    was another one in the round before.
+    NaN for points not tried yet. good : (k,) bool, points that are matched. subsets : of all points of the chart, for
+    all cameras; None where none are kept. changed : number of points whose curvature was another one in the round
+    before.
     """
 
     camera: Camera
@@ -227,17 +230,21 @@ class _View:
     index: Indices
     held: Floats
     good: Mask
+    subsets: SubsetCache | None
     changed: int = 0
 
     @classmethod
     def of(
-        cls, reference: Reference, current: Current, camera: Camera, at: Pixels, index: Indices, margin: float
-    ) -> _View:
+        cls, reference: Reference, current: Current, camera: Camera, at: Pixels, index: Indices, margin: float,
+        subsets: SubsetCache | None,
+    ) -> _View:  # fmt: skip
         """A camera with its whole image. at : (n, 2) px, where all points of the chart are there. margin : px."""
         at = at[index][np.isfinite(at[index]).all(axis=1)]
         if len(at):
             current = current.crop_around(at, margin)
-        return cls(camera, reference, current, index, np.full((len(index), 6), np.nan), np.zeros(len(index), bool))
+        return cls(
+            camera, reference, current, index, np.full((len(index), 6), np.nan), np.zeros(len(index), bool), subsets
+        )
 
     def first_look(
         self, xy: Pixels, stencil: Points, settings: CorrelationSettings, chosen: Mask, *, curved: bool
@@ -253,7 +260,8 @@ class _View:
             return self.index[at], None
         points, used = xy[self.index[at]], replace(settings, order=1) if curved else settings
         start = start if curved or settings.order == 2 else start[:, :6]
-        matches = correlate_points(self.reference, self.current, points, used, start=start)
+        kept = self._kept(at)
+        matches = correlate_points(self.reference, self.current, points, used, start=start, kept=kept)
         self.held[at], self.good[at] = matches.curvature.reshape(-1, 6), matches.good
         return self.index[at], matches
 
@@ -271,11 +279,17 @@ class _View:
         if not len(at):
             return self.index[at], None
         points = xy[self.index[at]]
-        matches = correlate_independently(self.reference, self.current, points, replace(settings, order=1), start[at])
+        matches = correlate_independently(
+            self.reference, self.current, points, replace(settings, order=1), start[at], kept=self._kept(at)
+        )
         self.held[at] = start[at, 6:]
         entered = matches.good | ~self.good[at]
         self.good[at] |= matches.good
         return self.index[at[entered]], matches.part(entered)
+
+    def _kept(self, at: Indices) -> tuple[SubsetCache, Indices] | None:
+        """The subsets of all points, and those among them at ``at`` (j,) of the camera's own points."""
+        return None if self.subsets is None else (self.subsets, self.index[at])
 
     def _warps(self, xy: Pixels, stencil: Points, settings: CorrelationSettings, at: Indices) -> Floats:
         """Warps (j, 12) into this camera of the points at ``at`` (j,) of its own; NaN where there is none."""

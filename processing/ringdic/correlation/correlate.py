@@ -20,7 +20,7 @@ from ringdic.correlation.lattice_field import interpolate_lattice
 from ringdic.correlation.neighbours import local_affine_fit
 from ringdic.correlation.prepared import Current, Reference, prepare_current, prepare_reference
 from ringdic.correlation.propagation import Progress, Propagation
-from ringdic.correlation.refinement import refine
+from ringdic.correlation.refinement import SubsetCache, refine
 from ringdic.correlation.seeds import even_sample, flow_start_values, template_start_values
 from ringdic.correlation.settings import CorrelationSettings
 from ringdic.correlation.status import Status
@@ -92,6 +92,7 @@ def correlate_points(
     prefer_neighbour: bool = False,
     threads: int | None = None,
     progress: Progress | None = None,
+    kept: tuple[SubsetCache, Indices] | None = None,
 ) -> PointMatches:
     """Match points of a reference image in a current image.
 
@@ -110,6 +111,7 @@ def correlate_points(
         values that are less certain than a neighbour's match.
     threads : number of threads; all cores by default. The results do not depend on it.
     progress : called with the numbers of matched and of all points after every wave.
+    kept : cache of the reference's subsets for more points than these, and the row (n,) of each of these in it.
 
     Returns
     -------
@@ -125,7 +127,7 @@ def correlate_points(
         seconds = {"prepare": time.perf_counter() - began, "start": 0.0, "refine": 0.0}
         # Where start values are given, the kernel's own test of each subset is enough.
         textureless = None if start is None else np.zeros(len(xy), bool)
-        points = Propagation(reference, current, xy, settings, progress, textureless=textureless)
+        points = Propagation(reference, current, xy, settings, progress, textureless=textureless, kept=kept)
         if start is None:
             _match_automatically(points, seconds)
         else:
@@ -142,6 +144,7 @@ def correlate_independently(
     settings: CorrelationSettings,
     start: Floats,
     repeated: bool = False,
+    kept: tuple[SubsetCache, Indices] | None = None,
 ) -> PointMatches:
     """Match points of a reference image each from its own start value, without propagation and test of outliers.
 
@@ -152,6 +155,7 @@ def correlate_independently(
     xy : (n, 2) float64, px, points of the reference image.
     start : (n, 6) or (n, 12) float64, px and derivatives, as for :func:`correlate_points`; NaN leaves a point out.
     repeated : whether these points of the reference are matched in other images too, and what all share is kept.
+    kept : cache of the reference's subsets for more points than these, and the row (n,) of each of these in it.
 
     Raises InputError if there is no point, or if the images were prepared for other settings.
     """
@@ -159,8 +163,9 @@ def correlate_independently(
     load_kernels()
     textureless = np.zeros(len(xy), bool)  # the kernel tests each subset
     points = Propagation(
-        reference, current, xy, settings, region=current, textureless=textureless, independent=True, repeated=repeated
-    )
+        reference, current, xy, settings, region=current, textureless=textureless, independent=True, repeated=repeated,
+        kept=kept,
+    )  # fmt: skip
     given = np.flatnonzero(np.isfinite(start).all(axis=1))
     began = time.perf_counter()
     if len(given):

@@ -49,6 +49,7 @@ class Propagation:
     textureless : (n,) bool, points with too little texture; determined from the image by default.
     independent : each point is refined from its own start value only; no point has neighbours.
     repeated : these points are matched in other images too, so that their normal matrices are worth keeping.
+    kept : cache of the reference's subsets to be used instead of one of these points alone, and the row (n,) of each.
 
     Attributes
     ----------
@@ -73,6 +74,7 @@ class Propagation:
     textureless: Mask | None = None
     independent: bool = False
     repeated: bool = True
+    kept: tuple[SubsetCache, Indices] | None = None
     near: Indices = field(init=False)
     parameters: Floats = field(init=False)
     status: Indices = field(init=False)
@@ -100,7 +102,7 @@ class Propagation:
         if self.textureless is None:
             self.textureless = textureless_points(self.reference, self.xy, self.settings)
         self.status[self.textureless] = Status.NO_TEXTURE
-        if self.repeated:
+        if self.repeated and self.kept is None:
             self.subsets = subset_cache(self.reference, self.xy, self.settings)
 
     @property
@@ -176,6 +178,8 @@ class Propagation:
 
     def _cache_rows(self, index: Indices) -> tuple[SubsetCache, Indices] | None:
         """The cache of the reference's subsets with the rows of points (k,) in it; None if there is no cache."""
+        if self.kept is not None:
+            return self.kept[0], self.kept[1][index]
         return None if self.subsets is None else (self.subsets, index)
 
     def _settings_for(self, index: Indices) -> CorrelationSettings:

@@ -45,11 +45,13 @@ class SubsetCache:
     """Cached normal matrices of n subsets of a reference image, which every later current image reuses.
 
     values : (n, width_of_subset) float64, in the layout of ``kernels``. known : (n,) bool, rows that are filled.
+    transpose : the cache of the subsets with x and y exchanged; None where these are not kept.
     """
 
-    def __init__(self, n: int, order: int) -> None:
+    def __init__(self, n: int, order: int, *, transposed: bool = False) -> None:
         self.values = np.empty((n, width_of_subset(order)))
         self.known = np.zeros(n, bool)
+        self.transpose = SubsetCache(n, order) if transposed else None
 
 
 def subset_cache(reference: Reference, xy: Pixels, settings: CorrelationSettings) -> SubsetCache | None:
@@ -101,8 +103,10 @@ def refine(
     """
     if not steep_along_rows(start):
         return _refine(reference, current, xy, start, settings, prefer_neighbour, cache)
+    if cache is not None:
+        cache = None if cache[0].transpose is None else (cache[0].transpose, cache[1])
     exchanged = _refine(
-        reference.transpose, current.transpose, xy[:, ::-1], start[:, _TRANSPOSED], settings, prefer_neighbour, None
+        reference.transpose, current.transpose, xy[:, ::-1], start[:, _TRANSPOSED], settings, prefer_neighbour, cache
     )
     return exchanged._replace(sigma=exchanged.sigma[:, ::-1], parameters=exchanged.parameters[:, _TRANSPOSED])
 
