@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ringdic.arrays import Mask, Pixels
 from ringdic.correlation.settings import CorrelationSettings
-from ringdic.correlation.spline import REACH, Box, coefficients, gradients
+from ringdic.correlation.spline import PAD, REACH, Box, coefficients, gradients
 from ringdic.errors import InputError
 
 Levels = NDArray[np.floating]
@@ -68,14 +68,14 @@ class Reference:
 
     @cached_property
     def transpose(self) -> Reference:
-        """The reference with x and y exchanged."""
+        """The reference with x and y exchanged, about its box."""
         along_x, along_y = self.gradient
         cache: dict[Hashable, Any] = {
             "grey": _transpose(self.grey),
             "gradient": (_transpose(along_y), _transpose(along_x)),
         }
         box, mask = _transpose_box(self.box), _transpose(self.mask)
-        return replace(self, image=_transpose(self.image), box=box, mask=mask, _cache=cache)
+        return replace(self, image=_transpose_about(self.image, self.box), box=box, mask=mask, _cache=cache)
 
     def get_or_compute(self, key: Hashable, compute: Callable[[], T]) -> T:
         """The value stored under a key, computed by ``compute`` and stored on first use.
@@ -121,8 +121,8 @@ class Current:
 
     @cached_property
     def transpose(self) -> Current:
-        """The current image with x and y exchanged."""
-        return replace(self, image=_transpose(self.image), box=_transpose_box(self.box))
+        """The current image with x and y exchanged, about its box."""
+        return replace(self, image=_transpose_about(self.image, self.box), box=_transpose_box(self.box))
 
     def crop_around(self, positions: Pixels, margin: float) -> Current:
         """The current image with its box reduced to given positions and a margin around them.
@@ -221,6 +221,15 @@ def _transpose(image: NDArray) -> NDArray:
     """Transposed copy of an image or mask."""
     whole = image.view(np.uint8) if image.dtype == np.bool_ else image
     return np.asarray(cv2.transpose(whole)).view(image.dtype)  # by blocks: five times faster than a copy of image.T
+
+
+def _transpose_about(image: NDArray, box: Box) -> NDArray:
+    """Transposed copy of an image, filled only in a box and where filters of the box reach."""
+    margin = PAD + REACH
+    x0, y0, x1, y1 = _clip((box[0] - margin, box[1] - margin, box[2] + margin, box[3] + margin), image.shape)
+    out = np.empty(image.shape[::-1], image.dtype)
+    out[x0:x1, y0:y1] = _transpose(image[y0:y1, x0:x1])
+    return out
 
 
 def _transpose_box(box: Box) -> Box:

@@ -138,20 +138,16 @@ class Propagation:
         """
         settings = replace(self._settings_for(index), order=1) if fixed_curvature else self._settings_for(index)
         part = self.region if self.region is not None else self._initial_region(start, index)
-        self._filter_part(part, start)
+        steep = steep_along_rows(start)
+        self._filter_part(part, steep)
+        cache = None if fixed_curvature else self._cache_rows(index)
         status, zncc, iterations, sigma, parameters = refine(
-            self.reference,
-            part,
-            self.xy[index],
-            start,
-            settings,
-            prefer_neighbour,
-            None if fixed_curvature else self._cache_rows(index),
+            self.reference, part, self.xy[index], start, settings, prefer_neighbour, cache, steep
         )
         outside = np.flatnonzero(status == Status.OUTSIDE)
         if part is not self.current and len(outside):  # outside the region, but perhaps inside the image
             part = self.current
-            self._filter_part(part, start[outside])
+            self._filter_part(part, steep_along_rows(start[outside]))
             second = refine(self.reference, part, self.xy[index[outside]], start[outside], settings)
             status[outside], zncc[outside], iterations[outside], sigma[outside], parameters[outside] = second
         self.region = part
@@ -192,13 +188,13 @@ class Propagation:
             return replace(self.settings, max_iterations=_REPEATED_ITERATIONS)
         return self.settings
 
-    def _filter_part(self, part: Current, start: Floats) -> None:
+    def _filter_part(self, part: Current, steep: bool) -> None:
         """Compute the coefficients of a part of the current image, and add the time to ``filtering``.
 
-        They are computed when first asked for; start (k, 12) decides whether those of the transposed image are needed.
+        They are computed when first asked for. steep : whether those of the transposed image are needed.
         """
         began = time.perf_counter()
-        assert (part.transpose if steep_along_rows(start) else part).coef.size  # computed on first use
+        assert (part.transpose if steep else part).coef.size  # computed on first use
         self.filtering += time.perf_counter() - began
 
     def _initial_region(self, start: Floats, index: Indices) -> Current:

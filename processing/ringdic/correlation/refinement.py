@@ -84,6 +84,7 @@ def refine(
     settings: CorrelationSettings,
     prefer_neighbour: bool = False,
     cache: tuple[SubsetCache, Indices] | None = None,
+    steep: bool | None = None,
 ) -> SubsetMatches:
     """Refine points by inverse-compositional Gauss-Newton (IC-GN) from start values.
 
@@ -95,13 +96,14 @@ def refine(
     prefer_neighbour : a point next to one just matched starts from that match where it agrees with the given start
         value.
     cache : the reference's subset cache and the row (n,) of each point in it, if there is one.
+    steep : whether the images are transposed; by default where displacements are steep along rows.
 
     Returns
     -------
     refinement : status (n,), ZNCC (n,), iterations (n,), sigma (n, 2) px and parameters (n, 12), unfiltered: the ZNCC
         is not yet compared with its limit.
     """
-    if not steep_along_rows(start):
+    if not (steep_along_rows(start) if steep is None else steep):
         return _refine(reference, current, xy, start, settings, prefer_neighbour, cache)
     if cache is not None:
         cache = None if cache[0].transpose is None else (cache[0].transpose, cache[1])
