@@ -24,7 +24,6 @@ from ringdic.charts.weights import CELL_STEPS, smooth_sigma
 from ringdic.correlation import Status
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.outliers import LostPoint, surface_outliers
-from ringdic.geometry.triangulation import reprojection_residuals
 from ringdic.mesh.mesh import Mesh
 from ringdic.results.results import Matches, Results
 from ringdic.results.series import StepCache
@@ -68,36 +67,39 @@ def camera_view(camera: Camera, k: int, surface: ReferenceSurface) -> CameraView
 
 
 @dataclass(frozen=True)
-class SurfaceStep:
-    """The surface at one step: N points, C cameras.
+class CameraStep:
+    """Matches at one step of the k points that one camera sees, in the order of its `CameraView`.
 
-    xyz : (N, 3) mm, NaN where lost. px : (C, N, 2) px, NaN where a camera has no match. sigma : (C, N, 2) px, as the
-    correlation states it. weight : (C, N, 2) px, standard deviations by which the views were weighted, NaN for a view
-    that was not used. c_ls : (C, N). status : (N,), 0 measured. camera_status : (C, N), of the matches. chi2, degrees :
-    (N,). residual : (C,) px, mean vertical residual of each camera.
+    px : (k, 2) px, NaN where there is no match. sigma : (k, 2) px, as the correlation states it. weight : (k, 2) px,
+    standard deviations by which the view was weighted, NaN where it was not used. c_ls : (k,). status : (k,), 0 good.
     """
 
-    xyz: Points
     px: Pixels
     sigma: NDArray[np.float32]
     weight: NDArray[np.float32]
     c_ls: NDArray[np.float32]
     status: NDArray[np.int8]
-    camera_status: NDArray[np.int8]
-    chi2: Floats
-    degrees: Indices
-    residual: Floats
+
+    @property
+    def used(self) -> Mask:
+        """Which of the views, (k,) bool, the points were triangulated from."""
+        return np.isfinite(self.weight[:, 0])
 
 
 @dataclass(frozen=True)
-class _TrackedPixels:
-    """Pixels of the N points in C cameras at one step, with arrays as in `SurfaceStep`; weight of all views."""
+class SurfaceStep:
+    """The surface at one step: N points, C cameras.
 
-    px: Pixels
-    sigma: Pixels
-    weight: Pixels
-    c_ls: Floats
+    xyz : (N, 3) mm, NaN where lost. cameras : matches of each of the C cameras. status : (N,), 0 measured. chi2,
+    degrees : (N,). residual : (C,) px, mean vertical residual of each camera.
+    """
+
+    xyz: Points
+    cameras: tuple[CameraStep, ...]
     status: NDArray[np.int8]
+    chi2: Floats
+    degrees: Indices
+    residual: Floats
 
 
 class SurfaceSeries:
@@ -131,16 +133,20 @@ class SurfaceSeries:
         self.poses = RefinedCameras(cameras)
         refine = self.poses if settings.calibration.refine_poses else None
         self._drift = np.full((len(self.names), len(cameras)), np.nan)
-        residual = self._residual = reprojection_residuals(cameras, surface.xyz, surface.px)
-        with np.errstate(invalid="ignore"):
-            self._drift[0] = [np.nanmean(one[:, 1]) if np.isfinite(one).any() else np.nan for one in residual]
+        residuals = [surface.px[c, view.vertex] - view.px for c, view in enumerate(self._views)]
+        self._drift[0] = [float(np.mean(one[:, 1])) if len(one) else np.nan for one in residuals]
+        # In the image of its own camera a point lies on a whole pixel by definition.
+        others = [
+            one[surface.own[view.vertex] != c] for c, (one, view) in enumerate(zip(residuals, self._views, strict=True))
+        ]
+        self._residual = float(np.sqrt(np.mean(np.concatenate(others) ** 2)))
         c_ls: list[list[Floats]] = [[] for _ in cameras]
         steps = range(1, len(self.names))
         for k, step in enumerate(map_in_order(lambda k: self._measure(k, matches, refine), steps), start=1):
             cache.put(k, step)
             self._drift[k] = self._drift[0] + step.residual
-            for c, view in enumerate(self._views):
-                c_ls[c].append(_sample(step.c_ls[c, view.vertex]))
+            for samples, one in zip(c_ls, step.cameras, strict=True):
+                samples.append(_sample(one.c_ls))
         self._grey_noise = [
             camera_noise(float(surface.grey_noise[c]), np.array(rows), _sample(self._textures[c].contrast))
             if rows and len(self._views[c].vertex)
@@ -163,12 +169,10 @@ class SurfaceSeries:
         Mean number of views of a point, RMS residual of the cameras (px), numbers of lost points by reason, distances
         between the charts where they overlap (mm), and the motion of cameras that have moved.
         """
-        residual = self._residual.copy()
-        residual[self.surface.own, np.arange(len(self.surface.xyz))] = np.nan  # whole pixels by definition
         reasons = {int(reason): reason.name.lower() for kind in (Status, LostPoint) for reason in kind}
         return {
             "views": float(np.isfinite(self.surface.px[..., 0]).sum(axis=0).mean()),
-            "residual_px": float(np.sqrt(np.nanmean(residual**2))),
+            "residual_px": self._residual,
             "lost": {reasons[int(reason)]: int(number) for reason, number in self.surface.lost},
             **_distances(self.surface.mismatch, self._charts),
             "moved_cameras": self.poses.figures(self.names),
@@ -186,11 +190,12 @@ class SurfaceSeries:
 
     def _measure(self, k: int, matches: MatchesOfStep, refine: RefinedCameras | None) -> SurfaceStep:
         """Triangulate the points of step k from all cameras."""
-        tracked = self._tracked(k, matches)
-        px, weight, status = tracked.px, tracked.weight, tracked.status
+        px, weight = (np.full(self.surface.px.shape, np.nan) for _ in range(2))
+        status = np.full(px.shape[:2], Status.NOT_REACHED, np.int8)
+        tracked = [self._track(c, matches(c, k), px[c], weight[c], status[c]) for c in range(len(px))]
         cameras = self._cameras if refine is None else refine(k, px, weight)
         points, used = triangulate_agreeing(cameras, px, weight)
-        turned = self._oblique(cameras, points.xyz) & np.isfinite(px[..., 0])
+        turned = self._oblique(cameras, points.xyz, px)
         again = np.flatnonzero(turned.any(axis=0))
         if len(again):  # surface that has turned away from a camera
             px[turned], status[turned] = np.nan, LostPoint.OBLIQUE
@@ -205,50 +210,57 @@ class SurfaceSeries:
         used &= measured
         xyz = np.where(measured[:, None], points.xyz, np.nan)
         residual = np.full(len(cameras), np.nan)
-        for c, camera in enumerate(cameras):
+        steps = []
+        for c, (camera, view, (sigma, c_ls)) in enumerate(zip(cameras, self._views, tracked, strict=True)):
             at = np.flatnonzero(used[c])
             if len(at):
                 residual[c] = float(np.mean((px[c, at] - camera.project(xyz[at]))[:, 1]))
+            weight[c, ~used[c]] = np.nan
+            weights = weight[c, view.vertex].astype(np.float32)
+            steps.append(CameraStep(px[c, view.vertex], sigma, weights, c_ls, status[c, view.vertex]))
         return SurfaceStep(
-            xyz, px, tracked.sigma.astype(np.float32), np.where(used[..., None], weight, np.nan).astype(np.float32),
-            tracked.c_ls.astype(np.float32), overall, status, np.where(measured, points.chi2, np.nan),
-            np.where(measured, points.degrees, 0), residual,
+            xyz, tuple(steps), overall, np.where(measured, points.chi2, np.nan), np.where(measured, points.degrees, 0),
+            residual,
         )  # fmt: skip
 
-    def _tracked(self, k: int, matches: MatchesOfStep) -> _TrackedPixels:
-        """Pixels of the points in all cameras at step k, from the matches of the cameras' grids."""
-        n, count = len(self.surface.xyz), len(self._cameras)
-        out = _TrackedPixels(
-            np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan),
-            np.full((count, n), np.nan), np.full((count, n), Status.NOT_REACHED, np.int8),
-        )  # fmt: skip
-        cell, sigma_max = CELL_STEPS * self._settings.correlation.step_px, self._settings.surface.sigma_max_px
-        for c, view in enumerate(self._views):
-            one = matches(c, k) if len(view.vertex) else None
-            if one is None:
-                continue
-            pixels = interpolate_matches(one, view.px)
-            with np.errstate(invalid="ignore"):
-                uncertain = (pixels.status == 0) & (pixels.sigma > sigma_max).any(axis=1)
-            status = np.where(uncertain, LostPoint.UNCERTAIN, pixels.status).astype(np.int8)
-            out.status[c, view.vertex] = status
-            good = status == 0
-            vertex, sigma = view.vertex[good], pixels.sigma[good]
-            out.px[c, vertex], out.sigma[c, vertex], out.c_ls[c, vertex] = pixels.px[good], sigma, pixels.c_ls[good]
-            out.weight[c, vertex] = smooth_sigma(view.px[good], np.maximum(sigma, _LEAST_SIGMA), cell)
-        return out
+    def _track(
+        self, c: int, matches: CameraMatches | None, px: Pixels, weight: Pixels, status: NDArray[np.int8]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Pixels of the points in camera c at a step, from the matches of its grid, None where there are none.
 
-    def _oblique(self, cameras: Sequence[Camera], xyz: Points) -> Mask:
-        """Which views (C, n) of points (n, 3) mm are more oblique than the settings allow; none where unknown."""
+        px, weight (N, 2) px and status (N,) of all points are filled. Returns the standard deviations (k, 2) px and
+        C_LS (k,) of the matches of the points that the camera sees, NaN where there is none.
+        """
+        view, group = self._views[c], self._settings
+        if matches is None or not len(view.vertex):
+            return np.full((len(view.vertex), 2), np.nan, np.float32), np.full(len(view.vertex), np.nan, np.float32)
+        pixels = interpolate_matches(matches, view.px)
+        with np.errstate(invalid="ignore"):
+            uncertain = (pixels.status == 0) & (pixels.sigma > group.surface.sigma_max_px).any(axis=1)
+        status[view.vertex] = np.where(uncertain, LostPoint.UNCERTAIN, pixels.status)
+        good = status[view.vertex] == 0
+        vertex, sigma = view.vertex[good], pixels.sigma[good]
+        px[vertex] = pixels.px[good]
+        cell = CELL_STEPS * group.correlation.step_px
+        weight[vertex] = smooth_sigma(view.px[good], np.maximum(sigma, _LEAST_SIGMA), cell)
+        lost = np.where(good, 1.0, np.nan)
+        return (pixels.sigma * lost[:, None]).astype(np.float32), (pixels.c_ls * lost).astype(np.float32)
+
+    def _oblique(self, cameras: Sequence[Camera], xyz: Points, px: Pixels) -> Mask:
+        """Which views (C, n) of points (n, 3) mm with pixels (C, n, 2) are more oblique than the settings allow."""
         normals = Mesh(xyz, self.surface.faces).vertex_normals
         limit = np.cos(np.radians(self._settings.surface.incidence_deg))
-        with np.errstate(invalid="ignore"):
-            return np.stack([camera.incidence_cosine(xyz, normals) < limit for camera in cameras])
+        oblique = np.zeros(px.shape[:2], bool)
+        for camera, at, out in zip(cameras, px, oblique, strict=True):
+            seen = np.flatnonzero(np.isfinite(at[:, 0]))
+            with np.errstate(invalid="ignore"):
+                out[seen] = camera.incidence_cosine(xyz[seen], normals[seen]) < limit
+        return oblique
 
     def _reference(self, rig: str, pairs: Sequence[tuple[str, str]]) -> Results:
         """The results of the reference alone, without standard deviations."""
         surface = self.surface
-        facing, vertex_pair = _facing_pairs(self._cameras, pairs, surface)
+        facing, vertex_pair = _facing_pairs(self._cameras, pairs, surface, self._views)
         corners = vertex_pair[surface.faces]
         n = len(surface.xyz)
         return Results(
@@ -270,7 +282,7 @@ class SurfaceSeries:
                     xy=surface.px[c, view.vertex],
                     px=view.px[None, None],
                     c_ls=np.zeros((1, len(view.vertex))),
-                    sigma=surface.sigma[c, view.vertex][None, None],
+                    sigma=surface.sigma[c, view.vertex].astype(float)[None, None],
                     status=np.zeros((1, len(view.vertex)), np.int8),
                     vertex=view.vertex,
                 )
@@ -312,8 +324,8 @@ class SurfaceSeries:
         one: SurfaceStep = self._cache.get(step)
         reference, surface = self.reference, self.surface
         total = self._pixel_sigma(one)
-        gain = position_gain(self._cameras, one.xyz, one.weight.astype(float))
-        half = total / np.sqrt(2.0)  # the share of either image
+        gain = position_gain(self._cameras, one.xyz, self._dense([camera.weight for camera in one.cameras]))
+        half = total / np.float32(np.sqrt(2.0))  # the share of either image
         displacement = _root(covariance(gain, total))
         position = _root(step_covariance((self._gain, gain), surface.scatter, (half, half), surface.own, self._label))
         strains = deformation(surface.xyz, one.xyz, surface.faces)
@@ -321,8 +333,10 @@ class SurfaceSeries:
         lost = ~np.isfinite(one.xyz).all(axis=1)
         position[lost], displacement[lost] = np.nan, np.nan
         stretches[~np.isfinite(strains.J)] = np.nan
-        used = np.isfinite(one.weight[..., 0])
-        c_ls = np.fmax.reduce(np.where(used, one.c_ls, np.nan), axis=0)
+        c_ls = np.full(len(one.xyz), np.nan)
+        for view, camera in zip(self._views, one.cameras, strict=True):
+            at = view.vertex[camera.used]
+            c_ls[at] = np.fmax(c_ls[at], camera.c_ls[camera.used])
         chi2 = one.chi2 / np.where(one.degrees > 0, one.degrees, 1)
 
         def both(name: str, values: NDArray[Any]) -> NDArray[Any]:
@@ -338,34 +352,37 @@ class SurfaceSeries:
             sigma_displacement=both("sigma_displacement", displacement),
             sigma_lambda=both("sigma_lambda", stretches),
             chi2=both("chi2", chi2),
-            matches=tuple(self._matches(each, one, total, used) for each in reference.matches),
+            matches=tuple(self._matches(each, one, total) for each in reference.matches),
         )
 
-    def _pixel_sigma(self, step: SurfaceStep) -> Floats:
-        """Standard deviations (C, N, 2) px of the displacements in each camera, due to noise and to other change."""
-        total = np.full(step.px.shape, np.nan)
-        for c, (view, texture) in enumerate(zip(self._views, self._textures, strict=True)):
-            if not len(view.vertex):
-                continue
-            variance = self._grey_noise[c]
-            parts = match_uncertainty(
-                step.sigma[c, view.vertex].astype(float), step.c_ls[c, view.vertex].astype(float),
-                (texture, texture), (variance, variance),
-            )  # fmt: skip
-            total[c, view.vertex] = np.sqrt(parts.reference**2 + parts.current**2 + parts.systematic**2)
-        return total
+    def _dense(self, values: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+        """Values (C, N, 2) of all points, NaN for those that a camera does not see, from those of its view (k, 2)."""
+        out = np.full(self.surface.px.shape, np.nan, np.float32)
+        for row, view, one in zip(out, self._views, values, strict=True):
+            row[view.vertex] = one
+        return out
 
-    def _matches(self, reference: Matches, step: SurfaceStep, total: Floats, used: Mask) -> Matches:
+    def _pixel_sigma(self, step: SurfaceStep) -> NDArray[np.float32]:
+        """Standard deviations (C, N, 2) px of the displacements in each camera, due to noise and to other change."""
+        total = []
+        for variance, one, texture in zip(self._grey_noise, step.cameras, self._textures, strict=True):
+            parts = match_uncertainty(
+                one.sigma.astype(float), one.c_ls.astype(float), (texture, texture), (variance, variance)
+            )
+            each = np.sqrt(parts.reference**2 + parts.current**2 + parts.systematic**2)
+            total.append(each.astype(np.float32))
+        return self._dense(total)
+
+    def _matches(self, reference: Matches, step: SurfaceStep, total: NDArray[np.float32]) -> Matches:
         """Matches of one camera at the reference and at a step; good ones that contradict other cameras are marked."""
         c = [camera.id for camera in self._cameras].index(reference.cameras[0])
-        vertex = reference.vertex
-        status = step.camera_status[c, vertex]
-        status = np.where((status == 0) & ~used[c, vertex], LostPoint.RESIDUAL, status).astype(np.int8)
+        one = step.cameras[c]
+        status = np.where((one.status == 0) & ~one.used, LostPoint.RESIDUAL, one.status).astype(np.int8)
         return replace(
             reference,
-            px=np.stack([reference.px[0], step.px[c, vertex][None]]),
-            c_ls=np.stack([reference.c_ls[0], step.c_ls[c, vertex]]),
-            sigma=np.stack([reference.sigma[0], total[c, vertex][None]]),
+            px=np.stack([reference.px[0], one.px[None]]),
+            c_ls=np.stack([reference.c_ls[0], one.c_ls]),
+            sigma=np.stack([reference.sigma[0], total[c, reference.vertex][None]]),
             status=np.stack([reference.status[0], status]),
         )
 
@@ -387,7 +404,7 @@ def _distances(mismatch: Floats, charts: Sequence[str]) -> dict[str, Any]:
 
 
 def _facing_pairs(
-    cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]], surface: ReferenceSurface
+    cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]], surface: ReferenceSurface, views: Sequence[CameraView]
 ) -> tuple[tuple[tuple[str, str], ...], Indices]:
     """Pair of cameras that face each point most squarely, of those that measured it.
 
@@ -395,8 +412,11 @@ def _facing_pairs(
     point's pair among them.
     """
     normals = Mesh(surface.xyz, surface.faces).vertex_normals
-    squarely = np.stack([camera.incidence_cosine(surface.xyz, normals) for camera in cameras])
-    squarely = np.where(np.isfinite(surface.px[..., 0]) & np.isfinite(squarely), squarely, -2.0)
+    squarely = np.full((len(cameras), len(normals)), -2.0)
+    for camera, view, out in zip(cameras, views, squarely, strict=True):
+        out[view.vertex] = np.nan_to_num(
+            camera.incidence_cosine(surface.xyz[view.vertex], normals[view.vertex]), nan=-2.0
+        )
     return facing_pairs(cameras, pairs, squarely)
 
 

@@ -44,8 +44,8 @@ class ReferenceSurface:
     faces: Indices
     own: Indices
     px: Pixels
-    sigma: Pixels
-    scatter: Pixels
+    sigma: NDArray[np.float32]
+    scatter: NDArray[np.float32]
     texture: NDArray[np.float32]
     grey_noise: Floats
     chi2: Floats
@@ -119,8 +119,8 @@ class _MeasuredChart:
     faces: Indices
     own: Indices
     px: Pixels
-    sigma: Pixels
-    scatter: Pixels
+    sigma: NDArray[np.float32]
+    scatter: NDArray[np.float32]
     texture: NDArray[np.float32]
     chi2: Floats
     degrees: Indices
@@ -159,9 +159,10 @@ def _measure(cameras: Sequence[Camera], chart: Chart, step: int, sigma_max: floa
 
     c_ls = np.max(np.where(used, chart.c_ls, -np.inf), axis=0, initial=-np.inf)
     return _MeasuredChart(
-        xyz[rows], number[faces], np.full(len(rows), chart.cameras[0]), everywhere(px), everywhere(smooth),
-        everywhere(sigma), everywhere(chart.texture), points.chi2[rows], points.degrees[rows],
-        c_ls[rows].astype(float), number[neighbours[rows]], _lost_at(chart, status),
+        xyz[rows], number[faces], np.full(len(rows), chart.cameras[0]), everywhere(px),
+        everywhere(smooth.astype(np.float32)), everywhere(sigma.astype(np.float32)), everywhere(chart.texture),
+        points.chi2[rows], points.degrees[rows], c_ls[rows].astype(float), number[neighbours[rows]],
+        _lost_at(chart, status),
     )  # fmt: skip
 
 
@@ -177,8 +178,9 @@ def _empty(count: int, chart: Chart) -> _MeasuredChart:
     """A chart without points, of a rig of ``count`` cameras."""
     nothing, triples = np.zeros(0), np.zeros((0, 3))
     views = np.zeros((count, 0, 2))
+    deviations = views.astype(np.float32)
     return _MeasuredChart(
-        triples, triples.astype(np.int64), nothing.astype(np.int64), views, views, views,
+        triples, triples.astype(np.int64), nothing.astype(np.int64), views, deviations, deviations,
         np.zeros((count, 0, 5), np.float32), nothing, nothing.astype(np.int64), nothing,
         np.zeros((0, 4, 2), np.int64), _lost_at(chart, chart.status[0]),
     )  # fmt: skip

@@ -277,31 +277,33 @@ def fill_step_covariance(before, after, narrow, whole, current, reference, label
     to the reference image and to the step's; NaN in the first two counts as 0. reference (n,): the camera whose pixel
     defines the point, -1 for none. label (n, 3, 2) mm/px: what that pixel moves.
     """
-    own = np.empty((3, 2))
+    own, change = np.empty((3, 2)), np.empty((3, 2))
     for n in range(len(reference)):
         total[n] = 0.0
         first, later, between = 0, 0, 0  # cameras that take part
         for c in range(len(before)):
-            step, seen = after[c, n], _any(after[c, n])
-            own[:] = before[c, n]
-            both = seen and _any(own)
-            if c == reference[n]:
-                own -= label[n]
-            elif not (seen or _any(own)):
+            step, seen, defines = after[c, n], _any(after[c, n]), c == reference[n]
+            both = seen and _any(before[c, n])
+            if not (seen or defines or _any(before[c, n])):
                 continue
-            first, later, between = first + _any(own), later + seen, between + _any(own - step)
+            for i in range(3):
+                for k in range(2):
+                    own[i, k] = before[c, n, i, k] - (label[n, i, k] if defines else 0.0)
+                    change[i, k] = own[i, k] - step[i, k]
+            first, later, between = first + _any(own), later + seen, between + _any(change)
             for k in range(2):
                 a, b = narrow[c, n, k] ** 2, whole[c, n, k] ** 2
                 a, b = a if a >= 0 else 0.0, b if b >= 0 else 0.0
                 common = min(a, b) if both else 0.0  # of errors that cancel
                 rest = current[c, n, k] ** 2 + b - common if seen else 0.0
                 for i in range(3):
-                    for j in range(3):
+                    for j in range(i, 3):
                         total[n, i, j] += (
-                            (own[i, k] - step[i, k]) * (own[j, k] - step[j, k]) * common
+                            change[i, k] * change[j, k] * common
                             + own[i, k] * own[j, k] * (a - common)
                             + step[i, k] * step[j, k] * rest
                         )
+        total[n, 1, 0], total[n, 2, 0], total[n, 2, 1] = total[n, 0, 1], total[n, 0, 2], total[n, 1, 2]
         if min(first, later, between) < 2:
             total[n] = np.nan
 

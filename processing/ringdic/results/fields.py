@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from dataclasses import field as member
 from functools import partial
 from typing import Any
 
@@ -44,7 +45,8 @@ class Field:
     rigid : whether removing the rigid motion changes it. group : heading under which lists of fields show it.
     of : names of the arrays that it is computed from; its own name by default. also : names of arrays that it takes too
         where they are known. value : the function of these arrays, (N, ...) of the vertices or (M, ...) of the
-        triangles, which returns (N,) or (M,).
+        triangles, which returns (N,) or (M,). through : function that is applied to each array in ``of`` before, which
+        fields of one family share.
     """
 
     name: str
@@ -57,6 +59,7 @@ class Field:
     of: tuple[str, ...] = ()
     value: Callable[..., Floats] = _itself
     also: tuple[str, ...] = ()
+    through: Callable[[Floats], Floats] = _itself
 
     def __post_init__(self) -> None:
         if self.location not in ("point", "face"):
@@ -69,18 +72,26 @@ class Field:
         names = ("name", "label", "unit", "location", "centre", "rigid", "group")
         return {name: getattr(self, name) for name in names}
 
-    def from_arrays(self, array: Callable[[str], Floats], rigid_motion_removed: bool = False) -> Floats:
+    def from_arrays(
+        self,
+        array: Callable[[str], Floats],
+        rigid_motion_removed: bool = False,
+        through: Callable[[str], Floats] | None = None,
+    ) -> Floats:
         """Values of the field, (N,) or (M,) by its location, in its unit.
 
         array : function that returns the array of a name in ``of`` or ``also``, and raises KeyError for a name in
         ``also`` that is not known. rigid_motion_removed : the values after the rigid motion is removed.
+        through : function that returns the array of a name in ``of`` as the field's own ``through`` makes it, where it
+        is known already; None computes it.
         """
         suffix = "_without_rigid_motion" if self.rigid and rigid_motion_removed else ""
-        arrays = [array(name + suffix) for name in self.of]
-        for name in self.also:
-            with suppress(KeyError):
-                arrays.append(array(name))
         with np.errstate(invalid="ignore", divide="ignore"):
+            first = through or (lambda name: self.through(array(name)))
+            arrays = [first(name + suffix) for name in self.of]
+            for name in self.also:
+                with suppress(KeyError):
+                    arrays.append(array(name))
             return self.value(*arrays)
 
 
@@ -106,11 +117,6 @@ def _bazant(E: Floats) -> Floats:
     return np.sinh(0.5 * np.log1p(2.0 * E))
 
 
-def _scalar(measure: Callable[[Floats, Floats], Floats], principal: Callable[[Floats], Floats], *two: Floats) -> Floats:
-    """A scalar measure of the two principal strains of a family, which follow from those of Green-Lagrange."""
-    return measure(*(principal(values) for values in two))
-
-
 _SCALARS: tuple[tuple[str, str, Callable[[Floats, Floats], Floats], float | None], ...] = (
     ("1", "smaller principal", lambda first, second: first, 0.0),
     ("2", "larger principal", lambda first, second: second, 0.0),
@@ -130,8 +136,8 @@ def _family(
     symbol = f"{label} {name}" if name in "Ee" else label
     for suffix, scalar, measure, centre in _SCALARS:
         text = f"{symbol}{suffix}, {scalar}" if name in "Ee" and suffix in "12" else f"{symbol}, {scalar}"
-        value = partial(_scalar, measure, principal)
-        yield Field(name + suffix, text, "", "face", centre, group=f"{label} strain", of=of, value=value)
+        group = f"{label} strain"
+        yield Field(name + suffix, text, "", "face", centre, False, group, of, measure, through=principal)
 
 
 _DEFORMATION = (
@@ -251,6 +257,9 @@ class StepFields:
 
     point: dict[str, Floats]
     face: dict[str, Floats]
+    _strains: dict[tuple[Callable[[Floats], Floats], str], Floats] = member(
+        default_factory=dict, init=False, repr=False
+    )
 
     @property
     def names(self) -> set[str]:
@@ -273,7 +282,20 @@ class StepFields:
     def scalar(self, entry: Field, rigid_motion_removed: bool = False) -> Floats:
         """Values of a field in its unit, (N,) where its location is "point", (M,) where it is "face"."""
         arrays = self.point if entry.location == "point" else self.face
-        return entry.from_arrays(arrays.__getitem__, rigid_motion_removed)
+
+        def through(name: str) -> Floats:
+            """The array of a name as the field takes it; those of the last family are kept for its other fields."""
+            if entry.through is _itself:
+                return arrays[name]
+            values = self._strains.get((entry.through, name))
+            if values is None:
+                values = entry.through(arrays[name])
+                for other in [key for key in self._strains if key[0] is not entry.through]:
+                    self._strains.pop(other, None)
+                self._strains[entry.through, name] = values
+            return values
+
+        return entry.from_arrays(arrays.__getitem__, rigid_motion_removed, through)
 
 
 @dataclass(frozen=True)

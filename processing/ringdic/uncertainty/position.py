@@ -21,34 +21,36 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Indices, Pixels, Points, Vectors
+from ringdic.arrays import Floats, Indices, Points, Vectors
 from ringdic.geometry import kernels
 from ringdic.geometry.camera import Camera, stacked_optics
 
 #: Sensitivities (C, n, 3, 2) of positions to the pixels of each camera, mm a px.
-Gain = NDArray[np.float32] | Floats
+Gain = NDArray[np.floating]
+#: Standard deviations (C, n, 2) px of pixels, in single or double precision.
+Deviations = NDArray[np.floating]
 
 
-def position_gain(cameras: Sequence[Camera], xyz: Points, sigma: Pixels) -> Gain:
+def position_gain(cameras: Sequence[Camera], xyz: Points, sigma: Deviations) -> Gain:
     """Gain ``A_c`` from the pixels of each camera to positions triangulated from all cameras with weights 1 / σ².
 
     xyz : (n, 3) mm, the positions. sigma : (C, n, 2) px, standard deviations of the pixels that they were triangulated
     from, NaN for a camera that was not used.
     Returns (C, n, 3, 2) mm a px, in single precision; zero for a camera that was not used.
     """
-    sigma = np.ascontiguousarray(sigma, dtype=float)
+    single = np.ascontiguousarray(sigma, dtype=np.float32)
     gain = np.empty((len(cameras), len(xyz), 3, 2), np.float32)
-    kernels.gain(*stacked_optics(cameras), np.ascontiguousarray(xyz, dtype=float), sigma, gain)
+    kernels.gain(*stacked_optics(cameras), np.ascontiguousarray(xyz, dtype=float), single, gain)
     return gain
 
 
-def covariance(gain: Gain, sigma: Pixels) -> Floats:
+def covariance(gain: Gain, sigma: Deviations) -> Floats:
     """Covariance ``Σ A_c diag(σ_c²) A_cᵀ`` of positions from independent errors of the pixels.
 
     gain : (C, n, 3, 2) mm a px, of `position_gain`. sigma : (C, n, 2) px, standard deviations of the pixels.
     Returns (n, 3, 3) mm²; NaN where fewer than two cameras take part.
     """
-    return np.asarray(kernels.fill_covariance(np.ascontiguousarray(gain), np.ascontiguousarray(sigma)))
+    return np.asarray(kernels.fill_covariance(np.ascontiguousarray(gain), np.ascontiguousarray(sigma, np.float32)))
 
 
 def along_surface(cameras: Sequence[Camera], reference: Indices, xyz: Points, normals: Vectors) -> Floats:
@@ -72,7 +74,7 @@ def along_surface(cameras: Sequence[Camera], reference: Indices, xyz: Points, no
     return out
 
 
-def reference_covariance(gain: Gain, sigma: Pixels, reference: Indices, label: Floats) -> Floats:
+def reference_covariance(gain: Gain, sigma: Deviations, reference: Indices, label: Floats) -> Floats:
     """Covariance due to image noise of reference positions, each defined by a pixel of its reference camera.
 
     gain : (C, n, 3, 2) mm a px, of `position_gain`. sigma : (C, n, 2) px, due to the noise of each image alone.
@@ -85,7 +87,11 @@ def reference_covariance(gain: Gain, sigma: Pixels, reference: Indices, label: F
 
 
 def step_covariance(
-    gains: tuple[Gain, Gain], sigma: Pixels, tracked: tuple[Pixels, Pixels], reference: Indices, label: Floats
+    gains: tuple[Gain, Gain],
+    sigma: Deviations,
+    tracked: tuple[Deviations, Deviations],
+    reference: Indices,
+    label: Floats,
 ) -> Floats:
     """Covariance of positions at a later step due to image noise.
 
@@ -97,5 +103,5 @@ def step_covariance(
     Returns (n, 3, 3) mm².
     """
     total = np.empty((len(reference), 3, 3))
-    kernels.fill_step_covariance(*gains, np.ascontiguousarray(sigma), *tracked, reference, label, total)
+    kernels.fill_step_covariance(*gains, np.ascontiguousarray(sigma, np.float32), *tracked, reference, label, total)
     return total

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ringdic.arrays import Floats, Indices, Pixels, Points
 from ringdic.strain import kernels
 from ringdic.strain.deformation import Deformation, directors
-from ringdic.uncertainty.position import Gain
+from ringdic.uncertainty.position import Deviations, Gain
 
 # Exponent on the correlation of two discs. Slopes are not spread evenly over a subset, and its gradient is fitted
 # together with its position: both make neighbours a little less correlated than the overlap of the discs. Measured on
@@ -67,7 +67,7 @@ def stretch_sigma(
     faces: Indices,
     gain: Gain,
     correlation: NDArray[np.floating],
-    sigma: Pixels,
+    sigma: Deviations,
 ) -> Floats:
     """Standard deviations of the stretches λ1 and λ2 at one step due to image noise.
 
