@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, dataclass, fields
 from typing import Any
 
@@ -81,7 +83,8 @@ def reference_surface(
 
     Raises ComputationError where no chart gave a triangle.
     """
-    measured = [_measure(cameras, chart, step, sigma_max) for chart in charts]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        measured = list(pool.map(lambda chart: _measure(cameras, chart, step, sigma_max), charts))
     parts = [SurfacePart(one.xyz, one.faces, one.c_ls) for one in measured]
     if not any(len(part.faces) for part in parts):
         raise ComputationError("no two cameras share a textured surface")

@@ -6,7 +6,9 @@ the newest step alone, leaves the outputs of all other steps valid.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -251,11 +253,13 @@ def surface_task(views: RigViews, step: int, settings: SurfaceGroup, *, inputs: 
     unmeasured places, and "unmatched", a sentence for each camera that has hardly a depth, else an empty one.
     """
     cameras = views.cameras
-    depths, charts = [read_output(path) for path in inputs[: len(cameras)]], inputs[len(cameras) :]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        depths = list(pool.map(read_output, inputs[: len(cameras)]))
+        charts = [pool.submit(read_output, path) for path in inputs[len(cameras) :]]
     maps = [_depth_map(one) for one in depths]
     why = why_unmatched(cameras, maps, [one["evidence"] for one in depths])
     try:
-        measured = [Chart.from_arrays(read_output(path)) for path in charts]
+        measured = [Chart.from_arrays(chart.result()) for chart in charts]
         surface = reference_surface(cameras, measured, step, settings.sigma_max_px, settings.merge)
     except ComputationError as error:
         raise ComputationError(f"{error}: {'; '.join(filter(None, why))}") from error

@@ -7,7 +7,9 @@ a depth is taken to lie on the plane of the nearest place that has one: its area
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,9 +48,11 @@ def unmeasured_places(
     centre : (3,) mm, world frame, about which the specimen stands, for a camera that has no depth at all.
     """
     triangles = _Triangles.of(surface)
-    lattices = [_Lattice.of(camera, one, triangles, centre) for camera, one in zip(cameras, maps, strict=True)]
     lost = [surface.lost_at[surface.lost_at[:, 0] == k] for k in range(len(cameras))]
-    return [_of_camera(k, lattices, lost, math.cos(math.radians(incidence_deg))) for k in range(len(cameras))]
+    limit = math.cos(math.radians(incidence_deg))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        lattices = list(pool.map(lambda camera, one: _Lattice.of(camera, one, triangles, centre), cameras, maps))
+        return list(pool.map(lambda k: _of_camera(k, lattices, lost, limit), range(len(cameras))))
 
 
 def arrays_of_places(places: Sequence[UnmeasuredPlaces]) -> dict[str, NDArray[Any]]:

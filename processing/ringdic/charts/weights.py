@@ -8,6 +8,8 @@ surface.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
@@ -32,17 +34,19 @@ def smooth_sigma(px: Pixels, sigma: Floats, cell: float) -> Floats:
     column, row = cell_position.astype(np.int64).T
     shape = (int(row.max()) + 1, int(column.max()) + 1)
     number = row * shape[1] + column
-    cells, first, members = np.unique(np.sort(number), return_index=True, return_counts=True)
-    count, total = np.zeros(shape), np.zeros((2, *shape))
-    count.flat[cells] = members
+    count = np.bincount(number, minlength=math.prod(shape))
+    cells = np.flatnonzero(count)
+    members = count[cells]
+    first = np.cumsum(members) - members
+    total = np.zeros((2, len(count)))
     for axis, values in enumerate(sigma[known].T):
-        ordered = values[np.lexsort((values, number))]
+        ordered = values[np.argsort(number + values / (2.0 * values.max()))]  # by cell, and by value within one
         median = 0.5 * (ordered[first + (members - 1) // 2] + ordered[first + members // 2])
-        total[axis].flat[cells] = members * median
+        total[axis, cells] = members * median
 
     def blurred(values: Floats) -> Floats:
-        smooth = gaussian_filter(values, 1.0, mode="constant")
+        smooth = gaussian_filter(values.reshape(shape), 1.0, mode="constant")
         return np.asarray(map_coordinates(smooth, cell_position.T[::-1] - 0.5, order=1, mode="nearest"))
 
-    out[known] = np.column_stack([blurred(total[0]), blurred(total[1])]) / blurred(count)[:, None]
+    out[known] = np.column_stack([blurred(total[0]), blurred(total[1])]) / blurred(count.astype(float))[:, None]
     return out

@@ -184,12 +184,16 @@ def _without_overlap(mesh: Mesh, owner: Indices, overlap: _Overlap, gap: float, 
     living[over[lost[over[:, 0]] & ~lost[over[:, 1]], 0]] = False
     living = peel(neighbours, living, over, bad)
     living = peel(neighbours, living, _close(mesh, owner, living, gap, reach), bad)
+    close = over
+    near = np.zeros(len(living), bool)  # triangles whose close pairs are known
     for _ in range(2):  # where small pieces were dropped, others may come back
         living = _tidy(mesh, living)
         free = ~living & ~lost
         free[over[living[over[:, 1]], 0]] = False
         free[over[living[over[:, 0]], 1]] = False
-        close = np.concatenate([over, _close(mesh, owner, living | free, gap, reach)])
+        if (free & ~near).any():
+            near = living | free
+            close = np.concatenate([over, _close(mesh, owner, near, gap, reach)])
         living = regrow(neighbours, living, free, close, bad)
     return _tidy(mesh, living)
 
@@ -205,13 +209,12 @@ def _tidy(mesh: Mesh, living: Mask) -> Mask:
     at = np.flatnonzero(living)
     while True:
         mesh_part = Mesh(mesh.vertices, mesh.faces[at])
-        piece = pieces(mesh_part)
-        left = (np.bincount(piece)[piece] >= _FEWEST) & without_pinches(mesh_part)
-        if left.all():
+        piece, sound = pieces(mesh_part), without_pinches(mesh_part)
+        at = at[(np.bincount(piece)[piece] >= _FEWEST) & sound]
+        if sound.all():  # so are the larger pieces alone
             result = np.zeros(len(living), bool)
             result[at] = True
             return result
-        at = at[left]
 
 
 def _close_gaps(

@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 
 from ringdic.arrays import Floats, Indices, Mask, Points
-from ringdic.mesh.adjacency import fan_numbers, piece_numbers, twins, vertices_of_several_fans
+from ringdic.mesh.adjacency import fan_numbers, piece_numbers, shared_edges, twins, vertices_of_several_fans
 from ringdic.mesh.mesh import Mesh, half_edges
 from ringdic.mesh.projection import line_hits
 
@@ -116,10 +116,10 @@ def borders(mesh: Mesh) -> tuple[Border, ...]:
     Raises ValueError for a surface with non-manifold edges or triangles of opposite orientation, whose borders have no
     direction.
     """
-    if len(non_manifold_edges(mesh)) or len(inconsistent_edges(mesh)):
-        raise ValueError("a surface with non-manifold edges or triangles turned over has no borders in order")
     half = half_edges(mesh.faces)
-    twin = twins(half)
+    twin, (_, alone) = twins(half), shared_edges(half)
+    if not (alone | ((twin >= 0) & (twin[twin] == np.arange(len(half))))).all():
+        raise ValueError("a surface with non-manifold edges or triangles turned over has no borders in order")
     following = np.arange(len(half)) // 3 * 3 + (np.arange(len(half)) + 1) % 3
     angle = _corner_angles(mesh).ravel()
     border = np.flatnonzero(twin < 0)
