@@ -33,7 +33,7 @@ from ringdic.results.uncertainty import StepUncertainty, camera_covariance
 from ringdic.results.writer import ResultsWriter, StepRecord, map_in_order
 from ringdic.session.folder import Capture, Session, new_run, open_session
 from ringdic.settings import CalibrationGroup, Settings
-from ringdic.tasks import Executor, LocalExecutor, Task, TaskReport, read_output, tidy, work_folder
+from ringdic.tasks import Executor, LocalExecutor, Task, TaskReport, process_memory, read_output, tidy, work_folder
 
 Calibrate = Callable[[Session, CalibrationGroup, Callable[[float, str], None]], CalibratedRig]
 
@@ -87,6 +87,7 @@ def process_session(path: Path, settings: Settings, report: Report = silent, exe
     session = open_session(path)
     steps = _with_captures_at_rest(session)
     matches = match_session(session, settings, steps, stages, executor)
+    process_memory.clear()  # images and prepared references, of which no later stage has use
     stages.at("deform", 0.0)
     with new_run(session.path) as run:
         (run.folder / "settings.toml").write_text(settings.to_toml(), encoding="utf-8")

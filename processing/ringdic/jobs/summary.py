@@ -182,7 +182,7 @@ def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
         rows.append(("bundle: centroids, print errors, radius", f"{value}, {bundle['radius_mm']:.3f} mm"))
     if agreement.get("mismatch_mm") is not None:
         value = f"{agreement['mismatch_mm']:.4f} ± {agreement['mismatch_std_mm']:.4f} mm"
-        rows.append(("distance between the surfaces of neighbouring pairs", value))
+        rows.append(("distance between the surfaces where they overlap", value))
     if agreement.get("residual_px") is not None:
         value = f"{agreement['views']:.1f}, {agreement['residual_px']:.4f} px"
         rows.append(("cameras a point, how far they miss it", value))

@@ -27,7 +27,7 @@ from ringdic.uncertainty.strain import stretch_slopes
 #: Derivatives (..., S) of quantities with respect to S independent errors of unit variance, in single precision.
 Sensitivity = NDArray[np.float32]
 
-_BLOCK = 4096  # triangles at a time, which bounds the memory
+_BLOCK = 512  # triangles at a time, which bounds the memory
 
 
 @dataclass(frozen=True)
