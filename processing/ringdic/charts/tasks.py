@@ -41,7 +41,7 @@ _WIDEST = 72.0  # degrees between the views of two cameras that are matched with
 _MOST = 2  # cameras, those with the most similar views, that a depth map is measured with
 _CHART_COST = 2.0  # of a depth map and of a chart, in units of one camera's step
 _LOOSER = 2.5  # tolerance of matches between cameras, in units of that between steps: their noise is as much larger
-_MATCHES = ("xy", "uv", "gradient", "sigma", "c_ls", "status")
+_MATCHES = ("xy", "uv", "gradient", "curvature", "sigma", "c_ls", "status")
 
 
 @dataclass(frozen=True)

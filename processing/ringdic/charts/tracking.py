@@ -44,13 +44,15 @@ class CameraMatches:
     """Matches of the n points of a camera's grid in its image of one step, NaN where lost.
 
     xy : (n, 2) int, px, the grid. step : px, of the grid. uv : (n, 2) px, displacement. gradient : (n, 2, 2),
-    du_i/dx_j. sigma : (n, 2) px. c_ls : (n,). status : (n,) int, 0 where good.
+    du_i/dx_j. curvature : (n, 2, 3) 1/px, second derivatives by xx, xy, yy. sigma : (n, 2) px. c_ls : (n,).
+    status : (n,) int, 0 where good.
     """
 
     xy: NDArray[np.int32]
     step: int
     uv: Pixels
     gradient: NDArray[np.float32]
+    curvature: NDArray[np.float32]
     sigma: NDArray[np.float32]
     c_ls: NDArray[np.float32]
     status: NDArray[np.int8]
@@ -109,6 +111,7 @@ def match_in_two_passes(
         settings.step,
         matches.warp[:, :2],
         matches.warp[:, 2:6].reshape(-1, 2, 2).astype(np.float32),
+        matches.warp[:, 6:].reshape(-1, 2, 3).astype(np.float32),
         matches.sigma.astype(np.float32),
         matches.c_ls.astype(np.float32),
         matches.status.astype(np.int8),
@@ -120,13 +123,14 @@ def interpolate_matches(matches: CameraMatches, xy: Pixels) -> CameraPixels:
 
     xy : (n, 2) float64, px, in the reference image.
     """
-    values = np.column_stack([matches.uv, matches.gradient.reshape(-1, 4), matches.sigma, matches.c_ls])
+    slopes, bends = matches.gradient.reshape(-1, 4), matches.curvature.reshape(-1, 6)
+    values = np.column_stack([matches.uv, slopes, bends, matches.sigma, matches.c_ls])
     interpolated, weight = interpolate_lattice(matches.xy, values.astype(np.float64), matches.step, xy)
     lost = ~(weight >= _LEAST)
     interpolated[lost] = np.nan
     status = np.zeros(len(xy), np.int8)
     status[lost] = _status_nearby(matches, xy[lost])
-    return CameraPixels(xy + interpolated[:, :2], interpolated[:, 6:8], interpolated[:, 8], status)
+    return CameraPixels(xy + interpolated[:, :2], interpolated[:, 12:14], interpolated[:, 14], status)
 
 
 def _status_nearby(matches: CameraMatches, xy: Pixels) -> NDArray[np.int8]:

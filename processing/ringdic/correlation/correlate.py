@@ -213,7 +213,7 @@ def load_search() -> None:
     points.status[:], points.parameters[:] = Status.GOOD, 0.0
     points.reject_outliers()
     local_affine_fit(points.xy, points.parameters, points.good, points.near, np.arange(n))
-    interpolate_lattice(6.0 * np.rint(points.xy / 6.0), np.zeros((n, 6)), 6.0, points.xy)
+    interpolate_lattice(6.0 * np.rint(points.xy / 6.0), np.zeros((n, 12)), 6.0, points.xy)
 
 
 def _small_example() -> Propagation:

@@ -1,9 +1,9 @@
-"""Interpolation of a field, with its gradients, from the points of a regular lattice.
+"""Interpolation of a field, with its derivatives, from the points of a regular lattice.
 
 Between four lattice points the interpolated value is a mean, weighted bilinearly, of two estimates: the corners'
 values, and the values extrapolated from each corner with its gradient. The errors of the two are equal and opposite for
 a quadratic field, which is therefore interpolated exactly. Where a corner is missing, the other corners' extrapolations
-alone are used.
+alone are used, with the second derivatives.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ def interpolate_lattice(lattice: NDArray[Any], values: Floats, spacing: float, x
     Parameters
     ----------
     lattice : (m, 2) float64 or integer, px, multiples of ``spacing``.
-    values : (m, k) float64, first u v (px) and du/dx du/dy dv/dx dv/dy (no unit), then any others, which are
-        interpolated bilinearly; a row with NaN counts as missing.
+    values : (m, k) float64, first u v (px), du/dx du/dy dv/dx dv/dy (no unit), and the second derivatives of u by xx,
+        xy, yy and those of v (1/px), then any others, which are interpolated bilinearly; a row with NaN counts as
+        missing.
     spacing : px, of the lattice.
     xy : (n, 2) float64, px, points to interpolate at.
 
@@ -63,7 +64,8 @@ def _blend(values, row, low, spacing, xy, out, weight):  # type: ignore[no-untyp
             continue
         column, line = math.floor(xy[p, 0] / spacing), math.floor(xy[p, 1] / spacing)
         for turn in range(2):  # first the sum of the corners' weights, then their weighted values
-            slopes = 0.5 if weight[p] > COMPLETE else 1.0  # a full set of values already makes half the change
+            complete = weight[p] > COMPLETE  # a full set of values already makes half the change
+            slopes, bend = (0.5, 0.0) if complete else (1.0, 0.5)
             for i in range(2):
                 for j in range(2):
                     c, r = column + i - low[0], line + j - low[1]
@@ -76,7 +78,10 @@ def _blend(values, row, low, spacing, xy, out, weight):  # type: ignore[no-untyp
                     elif near > 0.0:
                         row_values, near = values[row[c, r]], near / weight[p]
                         out[p] += near * row_values
-                        out[p, 0] += near * slopes * (row_values[2] * dx + row_values[3] * dy)
-                        out[p, 1] += near * slopes * (row_values[4] * dx + row_values[5] * dy)
+                        for m in range(2):
+                            by_x, by_y = row_values[2 + 2 * m], row_values[3 + 2 * m]
+                            xx, xy_, yy = row_values[6 + 3 * m], row_values[7 + 3 * m], row_values[8 + 3 * m]
+                            out[p, m] += near * slopes * (by_x * dx + by_y * dy)
+                            out[p, m] += near * bend * (xx * dx * dx + 2.0 * xy_ * dx * dy + yy * dy * dy)
         if not weight[p] > 0.0:
             out[p] = np.nan

@@ -93,6 +93,7 @@ def _matches(camera: Camera) -> CameraMatches:
     xyz = _plate(camera, xy)
     uv = camera.project(xyz * [_STRETCH, 1.0, 1.0]) - xy
     n = len(xy)
-    gradient, sigma = np.zeros((n, 2, 2), np.float32), np.full((n, 2), 0.01, np.float32)
+    gradient, curvature = np.zeros((n, 2, 2), np.float32), np.zeros((n, 2, 3), np.float32)
+    sigma = np.full((n, 2), 0.01, np.float32)
     c_ls, status = np.full(n, 0.01, np.float32), np.zeros(n, np.int8)
-    return CameraMatches(xy.astype(np.int32), _PITCH, uv, gradient, sigma, c_ls, status)
+    return CameraMatches(xy.astype(np.int32), _PITCH, uv, gradient, curvature, sigma, c_ls, status)

@@ -29,12 +29,13 @@ def lattice(width: int = 120, height: int = 90) -> np.ndarray:
 
 
 def field(xy: np.ndarray, bent: float = 1.0) -> np.ndarray:
-    """u v ux uy vx vy (n, 6) of a quadratic field, or where ``bent`` is 0 of an affine one, and a linear number."""
+    """The 12 numbers of a quadratic field, or where ``bent`` is 0 of an affine one, and a linear number, (n, 13)."""
     x, y = xy.T.astype(float)
     a, b, c = 3e-4 * bent, -2e-4 * bent, 5e-4 * bent
     u, v = 5.0 + 0.02 * x - 0.01 * y + a * x * x + b * x * y, -3.0 + 0.03 * y + c * y * y
     slopes = [0.02 + 2 * a * x + b * y, -0.01 + b * x, np.zeros_like(x), 0.03 + 2 * c * y]
-    return np.column_stack([u, v, *slopes, 0.1 * x + 0.2 * y])
+    bends = [np.full_like(x, bend) for bend in (2 * a, b, 0.0, 0.0, 0.0, 2 * c)]
+    return np.column_stack([u, v, *slopes, *bends, 0.1 * x + 0.2 * y])
 
 
 def test_between_four_corners_a_quadratic_field_is_met_exactly() -> None:
@@ -44,13 +45,13 @@ def test_between_four_corners_a_quadratic_field_is_met_exactly() -> None:
     np.testing.assert_allclose(weight, 1.0)
 
 
-def test_without_a_corner_an_affine_field_is_met_and_at_a_corner_its_own_value() -> None:
+def test_without_a_corner_a_quadratic_field_is_met_and_at_a_corner_its_own_value() -> None:
     known = lattice()[RNG.permutation(len(lattice()))[:60]]
     points = RNG.uniform(-5, [125, 95], (400, 2))
-    interpolated, weight = interpolate_lattice(known, field(known, 0.0), STEP, points)
+    interpolated, weight = interpolate_lattice(known, field(known), STEP, points)
     inside = weight > 0
     assert 0.2 < inside.mean() < 1.0
-    np.testing.assert_allclose(interpolated[inside, :6], field(points[inside], 0.0)[:, :6], atol=1e-12)
+    np.testing.assert_allclose(interpolated[inside, :2], field(points[inside])[:, :2], atol=1e-12)
     assert np.isnan(interpolated[~inside]).all()
     own, weight = interpolate_lattice(known, field(known), STEP, known.astype(float))
     np.testing.assert_array_equal(own, field(known))
@@ -64,16 +65,16 @@ def test_a_place_is_lost_with_the_points_about_it_and_says_why() -> None:
     values[lost] = np.nan
     zeros = np.zeros((len(xy), 2), np.float32)
     matches = CameraMatches(
-        xy, STEP, values[:, :2], values[:, 2:6].reshape(-1, 2, 2).astype(np.float32), zeros, zeros[:, 0],
+        xy, STEP, values[:, :2], values[:, 2:6].reshape(-1, 2, 2).astype(np.float32),
+        values[:, 6:12].reshape(-1, 2, 3).astype(np.float32), zeros, zeros[:, 0],
         np.where(lost, Status.NO_CONVERGENCE, Status.GOOD).astype(np.int8),
     )  # fmt: skip
     at = np.array([[52.0, 41.0], [25.0, 43.0], [63.0, 40.0], [np.nan, 1.0], [500.0, 500.0]])
     seen = interpolate_matches(matches, at)
     assert seen.status.tolist() == [Status.NO_CONVERGENCE, 0, 0, Status.NOT_REACHED, Status.NOT_REACHED]
     np.testing.assert_array_equal(np.isfinite(seen.px).all(axis=1), seen.status == 0)
-    # All four corners about the second place; beside the hole the two that are left go on as straight lines.
-    np.testing.assert_allclose(seen.px[1] - at[1], field(at[1:2])[0, :2], atol=1e-5)
-    np.testing.assert_allclose(seen.px[2] - at[2], field(at[2:3])[0, :2], atol=0.05)
+    # All four corners about the second place; beside the hole the two that are left go on with their curvature.
+    np.testing.assert_allclose(seen.px[1:3] - at[1:3], field(at[1:3])[:, :2], atol=1e-5)
 
 
 def test_the_grid_covers_what_the_charts_show_and_no_more() -> None:
