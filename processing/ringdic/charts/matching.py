@@ -18,7 +18,7 @@ from ringdic.charts.depth_map import DepthMap
 from ringdic.charts.images import ChartImages
 from ringdic.charts.patches import STENCIL, Patches, depths, stencil_rays, warps_between
 from ringdic.charts.tracked_points import robust_quadratics
-from ringdic.charts.views import ChartPlan, chart_region
+from ringdic.charts.views import ChartPlan, chart_region, grid_to_the_border
 from ringdic.correlation import (
     CorrelationSettings,
     Current,
@@ -27,7 +27,6 @@ from ringdic.correlation import (
     Status,
     correlate_independently,
     correlate_points,
-    grid,
     prepare_reference,
 )
 from ringdic.correlation.quadratic import Neighbourhoods
@@ -89,7 +88,7 @@ def match_chart(
     region, of_points = chart_region(images.image(k), depth_map, plan.inside, settings.radius)
     if mask is not None:
         region, of_points = region & mask, of_points & mask
-    xy, faces = grid(of_points, settings.step)
+    xy, faces = grid_to_the_border(of_points, settings.step)
     partners = np.flatnonzero(plan.sees[plan.inside].any(axis=0))
     cameras = np.concatenate([[k], partners]).astype(np.int64)
     count, n = len(cameras), len(xy)

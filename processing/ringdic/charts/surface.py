@@ -148,7 +148,8 @@ def _measure(cameras: Sequence[Camera], chart: Chart, step: int, sigma_max: floa
     status = _status(chart, px, uncertain, points.xyz)
     xyz = np.where((status == 0)[:, None], points.xyz, np.nan)
     neighbours = grid_neighbours(chart.xy, step)
-    off = surface_outliers(neighbours, xyz, floor=_BEND * _spacing(xyz, neighbours)) & (status == 0)
+    floor = (_BEND + _off_the_grid(chart.xy, step, neighbours)) * _spacing(xyz, neighbours)
+    off = surface_outliers(neighbours, xyz, floor=floor) & (status == 0)
     status[off], xyz[off] = LostPoint.SURFACE, np.nan
     faces = _without_steps(xyz, chart.faces)
     rows = np.unique(faces)
@@ -167,6 +168,12 @@ def _measure(cameras: Sequence[Camera], chart: Chart, step: int, sigma_max: floa
         points.chi2[rows], points.degrees[rows], c_ls[rows].astype(float), number[neighbours[rows]],
         _lost_at(chart, status),
     )  # fmt: skip
+
+
+def _off_the_grid(xy: Pixels, step: int, neighbours: Indices) -> Floats:
+    """Largest distance (n,) in steps by which each point or one of its neighbours lies beside its place on the grid."""
+    off = np.append(np.abs(xy / step - np.rint(xy / step)).max(axis=1), 0.0)
+    return np.asarray(np.maximum(off[:-1], off[neighbours].max(axis=(1, 2))))
 
 
 def _spacing(xyz: Points, neighbours: Indices) -> float:

@@ -19,15 +19,18 @@ from ringdic.arrays import Floats, Image, Indices, Mask, Pixels, Points, Vectors
 from ringdic.charts.contrast import contrast
 from ringdic.charts.depth_map import DepthMap
 from ringdic.charts.patches import depths
+from ringdic.correlation import grid
 from ringdic.geometry.camera import Camera
 
 _REACH = 1.5  # steps of a map's lattice within which its nearest place tells the depth of a pixel
 _SAME = 0.5  # steps of the lattice, in mm on the surface, within which two depths agree
 _STRONG = 0.5  # slope of a textured pixel, in units of the usual contrast of the chart
 _GAP = 0.6  # subset radii, half the largest gap between speckles
-_POINTS = 0.1  # subset radii, width of the strip along the border of the pattern in which no point lies
 _EDGE = 0.45  # subset radii, width of the strip along the border of the pattern that no subset contains
+_HOLE = 0.7  # subset radii, of a circle as large as the largest gap between speckles, with pattern all round, is
 _LEAST_CONTRAST = 0.3  # close to a point, of the usual one: a subset beyond the last speckles is ill determined
+_BRIGHTER = 0.15  # of the range of its grey levels, by which a surface's pixels exceed the brightest of its places
+_LAMP = 0.4  # subset radii, least width of a spot that is brighter than that and no part of the surface
 _OVERLAP = 1  # steps of the lattice by which a chart exceeds the part that its camera faces most squarely
 _RIM = 3.0  # steps of the lattice by which matches may reach beyond the last place with a depth
 
@@ -164,8 +167,9 @@ def chart_region(grey: Image, depth_map: DepthMap, inside: Mask, radius: int) ->
 
     grey : (height, width) grey levels. depth_map : of the camera. inside : (n,) places that belong to the chart.
     radius : px, of the subsets.
-    Returns two masks (height, width): pixels that subsets may contain, and those about which points may lie, since
-    there is texture close by.
+    Returns two masks (height, width): pixels that subsets may contain, and those of them where points may lie, since
+    there is texture close by. A point beyond the pixels of its subset would be an extrapolation, which knows nothing of
+    an edge of the surface between.
     """
     spacing, px = depth_map.spacing, depth_map.patches.px
     region, of_points = np.zeros(grey.shape, bool), np.zeros(grey.shape, bool)
@@ -183,15 +187,53 @@ def chart_region(grey: Image, depth_map: DepthMap, inside: Mask, radius: int) ->
     grown = cv2.dilate(mask, np.ones((side + 2 * half,) * 2, np.uint8))  # of squares about the cells
     closed = np.asarray(cv2.erode(grown, np.ones((side, side), np.uint8))) > 0
     textured, close = _textured_pixels(part, float(np.median(contrast(grey, px[inside], radius))), radius)
-    pattern = (closed & textured).astype(np.uint8)
-    region[top:bottom, left:right] = _eroded(pattern, _EDGE * radius)
-    of_points[top:bottom, left:right] = _eroded(pattern, _POINTS * radius) & close
+    column, row = np.rint(px[inside]).astype(np.int64).T
+    lamps = _lamps(part, grey[row, column], radius)
+    pattern = (_without_gaps(closed & textured, radius) & ~lamps).astype(np.uint8)
+    inner = cv2.erode(pattern, np.ones((2 * round(_EDGE * radius) + 1,) * 2, np.uint8)) > 0
+    region[top:bottom, left:right] = inner
+    of_points[top:bottom, left:right] = inner & _without_gaps(close, radius)
     return region, of_points
 
 
-def _eroded(pattern: NDArray[np.uint8], width: float) -> Mask:
-    """Mask of a pattern, (height, width) bool, without a strip along its border. width : px, of the strip."""
-    return np.asarray(cv2.erode(pattern, np.ones((2 * round(width) + 1,) * 2, np.uint8)) > 0)
+def _lamps(grey: Image, levels: NDArray, radius: int) -> Mask:
+    """Mask (height, width) of spots that are brighter than a surface ever is, such as lamps and light walls behind it.
+
+    Smaller ones may be reflections on it. levels : (n,), grey levels at places of the surface. radius : px, of the
+    subsets.
+    """
+    dark, bright = np.percentile(levels, [5, 95])
+    brighter = (grey > bright + _BRIGHTER * (bright - dark)).astype(np.uint8)
+    return np.asarray(cv2.morphologyEx(brighter, cv2.MORPH_OPEN, np.ones((round(_LAMP * radius),) * 2, np.uint8)) > 0)
+
+
+def _without_gaps(mask: Mask, radius: int) -> Mask:
+    """A mask (height, width) bool with its small holes filled. radius : px, of the subsets."""
+    _, label, figures, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
+    left, top, wide, high, area = figures.T
+    inside = (left > 0) & (top > 0) & (left + wide < mask.shape[1]) & (top + high < mask.shape[0])
+    gap = inside & (area < np.pi * (_HOLE * radius) ** 2)
+    gap[0] = False  # number 0 is the mask
+    return np.asarray(mask | gap[label])
+
+
+def grid_to_the_border(mask: Mask, step: int) -> tuple[Pixels, NDArray[np.int32]]:
+    """Grid of a mask as from `grid`, whose points just outside the mask are moved onto its border.
+
+    So the grid ends where the mask does, and not up to a step before it. mask : (height, width) bool. step : px.
+    Returns xy (n, 2) px, whole pixels less than half a step from the multiples of the step, and faces (m, 3).
+    """
+    half = (step - 1) // 2
+    near = cv2.dilate(mask.astype(np.uint8), np.ones((2 * half + 1,) * 2, np.uint8)) > 0
+    xy, faces = grid(near, step)
+    column, row = xy.astype(np.int64).T
+    outside = np.flatnonzero(~mask[row, column])
+    side = np.arange(-half, half + 1)
+    beside = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    beside = beside[np.argsort((beside**2).sum(axis=1), kind="stable")]
+    across, down = np.stack([column, row])[:, outside, None] + half + beside.T[:, None]
+    xy[outside] += beside[np.pad(mask, half)[down, across].argmax(axis=1)]
+    return xy, faces
 
 
 def _cells(depth_map: DepthMap, inside: Mask) -> Pixels:

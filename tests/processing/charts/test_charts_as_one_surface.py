@@ -1,5 +1,6 @@
 """Exact charts of a plate at two heights merged, and views that contradict one another."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -101,6 +102,21 @@ def test_results_tell_which_triangles_join_charts_and_how_far_these_are_apart(tm
     (row,) = figures["mismatches"]
     assert row["charts"] == ["A", "C"]
     assert row["bias_mm"] == pytest.approx(APART, abs=1e-6)
+
+
+def test_points_of_a_plane_beside_their_places_on_the_grid_lie_on_the_surface_of_their_neighbours() -> None:
+    flat = chart(0, 1, 500, 850, 0.0)
+    xy = flat.xy.copy()
+    right = xy[:, 0] == 850
+    xy[right, 0] -= 4.0
+    px = flat.px.copy()
+    px[0] = xy
+    ray = CAMERAS[0].ray(xy)
+    px[1] = CAMERAS[1].project(CAMERAS[0].centre - ray * (CAMERAS[0].centre[2] / ray[:, 2])[:, None])
+    surface = reference_surface(CAMERAS, [replace(flat, xy=xy, px=px)], STEP, 0.05)
+    assert len(surface.xyz) == len(xy)
+    px[1, np.flatnonzero(right)[20]] += [3.0, 0.0]  # 0.8 mm before the plate
+    assert len(reference_surface(CAMERAS, [replace(flat, xy=xy, px=px)], STEP, 0.05).xyz) == len(xy) - 1
 
 
 def test_a_view_that_contradicts_the_others_is_dropped_and_two_that_do_are_no_point() -> None:

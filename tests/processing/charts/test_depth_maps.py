@@ -10,8 +10,8 @@ from ringdic.charts.images import ChartImages
 from ringdic.charts.matching import ChartMatches, match_chart
 from ringdic.charts.patches import Patches, optical_axis
 from ringdic.charts.plane_sweep import DepthRange
-from ringdic.charts.views import ChartPlan, chart_region, plan_chart
-from ringdic.correlation import CorrelationSettings
+from ringdic.charts.views import ChartPlan, chart_region, grid_to_the_border, plan_chart
+from ringdic.correlation import CorrelationSettings, grid
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.geometry.outliers import LostPoint
 from ringdic.geometry.triangulation import triangulate
@@ -132,7 +132,8 @@ def test_a_chart_is_matched_without_the_bias_of_flat_subsets(middle: ChartMatche
 def test_points_of_a_chart_lie_on_whole_pixels_of_its_camera(middle: ChartMatches) -> None:
     assert middle.cameras[0] == 1
     assert np.array_equal(middle.px[0], middle.xy)
-    assert (middle.xy % STEP == 0).all()
+    assert (middle.xy % 1 == 0).all()
+    assert (np.abs(middle.xy - STEP * np.rint(middle.xy / STEP)) < STEP / 2).all()
 
 
 def test_an_image_without_texture_gives_no_depth(images: list[np.ndarray]) -> None:
@@ -175,22 +176,70 @@ def test_a_view_more_oblique_than_the_limit_is_not_used(
     assert (chart.status == LostPoint.OBLIQUE).any()
 
 
-def test_subsets_keep_away_from_the_silhouette_but_points_come_close_to_it() -> None:
-    """The contrast between a plate and what stands behind it is not the plate's own."""
+def speckled_plate() -> tuple[np.ndarray, DepthMap]:
+    """Image of a speckled square, px 100 to 299 each way, before a dark wall, and its depth map."""
     rng = np.random.default_rng(3)
     grey = np.full((400, 400), 20, np.uint8)
-    grey[100:300, 100:300] = cv2.resize(rng.integers(60, 255, (50, 50)).astype(np.uint8), (200, 200))
+    grey[100:300, 100:300] = cv2.resize(rng.integers(60, 230, (50, 50)).astype(np.uint8), (200, 200))
     px = np.stack(np.meshgrid(np.arange(105.0, 300.0, 15.0), np.arange(105.0, 300.0, 15.0)), axis=-1).reshape(-1, 2)
     n = len(px)
     patches = Patches(px, np.full(n, 1 / 400), np.zeros((n, 2)), np.zeros((n, 3)))
-    plate = DepthMap(15, patches, np.full(n, 1e-7), px, np.ones(len(px), bool), 1.0)
-    subsets, points = chart_region(grey, plate, np.ones(n, bool), RADIUS)
-    for mask, least, most in ((subsets, 2, 6), (points, -1, 2)):
-        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        from_border = [rows[0] - 100, 299 - rows[-1], columns[0] - 100, 299 - columns[-1]]
-        assert least <= min(from_border)
-        assert max(from_border) <= most
+    return grey, DepthMap(15, patches, np.full(n, 1e-7), px, np.ones(len(px), bool), 1.0)
+
+
+def region_of(grey: np.ndarray, plate: DepthMap) -> tuple[np.ndarray, np.ndarray]:
+    return chart_region(grey, plate, np.ones(len(plate.patches.px), bool), RADIUS)
+
+
+def test_subsets_keep_away_from_the_silhouette_and_no_point_lies_beyond_their_pixels() -> None:
+    """The contrast between a plate and what stands behind it is not the plate's own."""
+    subsets, points = region_of(*speckled_plate())
+    rows, columns = np.flatnonzero(subsets.any(axis=1)), np.flatnonzero(subsets.any(axis=0))
+    from_border = [rows[0] - 100, 299 - rows[-1], columns[0] - 100, 299 - columns[-1]]
+    assert min(from_border) >= 2
+    assert max(from_border) <= 6
     assert points[subsets].mean() > 0.99
+    assert not points[~subsets].any()
+
+
+def test_a_gap_between_speckles_belongs_to_the_pattern_and_a_hole_as_large_as_a_subset_does_not() -> None:
+    grey, plate = speckled_plate()
+    rows, columns = np.indices(grey.shape)
+    for centre, radius in (((150, 150), 0.7 * RADIUS), ((240, 240), 1.8 * RADIUS)):
+        grey[np.hypot(columns - centre[0], rows - centre[1]) < radius] = 140
+    subsets, points = region_of(grey, plate)
+    assert subsets[140:161, 140:161].all()
+    assert points[140:161, 140:161].all()
+    assert not subsets[240, 240]
+
+
+def test_a_lamp_beside_the_surface_is_no_part_of_it_and_a_small_reflection_is() -> None:
+    grey, plate = speckled_plate()
+    grey[180:210, 270:300] = 255
+    grey[150:152, 150:152] = 255
+    subsets, points = region_of(grey, plate)
+    assert not subsets[180:210, 270:300].any()
+    assert not points[180:210, 270:300].any()
+    assert subsets[140:160, 140:160].all()
+
+
+@pytest.mark.parametrize("step", [5, 10])
+def test_the_grid_ends_at_the_border_of_its_mask(step: int) -> None:
+    rows, columns = np.indices((101, 141))
+    mask = np.hypot(columns - 70.0, rows - 50.0) < 41.7
+    xy, faces = grid_to_the_border(mask, step)
+    column, row = xy.astype(int).T
+    assert mask[row, column].all()
+    assert (np.abs(xy - step * np.rint(xy / step)) < step / 2).all()
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
+    on_grid = (xy % step == 0).all(axis=1)
+    assert not inner[row, column][~on_grid].any()
+    first, second = xy[faces[:, 1]] - xy[faces[:, 0]], xy[faces[:, 2]] - xy[faces[:, 0]]
+    area = -0.5 * (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+    assert (area > 0).all()
+
+    plain_area = 0.5 * step**2 * len(grid(mask, step)[1])
+    assert mask.sum() - area.sum() < 0.6 * (mask.sum() - plain_area)
 
 
 def test_cameras_that_look_in_parallel_have_a_finite_middle() -> None:
