@@ -114,10 +114,12 @@ def match_chart(
         )
         for c, seen in zip(partners.tolist(), sees, strict=True)
     ]  # fmt: skip
-    squarest = _squarest(others, stencil, sees)
-    for slot, view in enumerate(views, start=1):
-        chosen = squarest[view.index] == slot - 1 if curved else np.ones(len(view.index), bool)
-        _enter(out, slot, *view.first_look(xy, stencil, settings, chosen, curved=curved))
+    if curved:
+        _first_looks(out, views, stencil, settings)
+    else:
+        for slot, view in enumerate(views, start=1):
+            every = np.ones(len(view.index), bool)
+            _enter(out, slot, *view.first_look(xy, stencil, settings, every, curved=False))
     for _ in range(_ROUNDS if curved else 0):
         patches = _measured_patches([camera, *others], out, depth_map, settings) or patches
         stencil = patches.stencil(camera, _reach(settings), rays)
@@ -129,14 +131,27 @@ def match_chart(
     return out
 
 
-def _squarest(others: Sequence[Camera], stencil: Points, sees: Mask) -> Indices:
-    """Index (n,) of the camera that faces each patch most squarely, among those that see it.
+def _first_looks(out: ChartMatches, views: Sequence[_View], stencil: Points, settings: CorrelationSettings) -> None:
+    """Match every point in the camera that faces it most squarely, and where that fails in the next one.
 
-    others : C cameras. stencil : (n, 9, 3) mm. sees : (C, n) bool.
+    A reflection or an obstacle hides a part of the surface from the one and not from the other.
+
+    out : matches of n points. views : of the C cameras. stencil : (n, 9, 3) mm, of the depth map's patches.
     """
     tangents = _tangents(stencil, np.zeros((1, 2)))
-    cosine = np.stack([_incidence_cosine(other, tangents) for other in others])
-    return np.asarray(np.argmax(np.where(sees & np.isfinite(cosine), cosine, -np.inf), axis=0))
+    squarely = np.full((len(views), len(out.xy)), -np.inf)
+    for view, cosine in zip(views, squarely, strict=True):
+        cosine[view.index] = np.nan_to_num(_incidence_cosine(view.camera, tangents)[view.index], nan=-np.inf)
+    while True:
+        wanted = (squarely.max(axis=0) > -np.inf) & ~(out.status[1:] == Status.GOOD).any(axis=0)
+        if not wanted.any():
+            return
+        squarest = np.where(wanted, squarely.argmax(axis=0), -1)
+        for slot, (view, cosine) in enumerate(zip(views, squarely, strict=True), start=1):
+            chosen = squarest[view.index] == slot - 1
+            if chosen.any():
+                _enter(out, slot, *view.first_look(out.xy, stencil, settings, chosen, curved=True))
+            cosine[view.index[chosen]] = -np.inf
 
 
 def _drop_oblique(

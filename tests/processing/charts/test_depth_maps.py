@@ -11,7 +11,7 @@ from ringdic.charts.matching import ChartMatches, match_chart
 from ringdic.charts.patches import Patches, optical_axis
 from ringdic.charts.plane_sweep import DepthRange
 from ringdic.charts.views import ChartPlan, chart_region, grid_to_the_border, plan_chart
-from ringdic.correlation import CorrelationSettings, grid
+from ringdic.correlation import CorrelationSettings, Status, grid
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.geometry.outliers import LostPoint
 from ringdic.geometry.triangulation import triangulate
@@ -127,6 +127,21 @@ def test_a_chart_is_matched_without_the_bias_of_flat_subsets(middle: ChartMatche
     assert np.abs(distance).max() < 1.0
     assert scatter <= 0.006
     assert abs(bias) <= 0.003
+
+
+def test_what_a_reflection_hides_from_one_camera_is_matched_in_the_next(
+    images: list[np.ndarray], maps: list[DepthMap], plans: list[ChartPlan]
+) -> None:
+    spot = LIMB.position(np.radians([25.0]), np.array([120.0]), 0)  # the first camera faces it most squarely
+    spoilt = images[0].copy()
+    cv2.circle(spoilt, tuple(np.rint(CAMERAS[0].project(spot)[0]).astype(int).tolist()), 4 * RADIUS, 255, -1)
+    seen = ChartImages(CAMERAS, lambda k: spoilt if k == 0 else images[k], SETTINGS)
+    chart = match_chart(seen, 1, maps[1], plans[1], None)
+    here = np.linalg.norm(chart.xy - CAMERAS[1].project(spot), axis=1) < 2 * RADIUS
+    good = dict(zip(chart.cameras.tolist(), chart.status == Status.GOOD, strict=True))
+    assert here.sum() > 40
+    assert not good[0][here].any()
+    assert good[2][here].mean() > 0.98
 
 
 def test_points_of_a_chart_lie_on_whole_pixels_of_its_camera(middle: ChartMatches) -> None:
