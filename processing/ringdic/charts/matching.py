@@ -330,11 +330,11 @@ def _measured_patches(
     scatter = _OVERLAP * 1.4826 * float(np.nanmedian(np.abs(fit.leave_one_out[:, 0])))
     with np.errstate(invalid="ignore"):
         harm = scatter * fit.curvature_sigma.max(axis=1) * settings.radius**2 / 8.0
-        certain = np.flatnonzero(np.isfinite(fit.curvature[:, 0]).all(axis=1) & (harm < scatter))
-    if not len(certain):
+        certain: Mask = np.asarray(np.isfinite(fit.curvature[:, 0]).all(axis=1) & (harm < scatter))
+    if not certain.any():
         return None
     # At the rim, where the neighbours lie to one side, the curvature is that of the nearest point that has it.
-    curvature = fit.curvature[certain[cKDTree(matches.xy[certain]).query(matches.xy)[1]], 0]
+    curvature = fit.curvature[_nearest(matches.xy, certain), 0]
     return Patches(matches.xy, fit.value[:, 0] * usual, fit.gradient[:, 0] * usual, curvature * usual)
 
 
@@ -354,7 +354,7 @@ def interpolated_patches(camera: Camera, depth_map: DepthMap, xy: Pixels) -> tup
     gradient = np.where(known[:, None], fit.gradient[:, 0] * usual, places.gradient)
     curvature = np.zeros((len(places.px), 3))
     if known.any():  # at the rim the curvature is that of the nearest place that has enough neighbours
-        curvature = fit.curvature[np.flatnonzero(known)[cKDTree(places.px[known]).query(places.px)[1]], 0] * usual
+        curvature = fit.curvature[_nearest(places.px, known), 0] * usual
     at = Patches(places.px, value, gradient, curvature).part(nearest)
     dx, dy = (xy - at.px).T
     xx, xy_, yy = at.curvature.T
@@ -362,3 +362,11 @@ def interpolated_patches(camera: Camera, depth_map: DepthMap, xy: Pixels) -> tup
     shifted = shifted + 0.5 * xx * dx**2 + xy_ * dx * dy + 0.5 * yy * dy**2
     slope = at.gradient + np.stack([xx * dx + xy_ * dy, xy_ * dx + yy * dy], axis=1)
     return Patches(xy, shifted, slope, at.curvature), nearest
+
+
+def _nearest(xy: Pixels, known: Mask) -> Indices:
+    """Index (n,) of the nearest of the known ones to each of the points (n, 2) px, to a known one its own."""
+    nearest, lost = np.arange(len(xy)), np.flatnonzero(~known)
+    if len(lost):
+        nearest[lost] = np.flatnonzero(known)[cKDTree(xy[known]).query(xy[lost])[1]]
+    return nearest

@@ -100,15 +100,13 @@ def texture_map(image: GreyImage, radius: int, *, stride: int | None = None) -> 
     grey = image if image.dtype in (np.uint8, np.uint16) else np.asarray(image, dtype=np.float32)
     unit = np.ones(1, dtype=np.float32)
 
-    def some(values: NDArray) -> NDArray[np.float32]:
-        return np.ascontiguousarray(values[::thin, ::thin], dtype=np.float32)
-
     def mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
         return np.asarray(cv2.blur(values, size, borderType=cv2.BORDER_REFLECT_101)[::step, ::step])
 
-    level = some(grey)
+    level = grey[::thin, ::thin].astype(np.float32)
     level -= level.mean()
-    fx, fy = (some(cv2.sepFilter2D(grey, cv2.CV_32F, *taps)) for taps in ((_SLOPE, unit), (unit, _SLOPE)))
+    fx = np.asarray(cv2.sepFilter2D(grey[::thin], cv2.CV_32F, _SLOPE, unit))[:, ::thin].copy()
+    fy = np.asarray(cv2.sepFilter2D(grey[:, ::thin].copy(), cv2.CV_32F, unit, _SLOPE))[::thin].copy()
     xx, yy = fx * fx, fy * fy
     total = xx + yy
     out = np.empty((*level[::step, ::step].shape, 5), dtype=np.float32)
