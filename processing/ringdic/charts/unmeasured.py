@@ -175,27 +175,29 @@ def _coverage(
     camera: Camera, triangles: _Triangles, origin: Pixels, spacing: int, shape: tuple[int, ...]
 ) -> tuple[Floats, Floats]:
     """Share of each cell under the nearest triangles that face a camera, and their least depth, mm."""
-    nearest = np.full(shape, np.inf)
+    nearest = np.full(math.prod(shape), np.inf)
     facing = np.flatnonzero(np.einsum("ni,ni->n", camera.centre - triangles.middles, triangles.normals) > 0)
     faces, depth = triangles.faces[facing], depths(camera, triangles.middles[facing])
     seen = np.zeros(len(triangles.xyz), bool)
     seen[faces] = True
     px = np.full((len(seen), 2), np.nan)
     px[seen] = camera.project(triangles.xyz[seen])
-    corners = px[faces]
-    middle = corners.mean(axis=1)
+    a, b, c = (px[faces[:, k]] for k in range(3))
+    middle = (a + b + c) / 3.0
     inside = ((middle >= 0) & (middle <= np.array(camera.size) - 1)).all(axis=1) & (depth > 0)
-    corners, middle, depth = corners[inside], middle[inside], depth[inside]
-    cell = _cells(middle, origin, spacing)
+    at = np.flatnonzero(inside)
+    column, row = _cells(middle[at], origin, spacing)
+    cell, depth = column * shape[1] + row, depth[at]
     np.minimum.at(nearest, cell, depth)
-    front = depth < nearest[cell] + _BEHIND / _STEEPEST * spacing * depth / _focal_length(camera)
-    corners, middle = corners[front], middle[front]
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    at = at[depth < nearest[cell] + _BEHIND / _STEEPEST * spacing * depth / _focal_length(camera)]
+    first, second = b[at] - a[at], c[at] - a[at]
     area = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
-    # A third of each triangle counts half way to each of its corners.
-    column, row = _cells((0.5 * (middle[:, None] + corners)).reshape(-1, 2), origin, spacing)
-    index = np.clip(column, 0, shape[0] - 1) * shape[1] + np.clip(row, 0, shape[1] - 1)
-    share = np.bincount(index, np.repeat(area, 3), math.prod(shape)).reshape(shape)
+    share = np.zeros(len(nearest))
+    for corner in (a, b, c):  # a third of each triangle counts half way to each of its corners
+        column, row = _cells(0.5 * (middle[at] + corner[at]), origin, spacing)
+        index = np.clip(column, 0, shape[0] - 1) * shape[1] + np.clip(row, 0, shape[1] - 1)
+        share += np.bincount(index, area, len(share))
+    share, nearest = share.reshape(shape), nearest.reshape(shape)
     return share / (3.0 * spacing**2), nearest
 
 
