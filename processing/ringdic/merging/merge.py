@@ -207,14 +207,11 @@ def _close(mesh: Mesh, owner: Indices, which: Mask, gap: float, reach: float) ->
 def _tidy(mesh: Mesh, living: Mask) -> Mask:
     """Triangles (M,) without small separate pieces and without fans that touch in one point only."""
     at = np.flatnonzero(living)
-    while True:
-        mesh_part = Mesh(mesh.vertices, mesh.faces[at])
-        piece, sound = pieces(mesh_part), without_pinches(mesh_part)
-        at = at[(np.bincount(piece)[piece] >= _FEWEST) & sound]
-        if sound.all():  # so are the larger pieces alone
-            result = np.zeros(len(living), bool)
-            result[at] = True
-            return result
+    at = at[without_pinches(Mesh(mesh.vertices, mesh.faces[at]))]
+    piece = pieces(Mesh(mesh.vertices, mesh.faces[at]))  # without a small one, the others stay as they are
+    result = np.zeros(len(living), bool)
+    result[at[np.bincount(piece)[piece] >= _FEWEST]] = True
+    return result
 
 
 def _close_gaps(

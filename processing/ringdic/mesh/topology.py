@@ -85,7 +85,6 @@ def without_pinches(mesh: Mesh, weights: Floats | None = None) -> Mask:
 
     weights : (M,) mm², of the triangles; their areas unless given. Of fans of equal weight the first stays.
     """
-    weights = np.nan_to_num(mesh.areas) if weights is None else weights
     remaining = np.ones(len(mesh.faces), bool)
     while True:
         left = np.flatnonzero(remaining)
@@ -94,6 +93,7 @@ def without_pinches(mesh: Mesh, weights: Floats | None = None) -> Mask:
         pinched = vertices_of_several_fans(part.faces.ravel(), fan)
         if not pinched.any():
             return remaining
+        weights = np.nan_to_num(mesh.areas) if weights is None else weights
         weight = np.bincount(fan, np.repeat(weights[left], 3))
         corners = np.flatnonzero(pinched)
         # Sorted by the weight of their fans, the last corner at each vertex belongs to its largest fan.
