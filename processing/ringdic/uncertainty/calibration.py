@@ -100,9 +100,9 @@ def position_sensitivity(
         seen = np.flatnonzero(visible[:, index[0]]).tolist()
         if not seen:
             continue
-        errors = np.concatenate([by_camera[c][place[c, index]] for c in seen], axis=2).reshape(3 * len(index), -1)
+        errors = np.concatenate([by_camera[c][place[c, index]] for c in seen], axis=2)
         roots = np.concatenate([root[known.ids.index(cameras[c].id)] for c in seen])
-        moved = (errors @ roots).reshape(len(index), 3, -1)
+        moved = errors @ roots  # point by point, which no library splits among threads that are busy already
         if tracked_from is not None:
             moved += follows[index] @ tracked_from[1][index]
         out[index] = moved
