@@ -9,6 +9,7 @@ which others see it: its chart. ``matching`` matches the chart's grid in the ref
 ``unmeasured`` finds the texture that the surface does not cover, and ``evidence`` why a camera does not match.
 
 In time:
-``tracked_points`` and ``step_matching`` match points of one image in a later one of the same camera, ``tracking`` lays
-them on a grid over all that the camera sees, and ``series`` triangulates every step. ``tasks`` divides the work.
+``tracked_points`` and ``step_matching`` match points of one image in a later one of the same camera, with warps that
+``body_motion`` predicts where the body has turned far. ``tracking`` lays them on a grid over all that the camera sees,
+and ``series`` triangulates every step. ``tasks`` divides the work.
 """

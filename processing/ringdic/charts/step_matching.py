@@ -18,6 +18,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels
 from ringdic.charts.tracked_points import APART, TrackedPoints, contradiction_limit, robust_quadratics
@@ -34,6 +35,7 @@ from ringdic.correlation import (
 )
 from ringdic.correlation.quadratic import QuadraticFit
 from ringdic.correlation.seeds import flow_start_values
+from ringdic.geometry.outliers import LostPoint
 
 _LOOSE = 5e-3  # px, tolerance of the first of two passes
 _MARGIN = 32.0  # px about the subsets in which a current image is filtered
@@ -41,6 +43,9 @@ _START_ZNCC = 0.6  # least ZNCC under the warp by optical flow that makes it a s
 _SOME = 0.2  # least share of the knots with start values from which the others can be reached
 _FEWEST = 8  # start values from which an affine fit extrapolates where all points lie
 _BENT = 2.0  # standard deviations by which curvature moves a subset, from which on it matters at the rim
+_TURNED = np.radians(4.0)  # turn of the body from which on its motion predicts the warps
+_HIDDEN = np.cos(np.radians(74.0))  # cosine of the incidence below which a surface that has turned away is not matched
+_AGREEING = 0.5  # least share of the knots that a predicted motion lets match
 _CURVED = 20.0  # Σ(c/σ)² of second derivatives below which they may be noise, of 6 numbers of overlapping subsets
 
 
@@ -93,18 +98,60 @@ def match_tracked_points(
     """
     if not curved:
         return _reject_outliers(correlate_points(reference, current, points.pixels, settings), points)
-    first, part = _at_knots(reference, current, points, _of_knots(settings))
+    first, part, ground = _at_knots(reference, current, points, _of_knots(settings))
     if not first.good.any():
         return _lost(points, first.status[points.knots.of_points])
-    warp = _predicted_warps(first, points, settings.radius)
+    warp = _predicted_warps(first, ground.warp, points, settings.radius)
+    warp[ground.hidden] = np.nan
     part = _about(points.pixels + warp[:, :2], settings.radius, part, current)
     second = correlate_independently(reference, part, points.pixels, settings, warp, repeated=True)
-    mended, again = _mend_curvature(second, warp[:, :2], points, settings.radius)
+    second = replace(
+        second, uv=second.uv - ground.plane[:, 0], gradient=second.gradient - np.swapaxes(ground.plane[:, 1:], 1, 2)
+    )
+    mended, again = _mend_curvature(second, warp[:, :2], ground.warp, points, settings.radius)
     if len(again):
         settings = replace(settings, order=2)
         third = correlate_independently(reference, part, points.pixels[again], settings, _warp(mended)[again])
         mended = with_matches(mended, again, third)
-    return _reject_outliers(mended, points)
+    mended.status[ground.hidden] = LostPoint.OBLIQUE
+    return _reject_outliers(mended, points, ground.warp[:, :2])
+
+
+@dataclass(frozen=True)
+class _Ground:
+    """Warps that a motion of the body predicts, to which the rest is added.
+
+    warp : (n, 12). hidden : (n,) bool, points that turn away from the camera. plane : (n, 3, 2), what first-order
+    subsets measure of these warps beyond their quadratics: value, px, and slopes.
+    """
+
+    warp: Floats
+    hidden: Mask
+    plane: Floats
+
+    @classmethod
+    def level(cls, points: TrackedPoints) -> _Ground:
+        """No motion."""
+        n = len(points.positions)
+        return cls(np.zeros((n, 12)), np.zeros(n, bool), np.zeros((n, 3, 2)))
+
+    @classmethod
+    def of_matches(cls, points: TrackedPoints, warp: Floats) -> _Ground | None:
+        """The prediction from warps (m, 6) or more at the knots; None unless they tell of a large turn."""
+        if points.body is None:
+            return None
+        motion = points.body.motion(points.next_to_knots, points.knots.neighbourhoods.xy, warp)
+        if motion is None or motion.angle < _TURNED:
+            return None
+        predicted, cosine, plane = points.on_body.after(motion)
+        known = np.isfinite(predicted).all(axis=1)
+        if not known.any():
+            return None
+        lost, which = np.flatnonzero(~known), np.flatnonzero(known)
+        near = which[cKDTree(points.pixels[which]).query(points.pixels[lost])[1]]
+        predicted[lost] = shift_warps(predicted[near], points.pixels[lost] - points.pixels[near])
+        cosine[lost] = cosine[near]
+        return cls(predicted, ~(cosine > _HIDDEN), np.nan_to_num(plane))
 
 
 def shift_warps(warp: Floats, shift: Pixels) -> Floats:
@@ -135,10 +182,11 @@ def _of_knots(settings: CorrelationSettings) -> CorrelationSettings:
 
 def _at_knots(
     reference: Reference, current: Current, points: TrackedPoints, settings: CorrelationSettings
-) -> tuple[PointMatches, Current]:
+) -> tuple[PointMatches, Current, _Ground]:
     """Match the knots from optical flow, and those that it does not reach from their neighbours.
 
-    Returns the matches, and the part of the current image where all points will lie.
+    Where the matches by flow tell that the body has turned, the knots are matched from the warps that its motion
+    predicts. Returns the matches, the part of the current image where all points will lie, and the prediction.
     """
     xy = points.knots.neighbourhoods.xy
     at_knots = as_start_values(flow_start_values(reference, current, xy, settings.radius))[:, :6]
@@ -146,11 +194,37 @@ def _at_knots(
     _, zncc, _ = search_warps(reference, current, xy[known], at_knots[known, None], settings.radius)
     at_knots[known[~(zncc > _START_ZNCC)]] = np.nan
     known = known[zncc > _START_ZNCC]
+    turned = _at_turned_knots(reference, current, points, settings, at_knots)
+    if turned is not None:
+        return turned
     if len(known) < max(_FEWEST, _SOME * len(xy)):
-        return correlate_points(reference, current, xy, settings), current
+        matches = correlate_points(reference, current, xy, settings)
+        turned = _at_turned_knots(reference, current, points, settings, _warp(matches))
+        return turned or (matches, current, _Ground.level(points))
     at = xy[known]
     part = current.crop_by_affine_fit(at, at + at_knots[known, :2], points.pixels, settings.radius)
-    return correlate_points(reference, part, xy, settings, start=at_knots, prefer_neighbour=True), part
+    matches = correlate_points(reference, part, xy, settings, start=at_knots, prefer_neighbour=True)
+    return matches, part, _Ground.level(points)
+
+
+def _at_turned_knots(
+    reference: Reference, current: Current, points: TrackedPoints, settings: CorrelationSettings, warp: Floats
+) -> tuple[PointMatches, Current, _Ground] | None:
+    """Match the knots from the motion that warps (m, 6) or more at them tell of.
+
+    Returns what `_at_knots` does; None unless the body has turned far, or where the images contradict it.
+    """
+    ground = _Ground.of_matches(points, warp)
+    if ground is None:
+        return None
+    knot, xy = points.knots.index, points.knots.neighbourhoods.xy
+    start = np.where(ground.hidden[knot, None], np.nan, ground.warp[knot])
+    part = _about(xy + start[:, :2], settings.radius, current, current)
+    matches = correlate_independently(reference, part, xy, settings, start, repeated=True)
+    if matches.good.sum() < _AGREEING * (~ground.hidden[knot]).sum():
+        return None
+    better = _Ground.of_matches(points, _warp(matches))
+    return matches, current, better or ground
 
 
 def with_matches(matches: PointMatches, index: Indices, other: PointMatches) -> PointMatches:
@@ -192,18 +266,21 @@ def _warp_of(fit: QuadraticFit) -> Floats:
     return np.concatenate([fit.value, fit.gradient.reshape(-1, 4), fit.curvature.reshape(-1, 6)], axis=1)
 
 
-def _predicted_warps(first: PointMatches, points: TrackedPoints, radius: int) -> Floats:
-    """Predict the warps (n, 12) of all points from the knots' matches, with the second derivatives to be held fixed."""
-    near = points.knots.neighbourhoods
-    fit = robust_quadratics(near, first.uv, np.hypot(*first.sigma.T))
+def _predicted_warps(first: PointMatches, ground: Floats, points: TrackedPoints, radius: int) -> Floats:
+    """Predict the warps (n, 12) of all points from the knots' matches, with the second derivatives to be held fixed.
+
+    ground : (n, 12), to which the field that is fitted is added.
+    """
+    near, at = points.knots.neighbourhoods, ground[points.knots.index]
+    fit = robust_quadratics(near, first.uv - at[:, :2], np.hypot(*first.sigma.T))
     warp = _warp_of(fit)
-    warp = np.where(np.isfinite(warp).all(axis=1, keepdims=True), warp, _warp(first))
+    warp = np.where(np.isfinite(warp).all(axis=1, keepdims=True), warp, _warp(first) - at)
     knot = points.knots.nearest(np.asarray(np.isfinite(warp).all(axis=1)), points.pixels, near.window)
     out = shift_warps(warp[knot], points.pixels - near.xy[knot])
     out[knot < 0] = np.nan
     curvature, known = _change_of_curvature(fit, first, np.zeros((len(first.xy), 6)), radius)
     out[:, 6:] = curvature[points.knots.nearest(known, points.pixels)] if known.any() else 0.0
-    return out
+    return out + ground
 
 
 def _change_of_curvature(fit: QuadraticFit, matches: PointMatches, held: Floats, radius: int) -> tuple[Floats, Mask]:
@@ -223,26 +300,28 @@ def _change_of_curvature(fit: QuadraticFit, matches: PointMatches, held: Floats,
 
 
 def _mend_curvature(
-    second: PointMatches, predicted: Pixels, points: TrackedPoints, radius: int
+    second: PointMatches, predicted: Pixels, ground: Floats, points: TrackedPoints, radius: int
 ) -> tuple[PointMatches, Indices]:
     """Correct the second pass for the curvature of its own displacements, over smaller neighbourhoods.
 
-    predicted : (n, 2) px, the displacements that it started from; what contradicts them is left out. Returns the
-    matches, and the points (k,) int at the rim of a strongly curved field, where it is unknown.
+    predicted : (n, 2) px, the displacements that it started from; what contradicts them is left out. ground : (n, 12),
+    to which the field that is fitted is added. Returns the matches, and the points (k,) int at the rim of a strongly
+    curved field, where it is unknown.
     """
     knots = points.fine_knots
     distance = np.hypot(*(second.uv - predicted).T)
     with np.errstate(invalid="ignore"):
         agreeing = distance <= contradiction_limit(distance)
-    own = second.part(knots.index)
-    fit = knots.neighbourhoods.fit(np.where(agreeing[knots.index, None], own.uv, np.nan), np.hypot(*own.sigma.T))
-    change, known = _change_of_curvature(fit, own, own.curvature.reshape(-1, 6), radius)
+    own, at = second.part(knots.index), ground[knots.index]
+    values = np.where(agreeing[knots.index, None], own.uv - at[:, :2], np.nan)
+    fit = knots.neighbourhoods.fit(values, np.hypot(*own.sigma.T))
+    change, known = _change_of_curvature(fit, own, own.curvature.reshape(-1, 6) - at[:, 6:], radius)
     if not known.any():
         return second, np.zeros(0, np.int64)
     by_point = change[knots.nearest(known, points.pixels)].reshape(-1, 2, 3)
     bias = radius**2 / 8.0 * (by_point[..., 0] + by_point[..., 2])
     mended = replace(second, uv=second.uv - bias, curvature=second.curvature + by_point)
-    bent = radius**2 / 8.0 * np.abs(mended.curvature).max(axis=(1, 2))
+    bent = radius**2 / 8.0 * np.abs(mended.curvature.reshape(-1, 6) - ground[:, 6:]).max(axis=1)
     with np.errstate(invalid="ignore"):
         strong = second.good & (bent > _BENT * np.hypot(*second.sigma.T))
     return mended, np.flatnonzero(strong & knots.one_sided[knots.of_points])
@@ -273,14 +352,17 @@ def _lost(points: TrackedPoints, status: Indices) -> ImageMatches:
     return ImageMatches(np.full((n, 12), np.nan), np.full((n, 2), np.nan), lost, lost.copy(), status)
 
 
-def _reject_outliers(matches: PointMatches, points: TrackedPoints) -> ImageMatches:
-    """Matches at the points themselves; those unlike the reference or contradicting their neighbours are lost."""
+def _reject_outliers(matches: PointMatches, points: TrackedPoints, ground: Pixels | float = 0.0) -> ImageMatches:
+    """Matches at the points themselves; those unlike the reference or contradicting their neighbours are lost.
+
+    ground : (n, 2) px, displacements from which those of neighbours differ by a smooth field.
+    """
     status = matches.status.copy()
     mean_square = _mean_square(matches, points)
     with np.errstate(invalid="ignore"):
         status[mean_square > points.largest_difference(mean_square)] = Status.LOW_ZNCC
     plausible = status == Status.GOOD
-    uv = np.where(plausible[:, None], matches.uv, np.nan)
+    uv = np.where(plausible[:, None], matches.uv - ground, np.nan)
     status[points.contradict(uv, np.hypot(*matches.sigma.T))] = Status.INCONSISTENT
     good = status == Status.GOOD
     warp = shift_warps(_warp(matches), -points.shift)

@@ -11,11 +11,13 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Image, Mask, Points
+from ringdic.arrays import Image, Indices, Mask, Points
+from ringdic.charts.body_motion import SeenBody, SurfaceFrames
 from ringdic.charts.chart import Chart, chart_with_uncertainty
 from ringdic.charts.depth_map import DepthMap, depths_at_fitting_size
 from ringdic.charts.evidence import match_evidence, why_unmatched
@@ -287,10 +289,16 @@ def _reference_and_points(
     """Prepared reference image of camera k and the points of its grid, cached in memory for all its steps."""
     camera = cameras[k]
 
-    def make() -> tuple[Reference, TrackedPoints]:
-        xyz, faces, seen = process_memory.get(
-            ("surface", str(surface)), lambda: _seen_surface(surface), lambda value: sum(each.nbytes for each in value)
+    def frames() -> SurfaceFrames:
+        xyz, _, seen, own = process_memory.get(("surface", str(surface)), lambda: _seen_surface(surface), _bytes)
+        return process_memory.get(
+            ("surface frames", str(surface)),
+            lambda: SurfaceFrames.of(cameras, xyz, seen, own, settings.radius),
+            lambda value: _bytes((value.origin, value.axes, value.form)),
         )
+
+    def make() -> tuple[Reference, TrackedPoints]:
+        xyz, faces, seen, _ = process_memory.get(("surface", str(surface)), lambda: _seen_surface(surface), _bytes)
         if not seen[k].any():
             raise ComputationError(f"camera {camera.id}: it shares no measured point of the surface with another")
         px = np.full((len(xyz), 2), np.nan)
@@ -298,7 +306,9 @@ def _reference_and_points(
         grid = surface_grid(camera.size, settings.step, [(px, faces)])
         prepared = prepare_reference(step_image(image, camera), grid.region, settings)
         assert prepared.gradient  # computed here once, when first used
-        return prepared, tracked_points(prepared, grid.xy, settings)
+        index = np.flatnonzero(seen[k])
+        body = SeenBody(camera, index, xyz[index], px[index], frames)
+        return prepared, tracked_points(prepared, grid.xy, settings, body)
 
     def size(value: tuple[Reference, TrackedPoints]) -> int:
         prepared, points = value
@@ -307,7 +317,13 @@ def _reference_and_points(
     return process_memory.get(("tracked reference", camera.id, str(surface)), make, size)
 
 
-def _seen_surface(path: Path) -> tuple[Points, NDArray[np.int32], Mask]:
-    """Points (N, 3) mm, triangles (M, 3) of a surface, and which of the points each of C cameras sees, (C, N) bool."""
+def _seen_surface(path: Path) -> tuple[Points, NDArray[np.int32], Mask, Indices]:
+    """Points (N, 3) mm, triangles (M, 3) of a surface, which point each of C cameras sees, (C, N) bool, and owners."""
     arrays = read_output(path)
-    return arrays["xyz"], arrays["faces"].astype(np.int32), np.asarray(np.isfinite(arrays["px"][..., 0]))
+    seen: Mask = np.asarray(np.isfinite(arrays["px"][..., 0]))
+    return arrays["xyz"], arrays["faces"].astype(np.int32), seen, arrays["own"]
+
+
+def _bytes(arrays: Sequence[NDArray[Any]]) -> int:
+    """Size of arrays in memory."""
+    return sum(each.nbytes for each in arrays)

@@ -7,6 +7,7 @@ each square of a grid.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels
+from ringdic.charts.body_motion import PredictedPoints, SeenBody
 from ringdic.correlation import CorrelationSettings, Reference
 from ringdic.correlation.quadratic import Neighbourhoods, QuadraticFit
 
@@ -22,6 +24,7 @@ APART = 1.5
 _REACH = 3.0  # subset radii about a knot, of the neighbours that its curvature is computed from
 _FINE = (0.4, 2.5)  # subset radii, side of the squares and reach of the fine knots
 _ONE_SIDED = 0.12  # windows between a knot and the mean of its neighbours; 0.42 where these are a half disc
+_LATTICE = 0.2  # subset radii between the pixels by which the extent of subsets that are cut off is judged
 _SCATTERS = 8.0  # standard deviations from the neighbours' quadratic beyond which a point contradicts it
 _LEAST_OFF = 0.1  # px, least distance that is a contradiction
 _STRICTER = (4.0, 1.0)  # times the limit: the most distant knots are rejected first, so that they do not bias the fit
@@ -78,7 +81,9 @@ class TrackedPoints:
     positions : (n, 2) float64, px. pixels : (n, 2) float64, px, the whole pixels next to them, on which their
     subsets lie. variance : (n,), of the grey levels there, grey levels². least : mean square difference due
     to rounding to whole grey levels, grey levels². knots : matched before all other points. fine_knots : closer
-    together, with smaller neighbourhoods.
+    together, with smaller neighbourhoods. radius : px, of the subsets. lattice : (k, 2) px, pixels of the region,
+    ``spacing`` px apart. energy : (k, 2), squares of the derivatives of the grey levels there. body : what the camera
+    sees of the surface, None where that is unknown.
     """
 
     positions: Pixels
@@ -87,11 +92,27 @@ class TrackedPoints:
     least: float
     knots: Knots
     fine_knots: Knots
+    radius: int
+    lattice: Pixels
+    energy: Floats
+    spacing: int
+    body: SeenBody | None = None
 
     @property
     def shift(self) -> Pixels:
         """Offsets from the points to their whole pixels, (n, 2) px."""
         return self.pixels - self.positions
+
+    @cached_property
+    def next_to_knots(self) -> Indices:
+        """Number (m,), without unit, of the point of the body that the camera sees next to each knot."""
+        return np.zeros(0, np.int64) if self.body is None else self.body.nearest(self.knots.neighbourhoods.xy)
+
+    @cached_property
+    def on_body(self) -> PredictedPoints:
+        """The points on the body, which must be known, prepared for predictions; computed where it turns far."""
+        assert self.body is not None
+        return PredictedPoints(self.body, self.pixels, self.lattice, self.energy, self.radius, self.spacing)
 
     def contradict(self, values: Pixels, sigma: Floats) -> Mask:
         """Outlying points, whose displacement is far from the quadratic fitted to their neighbours.
@@ -125,17 +146,23 @@ class TrackedPoints:
         return _UNLIKE * np.fmax(quartile[self.knots.of_points], np.median(mean_square[known]))
 
 
-def tracked_points(reference: Reference, positions: Pixels, settings: CorrelationSettings) -> TrackedPoints:
+def tracked_points(
+    reference: Reference, positions: Pixels, settings: CorrelationSettings, body: SeenBody | None = None
+) -> TrackedPoints:
     """Prepare points of a reference image for tracking.
 
-    positions : (n, 2) float64, px.
+    positions : (n, 2) float64, px. body : what the camera sees of the surface.
     """
     pixels, radius = np.rint(positions), settings.radius
     knots = Knots.of(pixels, APART * radius, _REACH * radius)
     fine_knots = Knots.of(pixels, _FINE[0] * radius, _FINE[1] * radius)
     least = (reference.grey_range / 255.0) ** 2
     variance = _variance(reference, pixels, radius)
-    return TrackedPoints(positions, pixels, variance, least, knots, fine_knots)
+    spacing = max(1, round(_LATTICE * radius))
+    row, column = np.nonzero(reference.mask[::spacing, ::spacing])
+    lattice = spacing * np.stack([column, row], axis=1) + reference.origin
+    energy = np.stack([slope[::spacing, ::spacing][row, column] ** 2.0 for slope in reference.gradient], axis=1)
+    return TrackedPoints(positions, pixels, variance, least, knots, fine_knots, radius, lattice, energy, spacing, body)
 
 
 def thin_to_grid(xy: Pixels, side: float) -> Indices:
