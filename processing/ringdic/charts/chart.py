@@ -24,8 +24,9 @@ class Chart:
 
     cameras : (C,) indices of the cameras. xy : (n, 2) px, the grid. faces : (m, 3). px : (C, n, 2) px, NaN where not
     matched. noise, systematic : (C, n, 2) px, standard deviations due to the noise of each image alone, and due to
-    other causes. c_ls : (C, n). status : (C, n). texture : (C, n, 5), of each image about px: contrast, three mean
-    products of slopes, peakedness. grey_noise : (C,), variance of each camera's noise, grey levels².
+    other causes. bend : (C, n) px, of `ChartMatches`. c_ls : (C, n). status : (C, n). texture : (C, n, 5), of each
+    image about px: contrast, three mean products of slopes, peakedness. grey_noise : (C,), variance of each camera's
+    noise, grey levels².
     """
 
     cameras: Indices
@@ -34,6 +35,7 @@ class Chart:
     px: Pixels
     noise: NDArray[np.float32]
     systematic: NDArray[np.float32]
+    bend: NDArray[np.float32]
     c_ls: NDArray[np.float32]
     status: NDArray[np.int8]
     texture: NDArray[np.float32]
@@ -83,7 +85,7 @@ def chart_with_uncertainty(images: ChartImages, matches: ChartMatches, grey_nois
     return Chart(
         matches.cameras, matches.xy, matches.faces, matches.px,
         np.sqrt(noise).astype(np.float32), np.sqrt(systematic).astype(np.float32),
-        matches.c_ls.astype(np.float32), matches.status,
+        matches.bend.astype(np.float32), matches.c_ls.astype(np.float32), matches.status,
         np.stack([_as_array(each) for each in textures]), grey_noise,
     )  # fmt: skip
 

@@ -32,7 +32,7 @@ from ringdic.correlation import (
 from ringdic.correlation.quadratic import Neighbourhoods
 from ringdic.correlation.refinement import SubsetCache
 from ringdic.geometry.camera import Camera
-from ringdic.geometry.outliers import LostPoint
+from ringdic.geometry.outliers import LostPoint, grid_neighbours
 from ringdic.geometry.triangulation import triangulate
 
 _WINDOW = 2.7  # steps of the lattice about a place, of the neighbours from which its curvature is computed
@@ -45,6 +45,10 @@ _ROUNDS = 2  # times that the curvature is computed again from the matches
 _SETTLED = 0.05  # matches with another curvature, as a share of the points, below which the rounds end
 _STEEPER = 10.0  # degrees by which the incidence at the rim of a subset may exceed the limit
 _MARGIN = 3.0  # subset radii about the points, of the part of an image in which they are matched
+_BEND = 0.45  # bias of a match, by that due to the largest change of curvature over half a radius; by measurement
+_SHARP = 0.1  # px, that bias from which on smaller subsets are less wrong though more noisy
+_SMALL = 0.7  # radius of these, in that of the others
+_SMALLEST = 5  # px, least radius of these
 _FEWEST = 30  # points of a chart from which curvature is computed again
 _DIFFERENCE = 0.6  # subset radii over which a warp's central differences are taken
 
@@ -55,7 +59,8 @@ class ChartMatches:
 
     cameras : (C,) indices, the chart's own first. xy : (n, 2) px, the grid. faces : (m, 3) int. px : (C, n, 2) px, NaN
     where there is no match; px[0] is the grid. sigma : (C, n, 2) px, as the correlation states it. gradient : (C, n,
-    2, 2). c_ls : (C, n). status : (C, n).
+    2, 2). c_ls : (C, n). status : (C, n). bend : (C, n) px, standard deviation due to a change of the curvature within
+    the subset.
     """
 
     cameras: Indices
@@ -66,6 +71,7 @@ class ChartMatches:
     gradient: Floats
     c_ls: Floats
     status: NDArray[np.int8]
+    bend: Floats
 
 
 def match_chart(
@@ -96,6 +102,7 @@ def match_chart(
         cameras, xy, faces,
         np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan), np.full((count, n, 2, 2), np.nan),
         np.full((count, n), np.nan), np.full((count, n), Status.NOT_REACHED, np.int8),
+        np.zeros((count, n)),
     )  # fmt: skip
     if not n or not len(partners):
         return out
@@ -127,8 +134,35 @@ def match_chart(
             _enter(out, slot, *view.match(xy, stencil, settings))
         if sum(view.changed for view in views) < _SETTLED * n:
             break
+    _match_bends(out, views if curved else (), stencil, settings)
     _drop_oblique(out, [camera, *others], stencil, incidence_deg, settings.radius / _reach(settings))
     return out
+
+
+def _match_bends(out: ChartMatches, views: Sequence[_View], stencil: Points, settings: CorrelationSettings) -> None:
+    """State the bias due to a change of the curvature within subsets, and match with smaller ones where it is large.
+
+    A subset with the curvature held is free of bias where the curvature is the same all over it. Where it changes, as
+    at a rounded edge, the bias is about as large as that of the difference from one point of the grid to the next.
+
+    stencil : (n, 9, 3) mm, of the patches about the points.
+    """
+    n = len(out.xy)
+    beside = grid_neighbours(out.xy, settings.step).reshape(n, -1)
+    small = replace(settings, radius=max(_SMALLEST, round(_SMALL * settings.radius)), order=1)
+    apart = settings.radius / (2.0 * settings.step)
+    for slot, view in enumerate(views, start=1):
+        held = np.full((n + 1, 6), np.nan)
+        held[view.index] = view.held
+        difference = np.abs(held[beside] - held[:-1, None])
+        bend = apart * np.nan_to_num(difference).max(axis=(1, 2)) * settings.radius**2 / 8.0
+        out.bend[slot] = _BEND * np.maximum(bend, np.append(bend, 0.0)[beside].max(axis=1))
+        at = np.flatnonzero(bend[view.index] > _SHARP)
+        if not len(at):
+            continue
+        index, start = view.index[at], view.warps(out.xy, stencil, settings, at)
+        matches = correlate_independently(view.reference, view.current, out.xy[index], small, start)
+        _enter(out, slot, index[matches.good], matches.part(matches.good))
 
 
 def _first_looks(out: ChartMatches, views: Sequence[_View], stencil: Points, settings: CorrelationSettings) -> None:
@@ -269,7 +303,7 @@ class _View:
         subsets are as the settings say. Returns indices (j,) of points and their matches.
         """
         at = np.flatnonzero(chosen)
-        start = self._warps(xy, stencil, settings, at)
+        start = self.warps(xy, stencil, settings, at)
         if not np.isfinite(start).any():
             return self.index[at], None
         points, used = xy[self.index[at]], replace(settings, order=1) if curved else settings
@@ -285,7 +319,7 @@ class _View:
         xy : (n, 2) px. stencil : (n, 9, 3) mm, of measured patches. Returns indices (j,) of the points that changed,
         and their matches.
         """
-        start = self._warps(xy, stencil, settings, np.arange(len(self.index)))
+        start = self.warps(xy, stencil, settings, np.arange(len(self.index)))
         with np.errstate(invalid="ignore"):
             harm = np.abs(start[:, 6:] - self.held).max(axis=1) * settings.radius**2 / 8.0
             at = np.flatnonzero(np.isfinite(start).all(axis=1) & ~(harm <= _HARM))
@@ -305,7 +339,7 @@ class _View:
         """The subsets of all points, and those among them at ``at`` (j,) of the camera's own points."""
         return None if self.subsets is None else (self.subsets, self.index[at])
 
-    def _warps(self, xy: Pixels, stencil: Points, settings: CorrelationSettings, at: Indices) -> Floats:
+    def warps(self, xy: Pixels, stencil: Points, settings: CorrelationSettings, at: Indices) -> Floats:
         """Warps (j, 12) into this camera of the points at ``at`` (j,) of its own; NaN where there is none."""
         points = self.index[at]
         warps = warps_between(self.camera, xy[points], stencil[points], _reach(settings))

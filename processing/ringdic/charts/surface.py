@@ -138,6 +138,7 @@ def _measure(cameras: Sequence[Camera], chart: Chart, step: int, sigma_max: floa
         return _empty(len(cameras), chart)
     own = [cameras[c] for c in chart.cameras]
     sigma = np.sqrt(chart.noise.astype(float) ** 2 + chart.systematic.astype(float) ** 2 + _FLOOR**2)
+    stated = np.hypot(sigma, chart.bend[..., None])
     with np.errstate(invalid="ignore"):
         uncertain: Mask = np.asarray((sigma > sigma_max).any(axis=2))
     uncertain[0] = False  # its pixel defines the point
@@ -164,7 +165,7 @@ def _measure(cameras: Sequence[Camera], chart: Chart, step: int, sigma_max: floa
     c_ls = np.max(np.where(used, chart.c_ls, -np.inf), axis=0, initial=-np.inf)
     return _MeasuredChart(
         xyz[rows], number[faces], np.full(len(rows), chart.cameras[0]), everywhere(px),
-        everywhere(smooth.astype(np.float32)), everywhere(sigma.astype(np.float32)), everywhere(chart.texture),
+        everywhere(smooth.astype(np.float32)), everywhere(stated.astype(np.float32)), everywhere(chart.texture),
         points.chi2[rows], points.degrees[rows], c_ls[rows].astype(float), number[neighbours[rows]],
         _lost_at(chart, status),
     )  # fmt: skip

@@ -84,7 +84,7 @@ def _chart(cameras: list[Camera], k: int) -> Chart:
     count, n = px.shape[:2]
     sigma, texture = np.full((count, n, 2), 0.01, np.float32), np.ones((count, n, 5), np.float32)
     c_ls, status = np.full((count, n), 0.01, np.float32), np.zeros((count, n), np.int8)
-    return Chart(order, xy, faces, px, sigma, sigma, c_ls, status, texture, np.ones(count))
+    return Chart(order, xy, faces, px, sigma, sigma, sigma[..., 0], c_ls, status, texture, np.ones(count))
 
 
 def _matches(camera: Camera) -> CameraMatches:

@@ -43,8 +43,8 @@ def chart(own: int, other: int, left: int, right: int, height: float) -> Chart:
     c_ls = np.stack([np.zeros(n), 0.01 + 1e-5 * np.arange(n)])
     return Chart(
         np.array([own, other]), xy, faces, np.stack([xy, CAMERAS[other].project(xyz)]),
-        np.full((2, n, 2), 0.01, np.float32), np.zeros((2, n, 2), np.float32), c_ls.astype(np.float32),
-        np.zeros((2, n), np.int8), np.ones((2, n, 5), np.float32), np.ones(2),
+        np.full((2, n, 2), 0.01, np.float32), np.zeros((2, n, 2), np.float32), np.zeros((2, n), np.float32),
+        c_ls.astype(np.float32), np.zeros((2, n), np.int8), np.ones((2, n, 5), np.float32), np.ones(2),
     )  # fmt: skip
 
 
