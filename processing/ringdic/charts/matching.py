@@ -97,16 +97,9 @@ def match_chart(
     xy, faces = grid_to_the_border(of_points, settings.step)
     partners = np.flatnonzero(plan.sees[plan.inside].any(axis=0))
     cameras = np.concatenate([[k], partners]).astype(np.int64)
-    count, n = len(cameras), len(xy)
-    out = ChartMatches(
-        cameras, xy, faces,
-        np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan), np.full((count, n, 2, 2), np.nan),
-        np.full((count, n), np.nan), np.full((count, n), Status.NOT_REACHED, np.int8),
-        np.zeros((count, n)),
-    )  # fmt: skip
+    n, out = len(xy), _unmatched(cameras, xy, faces)
     if not n or not len(partners):
         return out
-    out.px[0], out.sigma[0], out.c_ls[0], out.status[0], out.gradient[0] = xy, 0.0, 0.0, Status.GOOD, 0.0
     reference = prepare_reference(images.image(k), region, settings)
     patches, nearest = interpolated_patches(camera, depth_map, xy)
     sees = plan.sees[np.ix_(nearest, partners)].T
@@ -136,6 +129,19 @@ def match_chart(
             break
     _match_bends(out, views if curved else (), stencil, settings)
     _drop_oblique(out, [camera, *others], stencil, incidence_deg, settings.radius / _reach(settings))
+    return out
+
+
+def _unmatched(cameras: Indices, xy: Pixels, faces: NDArray[np.int32]) -> ChartMatches:
+    """A chart whose points are known in its own camera alone, the first of the cameras (C,)."""
+    count, n = len(cameras), len(xy)
+    out = ChartMatches(
+        cameras, xy, faces,
+        np.full((count, n, 2), np.nan), np.full((count, n, 2), np.nan), np.full((count, n, 2, 2), np.nan),
+        np.full((count, n), np.nan), np.full((count, n), Status.NOT_REACHED, np.int8), np.zeros((count, n)),
+    )  # fmt: skip
+    if n and count > 1:
+        out.px[0], out.sigma[0], out.c_ls[0], out.status[0], out.gradient[0] = xy, 0.0, 0.0, Status.GOOD, 0.0
     return out
 
 
