@@ -45,8 +45,7 @@ _ROUNDS = 2  # times that the curvature is computed again from the matches
 _SETTLED = 0.05  # matches with another curvature, as a share of the points, below which the rounds end
 _STEEPER = 10.0  # degrees by which the incidence at the rim of a subset may exceed the limit
 _MARGIN = 3.0  # subset radii about the points, of the part of an image in which they are matched
-_BEND = 0.45  # bias of a match, by that due to the largest change of curvature over half a radius; by measurement
-_SHARP = 0.1  # px, that bias from which on smaller subsets are less wrong though more noisy
+_SHARP = 0.1  # px, bias due to the change of curvature over half a radius from which on smaller subsets are better
 _SMALL = 0.7  # radius of these, in that of the others
 _SMALLEST = 5  # px, least radius of these
 _FEWEST = 30  # points of a chart from which curvature is computed again
@@ -148,27 +147,33 @@ def _unmatched(cameras: Indices, xy: Pixels, faces: NDArray[np.int32]) -> ChartM
 def _match_bends(out: ChartMatches, views: Sequence[_View], stencil: Points, settings: CorrelationSettings) -> None:
     """State the bias due to a change of the curvature within subsets, and match with smaller ones where it is large.
 
-    A subset with the curvature held is free of bias where the curvature is the same all over it. Where it changes, as
-    at a rounded edge, the bias is about as large as that of the difference from one point of the grid to the next.
+    A subset with the curvature held is free of bias where the curvature changes evenly over it. At a rounded edge it
+    does not, and the bias is, by measurement, that of the difference between the curvature and its mean on both sides.
 
     stencil : (n, 9, 3) mm, of the patches about the points.
     """
     n = len(out.xy)
-    beside = grid_neighbours(out.xy, settings.step).reshape(n, -1)
+    pairs = grid_neighbours(out.xy, settings.step)
+    beside = pairs.reshape(n, -1)
     small = replace(settings, radius=max(_SMALLEST, round(_SMALL * settings.radius)), order=1)
     apart = settings.radius / (2.0 * settings.step)
     for slot, view in enumerate(views, start=1):
         held = np.full((n + 1, 6), np.nan)
         held[view.index] = view.held
-        difference = np.abs(held[beside] - held[:-1, None])
-        bend = apart * np.nan_to_num(difference).max(axis=(1, 2)) * settings.radius**2 / 8.0
-        out.bend[slot] = _BEND * np.maximum(bend, np.append(bend, 0.0)[beside].max(axis=1))
-        at = np.flatnonzero(bend[view.index] > _SHARP)
+        change = _bias(held[beside] - held[:-1, None], settings) * apart
+        uneven = _bias(held[pairs].mean(axis=2) - held[:-1, None], settings) * apart**2
+        out.bend[slot] = np.maximum(uneven, np.append(uneven, 0.0)[beside].max(axis=1))
+        at = np.flatnonzero(change[view.index] > _SHARP)
         if not len(at):
             continue
         index, start = view.index[at], view.warps(out.xy, stencil, settings, at)
         matches = correlate_independently(view.reference, view.current, out.xy[index], small, start)
         _enter(out, slot, index[matches.good], matches.part(matches.good))
+
+
+def _bias(difference: Floats, settings: CorrelationSettings) -> Floats:
+    """Largest bias (n,) px of matches at curvatures wrong by some differences (n, k, 6) 1/px; 0 where unknown."""
+    return np.asarray(np.nan_to_num(np.abs(difference)).max(axis=(1, 2)) * settings.radius**2 / 8.0)
 
 
 def _first_looks(out: ChartMatches, views: Sequence[_View], stencil: Points, settings: CorrelationSettings) -> None:
