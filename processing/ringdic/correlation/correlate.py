@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cache
 
 import numba
@@ -20,6 +20,7 @@ from ringdic.correlation.lattice_field import interpolate_lattice
 from ringdic.correlation.neighbours import local_affine_fit
 from ringdic.correlation.prepared import Current, Reference, prepare_current, prepare_reference
 from ringdic.correlation.propagation import Progress, Propagation
+from ringdic.correlation.quadratic import Neighbourhoods
 from ringdic.correlation.refinement import SubsetCache, refine
 from ringdic.correlation.seeds import even_sample, flow_start_values, template_start_values
 from ringdic.correlation.settings import CorrelationSettings
@@ -199,10 +200,11 @@ def load_kernels() -> None:
     _match_automatically(points, {"prepare": 0.0, "start": 0.0, "refine": 0.0})
 
 
-def load_refinement() -> None:
-    """Compile the kernels of the refinement, or load them from numba's cache."""
+def load_refinement(order: int = 1) -> None:
+    """Compile the kernels of the refinement by subsets of order 1 or 2, or load them from numba's cache."""
     points = _small_example()
-    refine(points.reference, points.current, points.xy, np.zeros((len(points.xy), 12)), points.settings)
+    settings = replace(points.settings, order=order)
+    refine(points.reference, points.current, points.xy, np.zeros((len(points.xy), 12)), settings)
 
 
 def load_search() -> None:
@@ -214,6 +216,9 @@ def load_search() -> None:
     points.reject_outliers()
     local_affine_fit(points.xy, points.parameters, points.good, points.near, np.arange(n))
     interpolate_lattice(6.0 * np.rint(points.xy / 6.0), np.zeros((n, 12)), 6.0, points.xy)
+    neighbourhoods = Neighbourhoods(points.xy, 20.0)
+    neighbourhoods.fit(np.zeros((n, 2)), np.ones(n))
+    neighbourhoods.lower_quartile(np.zeros(n))
 
 
 def _small_example() -> Propagation:

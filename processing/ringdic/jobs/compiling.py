@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -71,7 +72,12 @@ def _compile_parts(tell: Tell) -> bool:
 
 def _parts() -> dict[str, Callable[[], object]]:
     """What is run to compile the kernels, by name; those that take longest come first."""
-    parts: dict[str, Callable[[], object]] = {"surfaces": _surfaces, "refinement": _refinement, "matches": _matches}
+    parts: dict[str, Callable[[], object]] = {
+        "surfaces": _surfaces,
+        "refinement": partial(_refinement, 1),
+        "second order": partial(_refinement, 2),
+        "matches": _matches,
+    }
     for entry in entry_points(group=PARTS):
         parts[entry.name] = lambda entry=entry: entry.load()()  # type: ignore[misc]
     return parts
@@ -83,10 +89,10 @@ def _surfaces() -> None:
     run_small_plate()
 
 
-def _refinement() -> None:
+def _refinement(order: int) -> None:
     from ringdic.correlation.correlate import load_refinement
 
-    load_refinement()
+    load_refinement(order)
 
 
 def _matches() -> None:
