@@ -35,7 +35,8 @@ class Way:
 PAIRS = Way("paper's way", ("method=paper",), 0.08, 0.05, 0.9, 0.05)
 # What can be had on this rig at full scale, where the noise is half as large and no JPEG takes its share.
 # A strip along the border of the pattern, where a silhouette's contrast would bias the points, is left out.
-WHOLE = Way("all cameras", (), 0.01, 0.005, 0.97, 0.01)
+# A strip of half a subset's radius along the pattern's border, 3 % of it, holds no point: it would be an extrapolation.
+WHOLE = Way("all cameras", (), 0.01, 0.005, 0.965, 0.01)
 STRETCHES = 1.1e-3
 only_pairs = pytest.mark.parametrize("way", [PAIRS], ids=lambda way: way.name, indirect=True)
 only_whole = pytest.mark.parametrize("way", [WHOLE], ids=lambda way: way.name, indirect=True)

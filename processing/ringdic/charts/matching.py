@@ -27,6 +27,7 @@ from ringdic.correlation import (
     Status,
     correlate_independently,
     correlate_points,
+    grid,
     prepare_reference,
 )
 from ringdic.correlation.quadratic import Neighbourhoods
@@ -93,7 +94,8 @@ def match_chart(
     region, of_points = chart_region(images.image(k), depth_map, plan.inside, settings.radius)
     if mask is not None:
         region, of_points = region & mask, of_points & mask
-    xy, faces = grid_to_the_border(of_points, settings.step)
+    # At the border a flat subset, all on one side of its point, is biased.
+    xy, faces = (grid_to_the_border if curved else grid)(of_points, settings.step)
     partners = np.flatnonzero(plan.sees[plan.inside].any(axis=0))
     cameras = np.concatenate([[k], partners]).astype(np.int64)
     n, out = len(xy), _unmatched(cameras, xy, faces)
@@ -179,7 +181,8 @@ def _bias(difference: Floats, settings: CorrelationSettings) -> Floats:
 def _first_looks(out: ChartMatches, views: Sequence[_View], stencil: Points, settings: CorrelationSettings) -> None:
     """Match every point in the camera that faces it most squarely, and where that fails in the next one.
 
-    A reflection or an obstacle hides a part of the surface from the one and not from the other.
+    A reflection or an obstacle hides a part of the surface from the one and not from the other. What lies beyond the
+    border of the first image waits until the curvature has been measured.
 
     out : matches of n points. views : of the C cameras. stencil : (n, 9, 3) mm, of the depth map's patches.
     """
@@ -188,7 +191,8 @@ def _first_looks(out: ChartMatches, views: Sequence[_View], stencil: Points, set
     for view, cosine in zip(views, squarely, strict=True):
         cosine[view.index] = np.nan_to_num(_incidence_cosine(view.camera, tangents)[view.index], nan=-np.inf)
     while True:
-        wanted = (squarely.max(axis=0) > -np.inf) & ~(out.status[1:] == Status.GOOD).any(axis=0)
+        settled = np.isin(out.status[1:], (Status.GOOD, Status.OUTSIDE)).any(axis=0)
+        wanted = (squarely.max(axis=0) > -np.inf) & ~settled
         if not wanted.any():
             return
         squarest = np.where(wanted, squarely.argmax(axis=0), -1)
