@@ -290,7 +290,7 @@ def _reference_and_points(
     camera = cameras[k]
 
     def frames() -> SurfaceFrames:
-        xyz, _, seen, own = process_memory.get(("surface", str(surface)), lambda: _seen_surface(surface), _bytes)
+        xyz, _, seen, own = _seen_surface(surface)
         return process_memory.get(
             ("surface frames", str(surface)),
             lambda: SurfaceFrames.of(cameras, xyz, seen, own, settings.radius),
@@ -298,15 +298,15 @@ def _reference_and_points(
         )
 
     def make() -> tuple[Reference, TrackedPoints]:
-        xyz, faces, seen, _ = process_memory.get(("surface", str(surface)), lambda: _seen_surface(surface), _bytes)
-        if not seen[k].any():
+        xyz, faces, seen, _ = _seen_surface(surface)
+        index = np.flatnonzero(seen[k])
+        if not len(index):
             raise ComputationError(f"camera {camera.id}: it shares no measured point of the surface with another")
         px = np.full((len(xyz), 2), np.nan)
-        px[seen[k]] = camera.project(xyz[seen[k]])
+        px[index] = camera.project(xyz[index])
         grid = surface_grid(camera.size, settings.step, [(px, faces)])
         prepared = prepare_reference(step_image(image, camera), grid.region, settings)
         assert prepared.gradient  # computed here once, when first used
-        index = np.flatnonzero(seen[k])
         body = SeenBody(camera, index, xyz[index], px[index], frames)
         return prepared, tracked_points(prepared, grid.xy, settings, body)
 
@@ -318,10 +318,18 @@ def _reference_and_points(
 
 
 def _seen_surface(path: Path) -> tuple[Points, NDArray[np.int32], Mask, Indices]:
-    """Points (N, 3) mm, triangles (M, 3) of a surface, which point each of C cameras sees, (C, N) bool, and owners."""
-    arrays = read_output(path)
-    seen: Mask = np.asarray(np.isfinite(arrays["px"][..., 0]))
-    return arrays["xyz"], arrays["faces"].astype(np.int32), seen, arrays["own"]
+    """The surface in a task's output file, cached in memory for all cameras.
+
+    Returns points (N, 3) mm, triangles (M, 3), which point each of C cameras sees, (C, N) bool, and the camera (N,)
+    that each point is of.
+    """
+
+    def read() -> tuple[Points, NDArray[np.int32], Mask, Indices]:
+        arrays = read_output(path)
+        seen: Mask = np.asarray(np.isfinite(arrays["px"][..., 0]))
+        return arrays["xyz"], arrays["faces"].astype(np.int32), seen, arrays["own"]
+
+    return process_memory.get(("surface", str(path)), read, _bytes)
 
 
 def _bytes(arrays: Sequence[NDArray[Any]]) -> int:

@@ -81,8 +81,7 @@ class TrackedPoints:
     positions : (n, 2) float64, px. pixels : (n, 2) float64, px, the whole pixels next to them, on which their
     subsets lie. variance : (n,), of the grey levels there, grey levels². least : mean square difference due
     to rounding to whole grey levels, grey levels². knots : matched before all other points. fine_knots : closer
-    together, with smaller neighbourhoods. radius : px, of the subsets. lattice : (k, 2) px, pixels of the region,
-    ``spacing`` px apart. energy : (k, 2), squares of the derivatives of the grey levels there. body : what the camera
+    together, with smaller neighbourhoods. reference : the image. radius : px, of the subsets. body : what the camera
     sees of the surface, None where that is unknown.
     """
 
@@ -92,10 +91,8 @@ class TrackedPoints:
     least: float
     knots: Knots
     fine_knots: Knots
+    reference: Reference
     radius: int
-    lattice: Pixels
-    energy: Floats
-    spacing: int
     body: SeenBody | None = None
 
     @property
@@ -112,7 +109,11 @@ class TrackedPoints:
     def on_body(self) -> PredictedPoints:
         """The points on the body, which must be known, prepared for predictions; computed where it turns far."""
         assert self.body is not None
-        return PredictedPoints(self.body, self.pixels, self.lattice, self.energy, self.radius, self.spacing)
+        spacing, reference = max(1, round(_LATTICE * self.radius)), self.reference
+        row, column = np.nonzero(reference.mask[::spacing, ::spacing])
+        lattice = spacing * np.stack([column, row], axis=1) + reference.origin
+        energy = np.stack([slope[::spacing, ::spacing][row, column] ** 2.0 for slope in reference.gradient], axis=1)
+        return PredictedPoints(self.body, self.pixels, lattice, energy, self.radius, spacing)
 
     def contradict(self, values: Pixels, sigma: Floats) -> Mask:
         """Outlying points, whose displacement is far from the quadratic fitted to their neighbours.
@@ -158,11 +159,7 @@ def tracked_points(
     fine_knots = Knots.of(pixels, _FINE[0] * radius, _FINE[1] * radius)
     least = (reference.grey_range / 255.0) ** 2
     variance = _variance(reference, pixels, radius)
-    spacing = max(1, round(_LATTICE * radius))
-    row, column = np.nonzero(reference.mask[::spacing, ::spacing])
-    lattice = spacing * np.stack([column, row], axis=1) + reference.origin
-    energy = np.stack([slope[::spacing, ::spacing][row, column] ** 2.0 for slope in reference.gradient], axis=1)
-    return TrackedPoints(positions, pixels, variance, least, knots, fine_knots, radius, lattice, energy, spacing, body)
+    return TrackedPoints(positions, pixels, variance, least, knots, fine_knots, reference, radius, body)
 
 
 def thin_to_grid(xy: Pixels, side: float) -> Indices:

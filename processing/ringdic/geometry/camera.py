@@ -134,7 +134,7 @@ class Camera:
 
     def project(self, xyz: Points) -> Pixels:
         """Image pixels of world points. xyz : (..., 3) mm. Returns (..., 2) px."""
-        px = lens.projections(self.P, *self.optics, _points(xyz))
+        px = lens.projections(self.P, *self.optics, _rows(xyz))
         return np.asarray(px).reshape(*np.shape(xyz)[:-1], 2)
 
     def project_with_jacobian(self, xyz: Points) -> tuple[Pixels, Floats]:
@@ -142,7 +142,7 @@ class Camera:
 
         xyz : (..., 3) mm. Returns pixels (..., 2) px and d(pixel)/d(point) (..., 2, 3) px/mm.
         """
-        jacobian = lens.projection_slopes(self.P, *self.optics, _points(xyz))
+        jacobian = lens.projection_slopes(self.P, *self.optics, _rows(xyz))
         return self.project(xyz), np.asarray(jacobian).reshape(*np.shape(xyz)[:-1], 2, 3)
 
     def undistort(self, px: Pixels) -> Pixels:
@@ -186,11 +186,6 @@ def signed_degrees(angle: float) -> float:
     return (angle + 180.0) % 360.0 - 180.0
 
 
-def _points(xyz: Points) -> Points:
-    """Points (..., 3) as contiguous rows (n, 3)."""
-    return np.ascontiguousarray(xyz, dtype=float).reshape(-1, 3)
-
-
-def _rows(xy: Floats) -> Floats:
-    """Points (..., 2) as contiguous rows (n, 2), the form that the compiled loops take."""
-    return np.ascontiguousarray(xy, dtype=float).reshape(-1, 2)
+def _rows(points: Floats) -> Floats:
+    """Points (..., k) as contiguous rows (n, k), the form that the compiled loops take."""
+    return np.ascontiguousarray(points, dtype=float).reshape(-1, np.shape(points)[-1])

@@ -18,7 +18,7 @@ from ringdic.geometry.lens import projection_of_point, slopes_of_projection, und
 _SURE = 1e-9
 _STEPS = 8  # most Gauss-Newton steps; two or three are enough unless a match is wrong
 _SETTLED = 1e-7  # mm, step at which the iteration has converged
-_CROSSING = 1e-10  # least 27 det N / (tr N)³ of a normal matrix N; 1 where all directions are known equally well
+_CROSSING = 1e-10 / 27.0  # least s of lines of sight that cross; 1 / 27 where all directions are known equally well
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -36,6 +36,17 @@ def _inverse(N, out):  # type: ignore[no-untyped-def]
             out[i, j] /= determinant
             out[j, i] = out[i, j]
     return determinant
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _determined(N, least):  # type: ignore[no-untyped-def]
+    """Whether the determinant of a symmetric matrix N (3, 3) exceeds the share ``least`` of the cube of its trace."""
+    determinant = (
+        N[0, 0] * (N[1, 1] * N[2, 2] - N[1, 2] * N[1, 2])
+        - N[0, 1] * (N[0, 1] * N[2, 2] - N[0, 2] * N[1, 2])
+        + N[0, 2] * (N[0, 1] * N[1, 2] - N[0, 2] * N[1, 1])
+    )
+    return determinant > least * (N[0, 0] + N[1, 1] + N[2, 2]) ** 3
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -65,12 +76,7 @@ def normal_equations(P, px, normal, right, seen):  # type: ignore[no-untyped-def
         for i in range(3):
             for j in range(i):
                 N[i, j] = N[j, i]
-        determinant = (
-            N[0, 0] * (N[1, 1] * N[2, 2] - N[1, 2] * N[1, 2])
-            - N[0, 1] * (N[0, 1] * N[2, 2] - N[0, 2] * N[1, 2])
-            + N[0, 2] * (N[0, 1] * N[1, 2] - N[0, 2] * N[1, 1])
-        )
-        sure[n] = determinant > _SURE * (N[0, 0] + N[1, 1] + N[2, 2]) ** 3
+        sure[n] = _determined(N, _SURE)
     return sure
 
 
@@ -107,13 +113,14 @@ def weighted_points(P, K, lens, px, sigma, xyz, covariance, chi2, degrees):  # t
     normal, inverse, right, at = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
     for n in range(px.shape[1]):
         views = _weighted_linear_equations(P, K, lens, px, sigma, n, normal, right)
-        settled = views >= 2 and _determined(normal)
+        settled = views >= 2 and _determined(normal, _CROSSING)
         if settled:
             _inverse(normal, inverse)
             for i in range(3):
                 at[i] = inverse[i, 0] * right[0] + inverse[i, 1] * right[1] + inverse[i, 2] * right[2]
             settled, chi2[n] = _gauss_newton(P, K, lens, px, sigma, n, normal, inverse, right, at)
-        if settled and math.isfinite(at[0] + at[1] + at[2]) and math.isfinite(chi2[n]) and _determined(normal):
+        known = settled and math.isfinite(at[0] + at[1] + at[2]) and math.isfinite(chi2[n])
+        if known and _determined(normal, _CROSSING):
             xyz[n], covariance[n], degrees[n] = at, inverse, 2 * views - 3
         else:
             xyz[n], covariance[n], chi2[n], degrees[n] = np.nan, np.nan, np.nan, 0
@@ -191,17 +198,6 @@ def _weighted_equations(P, K, lens, px, sigma, n, at, normal, right):  # type: i
                 for j in range(3):
                     normal[i, j] += row[k, i] * weight * row[k, j]
     return chi2
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _determined(N):  # type: ignore[no-untyped-def]
-    """Whether the lines of sight of a point cross, by its normal matrix N (3, 3)."""
-    determinant = (
-        N[0, 0] * (N[1, 1] * N[2, 2] - N[1, 2] * N[1, 2])
-        - N[0, 1] * (N[0, 1] * N[2, 2] - N[1, 2] * N[0, 2])
-        + N[0, 2] * (N[0, 1] * N[1, 2] - N[0, 2] * N[1, 1])
-    )
-    return 27.0 * determinant > _CROSSING * (N[0, 0] + N[1, 1] + N[2, 2]) ** 3
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
