@@ -1,5 +1,6 @@
 """Fixtures of the whole suite."""
 
+import hashlib
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -8,6 +9,10 @@ from typing import Any, NoReturn
 
 import pytest
 from playwright.sync_api import Browser, sync_playwright
+from ringdic.session.records import read_capture_record
+
+# As in a command: the matrices are small, and more threads would only wait. Read when numpy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def _skip_or_fail(reason: str) -> NoReturn:
@@ -80,6 +85,23 @@ def rig_toml() -> Callable[[str, Sequence[str]], str]:
         return f'[rig]\nname = "{name}"{_TARGET_AND_BOARD}' + "".join(entries)
 
     return text
+
+
+@pytest.fixture(scope="session")
+def differing_images() -> Callable[[Path], list[str]]:
+    """Call it with a session folder: the files of its captures that differ from the records, or are in one alone."""
+
+    def differing(session: Path) -> list[str]:
+        faults = []
+        for path in sorted(session.glob("captures/*/capture.json")):
+            cameras = read_capture_record(path).cameras.values()
+            recorded = {(entry.file, entry.sha256) for entry in cameras if entry.file is not None}
+            images = [image for image in path.parent.iterdir() if image.name != path.name]
+            found = {(image.name, hashlib.sha256(image.read_bytes()).hexdigest()) for image in images}
+            faults += [f"{path.parent.name}/{name}" for name, _ in sorted(recorded ^ found)]
+        return faults
+
+    return differing
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ Exit codes: 0 done, 2 bad input, 3 could not be computed, 1 a bug.
 from __future__ import annotations
 
 import logging
+import os
 import sys
 
 from ringdic.errors import InputError, RingdicError, missing_extra
@@ -14,6 +15,8 @@ from ringdic.errors import InputError, RingdicError, missing_extra
 def main() -> None:
     """Run the command that is given on the command line, and end the process with its exit code."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", stream=sys.stderr)
+    # The matrices are small and tasks use all cores; more threads would only wait. Read when numpy is imported.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         from ringdic.cli.app import run  # needs packages that a camera node does not have
 

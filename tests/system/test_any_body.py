@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import pytest
+from ringdic_controller.studies.gallery import rows as gallery_rows
 from ringdic_controller.studies.gallery.run import run_gallery
 
 #: Rows of the gallery, and the least share covered of what two cameras see under 60°.
@@ -21,7 +22,9 @@ ROWS = {
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
     """The figures of the rows by name."""
-    totals = run_gallery(tmp_path_factory.mktemp("gallery"), scale=0.3, only=tuple(ROWS))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gallery_rows, "BOARDS", 5)
+        totals = run_gallery(tmp_path_factory.mktemp("gallery"), scale=0.3, only=tuple(ROWS))
     return {entry["name"]: entry for entry in totals["entries"]}
 
 

@@ -19,13 +19,14 @@ import numpy as np
 import pytest
 from ringdic.errors import InputError
 from ringdic.session.folder import open_session
-from ringdic.session.writer import Archive, SessionWriter, verify
+from ringdic.session.writer import Archive, SessionWriter
 from ringdic_controller.rig.capture import MS, SECOND, Timing
 from ringdic_controller.rig.link import RigLink
 from ringdic_controller.rig.rounds import CaptureRefusedError
 from ringdic_node.cli import main as node_command
 
 RigToml = Callable[[str, Sequence[str]], str]
+Differing = Callable[[Path], list[str]]
 WIDTH, HEIGHT = 640, 480
 EXPOSURE = "[capture]\nexposure_us = 4000\n"
 # A loaded test machine needs more lead than a rig; the other waits are short so that failures show soon.
@@ -119,7 +120,9 @@ def assert_archived(session: SessionWriter, capture_id: str, camera: str, kind: 
     assert entry.exposure_us == 4000.0, "the cameras hold what rig.toml asks for"
 
 
-def test_a_node_killed_in_the_middle_of_a_capture(twelve: Ring, tmp_path: Path, rig_toml: RigToml):
+def test_a_node_killed_in_the_middle_of_a_capture(
+    twelve: Ring, tmp_path: Path, rig_toml: RigToml, differing_images: Differing
+):
     archive = Archive(tmp_path / "archive")
     victim, others = "cam_05", [camera for camera in twelve.cameras if camera != "cam_05"]
     events: list[dict] = []
@@ -159,7 +162,7 @@ def test_a_node_killed_in_the_middle_of_a_capture(twelve: Ring, tmp_path: Path, 
         for camera in others:
             assert_archived(session, "0002-target", camera, "target", 0)
         assert not (session.path / "captures/0002-target" / f"{victim}.pgm").exists()
-        assert verify(session.path) == []
+        assert differing_images(session.path) == []
 
         roster = {node["id"]: node for node in rig.roster()}
         assert roster[victim]["alive"] is False
@@ -194,7 +197,9 @@ with RigLink("test-ring", ["a", "b", "c"], endpoint, archive, lambda event: None
 """
 
 
-def test_a_controller_and_a_node_killed_in_a_burst_lose_nothing(three: Ring, tmp_path: Path, rig_toml: RigToml):
+def test_a_controller_and_a_node_killed_in_a_burst_lose_nothing(
+    three: Ring, tmp_path: Path, rig_toml: RigToml, differing_images: Differing
+):
     root = tmp_path / "archive"
     session = Archive(root).create_session("burst", rig_toml("test-ring", three.cameras) + EXPOSURE)
     # Nodes come up first, try in vain for a while, and must find the controller when it appears.
@@ -226,7 +231,7 @@ def test_a_controller_and_a_node_killed_in_a_burst_lose_nothing(three: Ring, tmp
     for record in session.captures():
         for camera in three.cameras:
             assert_archived(session, record.capture_id, camera, "specimen", record.number - 1)
-    assert verify(session.path) == []
+    assert differing_images(session.path) == []
 
 
 def test_a_capture_is_refused_while_a_camera_is_absent_unless_the_operator_overrides(

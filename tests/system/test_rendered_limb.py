@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from ringdic.mesh.topology import holes, inconsistent_edges, is_closed_tube, non_manifold_vertices, overlap_area
+from ringdic.mesh.topology import holes, inconsistent_edges, is_closed_tube, overlap_area, without_pinches
 from ringdic.results.reader import read_results
 from ringdic.results.results import Results
 from ringdic.session.folder import newest_results
@@ -195,7 +195,7 @@ def test_one_closed_tube(results: Results, way: Way, figures) -> None:
     figures(f"rendered limb, {way.name}: largest hole", f"{largest:.2f} mm²", "≤ 5")
     assert (outwards > 0).all()
     assert is_closed_tube(mesh, largest_hole=5.0)
-    assert len(non_manifold_vertices(mesh)) == 0
+    assert without_pinches(mesh).all()
     assert len(inconsistent_edges(mesh)) == 0
     assert overlap == 0.0
     assert set(results.pair) >= {-1, *range(12)}

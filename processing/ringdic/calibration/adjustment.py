@@ -37,6 +37,7 @@ from ringdic.session.rig import Target
 HUBER = 2.5
 #: Least standard deviations of a centroid, px, and of a print error, mm, that the adjustment supposes.
 _PX_FLOOR, _PRINT_FLOOR = 1e-5, 5e-4
+_MOST_STEPS = 60
 
 
 @dataclass(frozen=True)
@@ -153,11 +154,10 @@ class Solution:
     iterations: int
 
 
-def adjust(problem: Problem, start: State, print_sigma: float, *, limit: int = 60) -> Solution:
+def adjust(problem: Problem, start: State, print_sigma: float) -> Solution:
     """Adjust all free parameters to convergence by the Levenberg-Marquardt method, and estimate the weights' scales.
 
     print_sigma : mm, prior standard deviation of the print errors, replaced by its estimate; 0 fixes the dots.
-    limit : largest number of steps.
 
     Raises ComputationError where the observations do not determine the free parameters.
     """
@@ -173,14 +173,14 @@ def adjust(problem: Problem, start: State, print_sigma: float, *, limit: int = 6
                 and abs(now.print - scales.print) <= 0.02 * scales.print
                 and abs(now.lens / scales.lens - 1) < 0.02
             )
-            scales, normal = now, _reweighted(problem, state, normal, now)
+            scales, normal = now, _assembled(problem, state, now, normal.by_rest, normal.by_dot, normal.residuals)
         trial, damping, gained, cost = _step(problem, state, normal, damping)
         iterations += 1
         # A gain of 1e-2 moves no parameter by more than a tenth of its standard error; exact data reach zero cost.
         at_rest = gained <= 1e-4 * cost or gained <= 1e-12
         done = trial is None or (at_rest and gained <= 1e-2)
         state = state if trial is None else trial
-        if (done and settled) or iterations == limit:
+        if (done and settled) or iterations == _MOST_STEPS:
             break
         if not near:
             px = _robust_sigma(problem.px - problem.project(state))
@@ -235,11 +235,6 @@ def _normal_equations(problem: Problem, state: State, scales: Scales) -> _Normal
         (values.reshape(-1), np.repeat(at, 2, axis=0).ravel(), starts), shape=(2 * n, len(problem.free))
     )
     return _assembled(problem, state, scales, J[:, problem.free], by_dot, problem.px - px)
-
-
-def _reweighted(problem: Problem, state: State, normal: _Normal, scales: Scales) -> _Normal:
-    """Normal equations with the Jacobians of earlier ones, for other scales."""
-    return _assembled(problem, state, scales, normal.by_rest, normal.by_dot, normal.residuals)
 
 
 def _assembled(

@@ -29,6 +29,7 @@ from ringdic.calibration.patch import (
 )
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
+from ringdic.session.json_values import from_json_value, json_value
 from ringdic.session.rig import Target
 
 log = logging.getLogger(__name__)
@@ -142,38 +143,13 @@ class BundleFit:
 
     def to_dict(self) -> dict[str, Any]:
         """The fit as JSON values."""
-        return {
-            "cameras": list(self.cameras),
-            "covariance": self.covariance.tolist(),
-            "sheet": [self.sheet.radius, self.sheet.pitch, self.sheet.tilt],
-            "px_sigma": self.px_sigma,
-            "print_sigma": self.print_sigma,
-            "rows": self.rows.tolist(),
-            "columns": self.columns.tolist(),
-            "offsets": self.offsets.tolist(),
-            "offsets_sigma": self.offsets_sigma.tolist(),
-            "lens_chi2": [None if np.isnan(value) else float(value) for value in self.lens_chi2],
-            "lens_scale": self.lens_scale,
-            "chi2": self.chi2.tolist(),
-        }
+        return {**json_value(self), "sheet": [self.sheet.radius, self.sheet.pitch, self.sheet.tilt]}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> BundleFit:
         """The fit from the JSON values of :meth:`to_dict`."""
-        return cls(
-            tuple(values["cameras"]),
-            np.array(values["covariance"], dtype=float),
-            PrintedSheet(*(float(value) for value in values["sheet"])),
-            float(values["px_sigma"]),
-            float(values["print_sigma"]),
-            np.array(values["rows"], dtype=np.intp),
-            np.array(values["columns"], dtype=np.intp),
-            np.array(values["offsets"], dtype=float).reshape(-1, 2),
-            np.array(values["offsets_sigma"], dtype=float).reshape(-1, 2),
-            np.array([np.nan if value is None else value for value in values["lens_chi2"]], dtype=float),
-            float(values["lens_scale"]),
-            np.array(values["chi2"], dtype=float),
-        )
+        radius, pitch, tilt = values["sheet"]
+        return from_json_value(cls, {**values, "sheet": {"radius": radius, "pitch": pitch, "tilt": tilt}})
 
 
 def bundle_adjustment(
@@ -234,7 +210,6 @@ def centroid_shift(
     rows: Indices,
     columns: Indices,
     *,
-    sheet: PrintedSheet | None = None,
     rotation: Floats | None = None,
     translation: Vectors | None = None,
 ) -> Pixels:
@@ -245,14 +220,13 @@ def centroid_shift(
     Parameters
     ----------
     rows, columns : (n,) of the dots, from 1.
-    sheet : the adjusted geometry of the sheet, or None for the nominal one.
     rotation, translation : (3, 3) and (3,) mm, motion of the target in the world since the calibration, or None.
 
     Returns
     -------
     (n, 2) px.
     """
-    sheet = sheet or PrintedSheet.nominal(target)
+    sheet = PrintedSheet.nominal(target)
     state = CameraParameters.of(camera)
     R, t = state.rotation, state.translation
     t = t if translation is None else t + R @ np.asarray(translation, dtype=float)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,16 +13,11 @@ from ringdic.arrays import Pixels
 from ringdic.calibration import dlt
 from ringdic.calibration.board import board_points, find_corners
 from ringdic.calibration.dots import find_dots
-from ringdic.calibration.intrinsics import (
-    VIEWS_NEEDED,
-    IntrinsicsFit,
-    calibrate_intrinsics,
-    intrinsics_from_dict,
-    intrinsics_to_dict,
-)
+from ringdic.calibration.intrinsics import VIEWS_NEEDED, IntrinsicsFit, calibrate_intrinsics
 from ringdic.calibration.target import DotObservations, identify_dots
 from ringdic.errors import ComputationError, InputError
 from ringdic.geometry.camera import Camera, Intrinsics
+from ringdic.session.json_values import from_json_value, json_value
 from ringdic.session.rig import Rig
 
 #: Largest standard error of a focal length that counts as determined, as a part of it.
@@ -71,33 +66,22 @@ class CameraCalibration:
 
     def to_dict(self) -> dict[str, Any]:
         """The calibration as JSON values."""
-        lens = self.camera.intrinsics
-        return {
-            "camera": self.camera.id,
-            "size": list(self.camera.size),
-            "P": self.camera.P.tolist(),
-            "intrinsics": None if lens is None else intrinsics_to_dict(lens),
-            "intrinsics_fit": None if self.fit is None else self.fit.to_dict(),
-            "dots": self.dots.to_dict(),
-            "residuals": self.residuals.tolist(),
-            "left_out": self.left_out,
-            "centroid_shift": self.centroid_shift.tolist(),
-            "views": list(self.views),
-            "blank": list(self.blank),
+        own = {
+            name: json_value(getattr(self, name))
+            for name in ("residuals", "left_out", "centroid_shift", "views", "blank")
         }
+        camera = {name: json_value(getattr(self.camera, name)) for name in ("size", "P", "intrinsics")}
+        fit = None if self.fit is None else self.fit.to_dict()
+        return {"camera": self.camera.id, **camera, "intrinsics_fit": fit, "dots": self.dots.to_dict(), **own}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> CameraCalibration:
         """The calibration from the JSON values of :meth:`to_dict`."""
-        width, height = values["size"]
         lens, fit = values["intrinsics"], values["intrinsics_fit"]
+        intrinsics = None if lens is None else from_json_value(Intrinsics, lens)
+        width, height = values["size"]
         return cls(
-            Camera(
-                values["camera"],
-                np.array(values["P"], dtype=float),
-                (int(width), int(height)),
-                None if lens is None else intrinsics_from_dict(lens),
-            ),
+            Camera(values["camera"], np.array(values["P"], dtype=float), (int(width), int(height)), intrinsics),
             DotObservations.from_dict(values["dots"]),
             np.array(values["residuals"], dtype=float).reshape(-1, 2),
             int(values["left_out"]),
@@ -122,9 +106,6 @@ def calibrate_camera(
     fewest_terms: bool = False,
     drop_percentile: float = 80.0,
     board_names: Sequence[str] | None = None,
-    max_incidence_deg: float = 55.0,
-    linear_light: bool = True,
-    progress: Callable[[int, int], None] | None = None,
 ) -> CameraCalibration:
     """Calibrate a camera from its images of the board and of the target.
 
@@ -135,24 +116,25 @@ def calibrate_camera(
     intrinsics : the lens, where the rig gives it; the board images are then not used.
     radial, tangential, skew, fewest_terms, drop_percentile : of the lens model, as in `calibrate_intrinsics`.
     board_names : names of the board images; None numbers them from 1.
-    max_incidence_deg : dots whose surface is seen more obliquely than this are not used.
-    linear_light : True for sRGB-coded images, False for raw ones.
-    progress : called with the number of board images done and their total.
 
     Raises
     ------
-    InputError : images of different sizes, too few views of the board, or a target that is not identified.
+    InputError : a lens of another size, too few views of the board, or a target that is not identified.
     ComputationError : the views do not determine the lens, or the dots the projection.
     """
     size = (target_image.shape[1], target_image.shape[0])
     lens = intrinsics if distortion else None
-    _require_one_size(camera_id, size, board_images, lens)
+    if lens is not None and lens.size != size:
+        raise InputError(
+            f"camera {camera_id}: its intrinsics are for images of {lens.size[0]} x {lens.size[1]} "
+            f"pixels, the target image is {size[0]} x {size[1]}; give intrinsics made at this size"
+        )
     fit = None
     views: tuple[str, ...] = ()
     blank: tuple[str, ...] = ()
     if distortion and lens is None:
         names = [str(i + 1) for i in range(len(board_images))] if board_names is None else list(board_names)
-        corners = _board_corners(rig, camera_id, board_images, progress)
+        corners = _board_corners(rig, camera_id, board_images)
         views = tuple(name for name, view in zip(names, corners, strict=True) if view is not None)
         blank = tuple(name for name, view in zip(names, corners, strict=True) if view is None)
         fit = calibrate_intrinsics(
@@ -163,43 +145,18 @@ def calibrate_camera(
         lens = fit.intrinsics
     entry = rig.camera(camera_id)
     dots = identify_dots(
-        find_dots(target_image, rig.target, linear_light=linear_light), rig.target, entry.azimuth_deg,
+        find_dots(target_image, rig.target), rig.target, entry.azimuth_deg,
         camera=camera_id, intrinsics=lens, rotation_deg=entry.rotation_deg, height_mm=entry.height_mm,
-        max_incidence_deg=max_incidence_deg,
     )  # fmt: skip
     return replace(_dlt_calibration(camera_id, size, dots, lens, fit), views=views, blank=blank)
 
 
-def _require_one_size(
-    camera_id: str, size: tuple[int, int], board_images: Sequence[NDArray[np.generic]], lens: Intrinsics | None
-) -> None:
-    """Raise InputError where a board image or the lens has another size (width, height) than the target image."""
-    width, height = size
-    for number, image in enumerate(board_images, start=1):
-        if image.shape != (height, width):
-            raise InputError(
-                f"camera {camera_id}: board image {number} is {image.shape[1]} x {image.shape[0]} pixels, the target "
-                f"image is {width} x {height}; all images of a camera must have one size"
-            )
-    if lens is not None and lens.size != size:
-        raise InputError(
-            f"camera {camera_id}: its intrinsics are for images of {lens.size[0]} x {lens.size[1]} "
-            f"pixels, the target image is {width} x {height}; give intrinsics made at this size"
-        )
-
-
-def _board_corners(
-    rig: Rig, camera_id: str, images: Sequence[NDArray[np.generic]], progress: Callable[[int, int], None] | None
-) -> list[Pixels | None]:
+def _board_corners(rig: Rig, camera_id: str, images: Sequence[NDArray[np.generic]]) -> list[Pixels | None]:
     """Corners of the board (n, 2) px in each image, None where the whole board is not detected.
 
     Raises InputError where it is detected in fewer than ``VIEWS_NEEDED`` images.
     """
-    corners = []
-    for number, image in enumerate(images, start=1):
-        corners.append(find_corners(image, rig.board.inner_corners))
-        if progress is not None:
-            progress(number, len(images))
+    corners = [find_corners(image, rig.board.inner_corners) for image in images]
     count = sum(view is not None for view in corners)
     if count < VIEWS_NEEDED:
         across, along = rig.board.squares

@@ -46,12 +46,12 @@ def to_projection(L: Floats) -> Floats:
     return np.append(np.asarray(L, dtype=float), 1.0).reshape(3, 4)
 
 
-def to_camera(L: Floats, id_: str = "") -> Camera:
+def to_camera(L: Floats) -> Camera:
     """Camera of DLT parameters: without lens distortion and with an unknown image size.
 
     L : (11,), world mm to undistorted px.
     """
-    return Camera(id_, to_projection(L), (1, 1))
+    return Camera("", to_projection(L), (1, 1))
 
 
 def residuals(L: Floats, xyz: Points, px: Pixels) -> Pixels:

@@ -55,18 +55,17 @@ class Dots:
         return Dots(self.px[chosen], self.width[chosen], self.height[chosen], self.contrast[chosen], self.size)
 
 
-def find_dots(image: NDArray[np.generic], target: Target, *, linear_light: bool = True) -> Dots:
+def find_dots(image: NDArray[np.generic], target: Target) -> Dots:
     """Detect dark spots of an image that may be dots of the target, and measure their centroids.
 
-    image : (height, width) grey, uint8, uint16 or float in 0 … 255.
+    image : (height, width) grey, uint8, uint16 or float in 0 … 255, sRGB-coded; centroids are taken after decoding.
     target : its description bounds the size of a dot, supposing that all of its rows are in the image.
-    linear_light : True for an sRGB-coded image, which is decoded before centroids are taken; False for a raw image.
     """
     if image.ndim != 2:
         raise ValueError(f"a grey image has two axes, not {image.ndim}")
     grey = _as_unit(image)
     boxes = _candidate_boxes(grey, target)
-    light = _to_linear(grey) if linear_light else grey
+    light = _to_linear(grey)
     size = (grey.shape[1], grey.shape[0])
     spots = [spot for box in boxes if (spot := _measure(light, box)) is not None]
     if not spots:

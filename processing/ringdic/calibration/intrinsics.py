@@ -28,6 +28,7 @@ from ringdic.calibration.lens_model import (
 from ringdic.calibration.parameters import lens_of, pose_jacobians
 from ringdic.errors import ComputationError, InputError
 from ringdic.geometry.camera import Intrinsics
+from ringdic.session.json_values import from_json_value, json_value
 
 log = logging.getLogger(__name__)
 
@@ -72,49 +73,14 @@ class IntrinsicsFit:
 
     def to_dict(self) -> dict[str, Any]:
         """The fit as JSON values."""
-        return {
-            "intrinsics": intrinsics_to_dict(self.intrinsics),
-            "sigma": self.sigma.tolist(),
-            "view_errors": self.view_errors.tolist(),
-            "kept": self.inliers.tolist(),
-            "rms": self.rms,
-            "covariance": self.covariance.tolist(),
-            "model": self.model,
-            "reason": self.reason,
-            "coverage": self.coverage,
-            "residual_distortion": self.residual_distortion,
-        }
+        values: dict[str, Any] = json_value(self)
+        kept = values.pop("inliers")
+        return {**values, "kept": kept}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> IntrinsicsFit:
         """The fit from the JSON values of :meth:`to_dict`."""
-        return cls(
-            intrinsics_from_dict(values["intrinsics"]),
-            np.array(values["sigma"], dtype=float),
-            np.array(values["view_errors"], dtype=float),
-            np.array(values["kept"], dtype=bool),
-            float(values["rms"]),
-            np.array(values["covariance"], dtype=float),
-            str(values["model"]),
-            str(values["reason"]),
-            float(values["coverage"]),
-            float(values["residual_distortion"]),
-        )
-
-
-def intrinsics_to_dict(intrinsics: Intrinsics) -> dict[str, Any]:
-    """JSON values of intrinsics: K, distortion and size."""
-    return {
-        "K": intrinsics.K.tolist(),
-        "distortion": intrinsics.distortion.tolist(),
-        "size": list(intrinsics.size),
-    }
-
-
-def intrinsics_from_dict(values: dict[str, Any]) -> Intrinsics:
-    """Intrinsics from the JSON values of :func:`intrinsics_to_dict`."""
-    width, height = values["size"]
-    return Intrinsics(np.array(values["K"]), np.array(values["distortion"]), (int(width), int(height)))
+        return from_json_value(cls, {**values, "inliers": values["kept"]})
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
@@ -125,7 +91,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
     """
     path = Path(path)
     try:
-        return intrinsics_from_dict(json.loads(path.read_text(encoding="utf-8")))
+        return from_json_value(Intrinsics, json.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; the rig names it as a camera's intrinsics") from error
     except (ValueError, KeyError, TypeError) as error:

@@ -25,6 +25,7 @@ from ringdic.calibration.dots import Dots
 from ringdic.calibration.patch import cylinder_points
 from ringdic.errors import ComputationError, InputError
 from ringdic.geometry.camera import Camera, Intrinsics, signed_degrees
+from ringdic.session.json_values import from_json_value, json_value
 from ringdic.session.rig import Target
 
 log = logging.getLogger(__name__)
@@ -38,6 +39,8 @@ _AZIMUTH_MARGIN = 1.0
 #: Largest distance of a dot from its predicted position, in dot sizes. Printed numbers above the top row, about 2 mm
 #: from where one more row of 4 mm dots would be, are beyond it.
 _PLACE = 0.35
+#: Dots whose surface is seen more obliquely than this are left out, degrees.
+_MAX_INCIDENCE = 55.0
 
 
 @dataclass(frozen=True)
@@ -82,29 +85,13 @@ class DotObservations:
 
     def to_dict(self) -> dict[str, Any]:
         """The observations as JSON values."""
-        return {
-            "camera": self.camera,
-            "rows": self.rows.tolist(),
-            "columns": self.columns.tolist(),
-            "px": self.px.tolist(),
-            "xyz": self.xyz.tolist(),
-            "azimuth_deg": self.azimuth_deg,
-            "margin_deg": self.margin_deg if math.isfinite(self.margin_deg) else None,
-        }
+        return dict(json_value(self))
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> DotObservations:
         """The observations from the JSON values of :meth:`to_dict`."""
         margin = values["margin_deg"]
-        return cls(
-            values["camera"],
-            np.array(values["rows"], dtype=np.intp),
-            np.array(values["columns"], dtype=np.intp),
-            np.array(values["px"], dtype=float).reshape(-1, 2),
-            np.array(values["xyz"], dtype=float).reshape(-1, 3),
-            float(values["azimuth_deg"]),
-            math.inf if margin is None else float(margin),
-        )
+        return from_json_value(cls, {**values, "margin_deg": math.inf if margin is None else margin})
 
 
 def dot_points(target: Target, rows: Indices, columns: Indices) -> Points:
@@ -128,7 +115,6 @@ def identify_dots(
     intrinsics: Intrinsics | None = None,
     rotation_deg: float = 0.0,
     height_mm: float | None = None,
-    max_incidence_deg: float = 55.0,
 ) -> DotObservations:
     """Identify the dots of the target in an image: row, column and position in space of each.
 
@@ -141,7 +127,6 @@ def identify_dots(
     rotation_deg : clockwise rotation of the image; the nearest multiple of 90 is used.
     height_mm : of the camera, good to a third of the rows' spacing, or None; needed to number the rows where the image
         shows neither the lowest nor the highest.
-    max_incidence_deg : dots whose surface is seen more obliquely than this are left out.
 
     Raises
     ------
@@ -156,7 +141,7 @@ def identify_dots(
     L = numbering.L
     all_rows = range(1, target.rows + 1)
     for _ in range(3):
-        spots, rows, columns = _match(upright, L, target, all_rows, max_incidence_deg)
+        spots, rows, columns = _match(upright, L, target, all_rows, _MAX_INCIDENCE)
         _require_dots(camera, len(spots), len(set(columns.tolist())))
         xyz = dot_points(target, rows, columns)
         L, inliers = dlt.solve_dlt_robust(xyz, upright.px[spots], sigmas=8.0, floor=1.0)

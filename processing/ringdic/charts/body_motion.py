@@ -26,10 +26,11 @@ from ringdic.strain.rigid_motion import RigidMotion
 _REACH = 0.7  # subset radii over which a warp's central differences are taken; to the fourth order they leave no bias
 _WINDOW = 2.0  # subset radii about a point of the surface, of the neighbours that its curvature is computed from
 _ITERATIONS = 30  # of Gauss-Newton at most
-_SETTLED = 1e-6  # rad and, times the size of the body, mm, of the last one
+_SETTLED = 1e-4  # rad and, times the size of the body, mm, of the last one
 _TUKEY = 4.685  # standard deviations beyond which a match has no weight (Beaton & Tukey 1974)
+_SINGULAR = 1e-12  # share of the largest, of a singular value of the normal matrix that counts as zero
 _LEAST_SCATTER = 0.1  # px, standard deviation of the matches, at least
-_SOME = 500  # matches, at most, that a motion is fitted to
+_SOME = 250  # matches, at most, that a motion is fitted to
 _FEWEST = 12  # matches that a motion is fitted to
 _STEEP = np.cos(np.radians(40.0))  # cosine of the incidence at the reference below which third derivatives count
 _RIDGE = 1e-9  # share of the trace added to the diagonal: pixels on a line give no plane
@@ -61,8 +62,8 @@ class SurfaceFrames:
             if not mine.any():
                 continue
             px, inverse = camera.project(xyz[vertex]), 1.0 / depths(camera, xyz[vertex])
-            fit = Neighbourhoods(px, _WINDOW * radius).fit(inverse[:, None])
-            patches = Patches(px, fit.value[:, 0], fit.gradient[:, 0], fit.curvature[:, 0]).part(mine)
+            fit = Neighbourhoods(px, _WINDOW * radius, np.flatnonzero(mine)).fit(inverse[:, None])
+            patches = Patches(px[mine], fit.value[:, 0], fit.gradient[:, 0], fit.curvature[:, 0])
             index, stencil = vertex[mine], patches.stencil(camera, _REACH * radius)
             out.origin[index] = stencil[:, 0]
             out.axes[index], out.form[index] = _frame(stencil)
@@ -260,8 +261,8 @@ def _fitted_motion(camera: Camera, xyz: Points, px: Pixels) -> RigidMotion:
         limit = _TUKEY * max(_LEAST_SCATTER, 1.4826 * float(np.median(distance)))
         weight = np.maximum(1.0 - (distance / limit) ** 2, 0.0)  # square root of Tukey's
         by_turn = np.cross(turned[:, None], jacobian)
-        A = np.concatenate([by_turn, jacobian * size], axis=2) * weight[:, None, None]
-        step = np.linalg.lstsq(A.reshape(-1, 6), (residual * weight[:, None]).ravel(), rcond=1e-9)[0]
+        A = (np.concatenate([by_turn, jacobian * size], axis=2) * weight[:, None, None]).reshape(-1, 6)
+        step = np.linalg.lstsq(A.T @ A, A.T @ (residual * weight[:, None]).ravel(), rcond=_SINGULAR)[0]
         R, shift = np.asarray(cv2.Rodrigues(step[:3])[0]) @ R, shift + size * step[3:]
         if np.abs(step).max() < _SETTLED:
             break

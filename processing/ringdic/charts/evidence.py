@@ -8,8 +8,7 @@ the share ``exp(-σ² ω²)`` of the pattern's power at ω radians a px: σ foll
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -40,9 +39,10 @@ _FEWEST_RINGS = 3
 
 @dataclass(frozen=True)
 class MatchEvidence:
-    """Figures of camera number ``camera`` and its nearest partner; NaN where unknown.
+    """Figures of a camera and its nearest partner; NaN where unknown.
 
-    textured, depths : numbers of textured places, inside the mask, and of those with a depth. masked : 1 with a mask.
+    camera, partner : their ids. textured, depths : numbers of textured places, inside the mask, and of those with a
+    depth. masked : whether there is a mask.
     contrast, partner_contrast : of the pattern, grey levels a px; mask_contrast : inside the mask. blur : px, standard
     deviation by which its image is more blurred than the partner's, negative where less. matches : number of features
     matched, of which in_mask lie inside the mask and in_range at a depth that is searched. offset : px, their median
@@ -50,18 +50,18 @@ class MatchEvidence:
     depths; low, high : mm, range of depths searched.
     """
 
-    camera: float
-    partner: float
-    textured: float
-    depths: float
-    masked: float
+    camera: str
+    partner: str
+    textured: int
+    depths: int
+    masked: bool
     contrast: float
     partner_contrast: float
     mask_contrast: float
     blur: float
-    matches: float
-    in_mask: float
-    in_range: float
+    matches: int
+    in_mask: int
+    in_range: int
     offset: float
     limit: float
     near: float
@@ -69,22 +69,19 @@ class MatchEvidence:
     low: float
     high: float
 
-    def array(self) -> Floats:
-        """The figures as one array, (18,), px, mm and grey levels as in the class, for a task's output."""
-        return np.array([getattr(self, each.name) for each in fields(self)])
-
-    def sentence(self, ids: Mapping[int, str]) -> str:
-        """What stands out, with its number, then the other figures. ids : of the cameras by number."""
-        partner = f"camera {ids[int(self.partner)]}"
+    @property
+    def sentence(self) -> str:
+        """What stands out, with its number, then the other figures."""
+        partner = f"camera {self.partner}"
         inside = " inside its mask" if self.masked else ""
-        figures = [f"{self.textured:.0f} textured places{inside}, {self.depths:.0f} with a depth"]
-        figures.append(f"{self.matches:.0f} features matched in {partner}")
+        figures = [f"{self.textured} textured places{inside}, {self.depths} with a depth"]
+        figures.append(f"{self.matches} features matched in {partner}")
         if self.matches >= _FEWEST:
             figures.append(f"epipolar offset {abs(self.offset):.1f} px")
             figures.append(f"depths {self.near:.0f} to {self.far:.0f} mm")
         if np.isfinite(self.blur):
             figures.append(f"blur {self.blur:+.1f} px against it")
-        return f"camera {ids[int(self.camera)]} does not match: {self._verdict(partner)} ({', '.join(figures)})"
+        return f"camera {self.camera} does not match: {self._verdict(partner)} ({', '.join(figures)})"
 
     def _verdict(self, partner: str) -> str:
         """The figure that stands against a match, and what to check."""
@@ -92,7 +89,7 @@ class MatchEvidence:
         if not self.masked and not self.textured:
             return f"the strongest contrast of its image is {self.contrast:.1f} grey levels a px; speckle the specimen"
         if self.masked and known and self.in_mask < 0.1 * self.matches:
-            return f"its mask holds {self.in_mask:.0f} of the {self.matches:.0f} features; draw it on the specimen"
+            return f"its mask holds {self.in_mask} of the {self.matches} features; draw it on the specimen"
         if self.masked and self.mask_contrast < _FAINT * self.contrast:
             return (
                 f"the contrast inside its mask is {self.mask_contrast:.1f} grey levels a px, elsewhere "
@@ -116,7 +113,7 @@ class MatchEvidence:
                 f"the contrast of its image is {self.contrast:.1f} grey levels a px, that of {partner} "
                 f"{self.partner_contrast:.1f}; check where it looks, and the light"
             )
-        return f"{self.matches:.0f} features of its image are found in that of {partner}; check where both look"
+        return f"{self.matches} features of its image are found in that of {partner}; check where both look"
 
 
 def match_evidence(
@@ -149,29 +146,26 @@ def match_evidence(
     low, high = space.limits(cameras[0])
     column, row = np.rint(first).astype(int).T
     return MatchEvidence(
-        k, partner, places, known, float(mask is not None), patterns[0].contrast, patterns[1].contrast,
+        cameras[0].id, cameras[1].id, places, known, mask is not None, patterns[0].contrast, patterns[1].contrast,
         patterns[0].contrast_inside(within), factor * patterns[0].blur_against(patterns[1]), len(first),
         int(within[row, column].sum()), int((space.holds(cameras[0], xyz) & space.holds(cameras[1], xyz)).sum()),
         factor * offset, factor * _OFF_LINE, float(near), float(far), low, high,
     )  # fmt: skip
 
 
-def why_unmatched(cameras: Sequence[Camera], maps: Sequence[DepthMap], evidence: Sequence[Floats]) -> list[str]:
-    """A sentence for each camera with hardly a depth, which says why; an empty one for the others.
+def why_unmatched(
+    images: DepthImages, depth_map: DepthMap, k: int, partner: int | None, space: DepthRange, mask: Mask | None
+) -> str:
+    """A sentence that says why a camera has hardly a depth, empty where it has enough.
 
-    cameras : the C cameras. maps : their depth maps. evidence : the arrays (18,) of their `MatchEvidence`, px, mm and
-    grey levels, or (0,) without.
+    partner : index of its nearest partner, None without. mask : (height, width) bool, of the full image, or None.
     """
-    ids = {k: camera.id for k, camera in enumerate(cameras)}
-    sentences = []
-    for camera, depth_map, figures in zip(cameras, maps, evidence, strict=True):
-        if len(figures):
-            sentences.append(MatchEvidence(*figures.tolist()).sentence(ids))
-        elif not len(depth_map.patches.px):
-            sentences.append(f"camera {camera.id} does not match: no other camera's view is similar enough")
-        else:
-            sentences.append("")
-    return sentences
+    evidence = None if partner is None else match_evidence(images, depth_map, k, partner, space, mask)
+    if evidence is not None:
+        return evidence.sentence
+    if len(depth_map.patches.px):
+        return ""
+    return f"camera {images.cameras[k].id} does not match: no other camera's view is similar enough"
 
 
 @dataclass(frozen=True)

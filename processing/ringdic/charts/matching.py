@@ -96,24 +96,23 @@ def match_chart(
         region, of_points = region & mask, of_points & mask
     # At the border a flat subset, all on one side of its point, is biased.
     xy, faces = (grid_to_the_border if curved else grid)(of_points, settings.step)
-    partners = np.flatnonzero(plan.sees[plan.inside].any(axis=0))
-    cameras = np.concatenate([[k], partners]).astype(np.int64)
+    partners = sorted(c for c, seen in plan.sees.items() if seen[plan.inside].any())
+    cameras = np.array([k, *partners], np.int64)
     n, out = len(xy), _unmatched(cameras, xy, faces)
     if not n or not len(partners):
         return out
     reference = prepare_reference(images.image(k), region, settings)
-    patches, nearest = interpolated_patches(camera, depth_map, xy)
-    sees = plan.sees[np.ix_(nearest, partners)].T
+    patches, nearest = interpolated_patches(depth_map, xy)
     subsets = SubsetCache(n, 1, transposed=True) if curved else None
-    others = [images.cameras[other] for other in partners.tolist()]
+    others = [images.cameras[other] for other in partners]
     rays = stencil_rays(camera, xy, _reach(settings))
     stencil = patches.stencil(camera, _reach(settings), rays)
     views = [
         _View.of(
             reference, images.current(c), images.cameras[c], images.cameras[c].project(stencil[:, 0]),
-            np.flatnonzero(seen), _MARGIN * settings.radius, subsets,
+            np.flatnonzero(plan.sees[c][nearest]), _MARGIN * settings.radius, subsets,
         )
-        for c, seen in zip(partners.tolist(), sees, strict=True)
+        for c in partners
     ]  # fmt: skip
     if curved:
         _first_looks(out, views, stencil, settings)
@@ -156,15 +155,16 @@ def _match_bends(out: ChartMatches, views: Sequence[_View], stencil: Points, set
     """
     n = len(out.xy)
     pairs = grid_neighbours(out.xy, settings.step)
-    beside = pairs.reshape(n, -1)
+    beside = np.moveaxis(pairs, 0, -1)  # (4, 2, n)
     small = replace(settings, radius=max(_SMALLEST, round(_SMALL * settings.radius)), order=1)
     apart = settings.radius / (2.0 * settings.step)
     for slot, view in enumerate(views, start=1):
-        held = np.full((n + 1, 6), np.nan)
-        held[view.index] = view.held
-        change = _bias(held[beside] - held[:-1, None], settings) * apart
-        uneven = _bias(held[pairs].mean(axis=2) - held[:-1, None], settings) * apart**2
-        out.bend[slot] = np.maximum(uneven, np.append(uneven, 0.0)[beside].max(axis=1))
+        held = np.full((6, n + 1), np.nan)
+        held[:, view.index] = view.held.T
+        away = held[:, beside] - held[:, None, None, :-1]
+        change = _bias(away.reshape(-1, n), settings) * apart
+        uneven = _bias(away.mean(axis=2).reshape(-1, n), settings) * apart**2
+        out.bend[slot] = np.maximum(uneven, np.append(uneven, 0.0)[beside].max(axis=(0, 1)))
         at = np.flatnonzero(change[view.index] > _SHARP)
         if not len(at):
             continue
@@ -174,8 +174,8 @@ def _match_bends(out: ChartMatches, views: Sequence[_View], stencil: Points, set
 
 
 def _bias(difference: Floats, settings: CorrelationSettings) -> Floats:
-    """Largest bias (n,) px of matches at curvatures wrong by some differences (n, k, 6) 1/px; 0 where unknown."""
-    return np.asarray(np.nan_to_num(np.abs(difference)).max(axis=(1, 2)) * settings.radius**2 / 8.0)
+    """Largest bias (n,) px of matches at curvatures wrong by some differences (k, n) 1/px; 0 where unknown."""
+    return np.asarray(np.fmax.reduce(np.abs(difference), axis=0, initial=0.0) * settings.radius**2 / 8.0)
 
 
 def _first_looks(out: ChartMatches, views: Sequence[_View], stencil: Points, settings: CorrelationSettings) -> None:
@@ -387,10 +387,10 @@ def _measured_patches(
     return Patches(matches.xy, fit.value[:, 0] * usual, fit.gradient[:, 0] * usual, curvature * usual)
 
 
-def interpolated_patches(camera: Camera, depth_map: DepthMap, xy: Pixels) -> tuple[Patches, Indices]:
+def interpolated_patches(depth_map: DepthMap, xy: Pixels) -> tuple[Patches, Indices]:
     """Curved patches about pixels between the places of a depth map, from local quadratics of the inverse depth.
 
-    camera : of the map. xy : (n, 2) px. Returns the patches, and the index (n,) of the place nearest to each pixel.
+    xy : (n, 2) px. Returns the patches, and the index (n,) of the place nearest to each pixel.
     """
     places = depth_map.patches
     neighbourhoods = Neighbourhoods(places.px, _WINDOW * depth_map.spacing)

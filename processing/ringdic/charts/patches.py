@@ -77,8 +77,16 @@ def stencil_rays(camera: Camera, px: Pixels, reach: float) -> Vectors:
 
 def axial_rays(camera: Camera, px: Pixels) -> Vectors:
     """Directions of lines of sight whose component along the optical axis is 1. px : (..., 2). Returns (..., 3)."""
-    rays = camera.ray(px)
-    return np.asarray(rays / (rays @ optical_axis(camera))[..., None])
+    M = camera.P[:, :3]  # of whose inverse times (x, y, 1) the component along M's last row is the same everywhere
+    inverse = np.linalg.inv(M) * np.linalg.norm(M[2]) * np.sign(np.linalg.det(M))
+    return np.asarray(camera.undistort(px) @ inverse[:, :2].T + inverse[:, 2])
+
+
+def focal_length(camera: Camera) -> float:
+    """Focal length, px, without the distortion: pixels across for each unit of the tangent of the angle to the axis."""
+    middle = (np.array(camera.size) - 1.0) / 2.0
+    ends = camera.ray(np.stack([middle, middle + np.array([1.0, 0.0])]))
+    return 1.0 / float(np.linalg.norm(ends[1] - ends[0]))
 
 
 def optical_axis(camera: Camera) -> Vectors:

@@ -36,6 +36,7 @@ from ringdic.uncertainty.noise import camera_noise
 from ringdic.uncertainty.position import (
     along_surface,
     covariance,
+    disagreement,
     position_gain,
     reference_covariance,
     step_covariance,
@@ -304,18 +305,14 @@ class SurfaceSeries:
         px = np.full_like(surface.px, np.nan)
         for c, view in enumerate(self._views):
             px[c, view.vertex] = view.px
+        self._scatter = surface.scatter * disagreement(surface.chi2, surface.degrees).astype(np.float32)[:, None]
         self._correlation = corner_correlations(px, surface.faces, group.radius_px, group.order)
-        sigma = _root(reference_covariance(self._gain, surface.scatter, surface.own, self._label))
+        sigma = _root(reference_covariance(self._gain, self._scatter, surface.own, self._label))
         n, m = len(surface.xyz), len(surface.faces)
         self.reference = replace(
             self.reference, sigma_xyz=sigma[None], sigma_displacement=np.zeros((1, n, 3)),
             sigma_lambda=np.zeros((1, m, 2)),
         )  # fmt: skip
-
-    def without_matches(self) -> SurfaceSeries:
-        """The series without the matches in the images."""
-        self.reference = replace(self.reference, matches=())
-        return self
 
     def at(self, step: int) -> Results:
         """Results of the reference and of a later step; for step 0 those of the reference alone."""
@@ -323,11 +320,11 @@ class SurfaceSeries:
             return self.reference
         one: SurfaceStep = self._cache.get(step)
         reference, surface = self.reference, self.surface
-        total = self._pixel_sigma(one)
+        total = self._pixel_sigma(one) * disagreement(one.chi2, one.degrees).astype(np.float32)[:, None]
         gain = position_gain(self._cameras, one.xyz, self._dense([camera.weight for camera in one.cameras]))
         half = total / np.float32(np.sqrt(2.0))  # the share of either image
         displacement = _root(covariance(gain, total))
-        position = _root(step_covariance((self._gain, gain), surface.scatter, (half, half), surface.own, self._label))
+        position = _root(step_covariance((self._gain, gain), self._scatter, (half, half), surface.own, self._label))
         strains = deformation(surface.xyz, one.xyz, surface.faces)
         stretches = stretch_sigma(strains, surface.xyz, surface.faces, gain, self._correlation, total)
         lost = ~np.isfinite(one.xyz).all(axis=1)

@@ -40,9 +40,11 @@ from ringdic.geometry.outliers import LostPoint
 _LOOSE = 5e-3  # px, tolerance of the first of two passes
 _MARGIN = 32.0  # px about the subsets in which a current image is filtered
 _START_ZNCC = 0.6  # least ZNCC under the warp by optical flow that makes it a start value
+_STRIDE = 3  # px between the pixels of a subset that this ZNCC is of
 _SOME = 0.2  # least share of the knots with start values from which the others can be reached
 _FEWEST = 8  # start values from which an affine fit extrapolates where all points lie
 _BENT = 2.0  # standard deviations by which curvature moves a subset, from which on it matters at the rim
+_LOOSER = 2.5  # times the tolerance of subsets of second order, which are as much noisier
 _TURNED = np.radians(6.0)  # turn of the body from which on its motion predicts the warps
 _HIDDEN = np.cos(np.radians(74.0))  # cosine of the incidence below which a surface that has turned away is not matched
 _AGREEING = 0.5  # least share of the knots that a predicted motion lets match
@@ -110,7 +112,7 @@ def match_tracked_points(
     )
     mended, again = _mend_curvature(second, warp[:, :2], ground.warp, points, settings.radius)
     if len(again):
-        settings = replace(settings, order=2)
+        settings = replace(settings, order=2, tolerance=_LOOSER * settings.tolerance)
         third = correlate_independently(reference, part, points.pixels[again], settings, _warp(mended)[again])
         mended = with_matches(mended, again, third)
     mended.status[ground.hidden] = LostPoint.OBLIQUE
@@ -185,26 +187,23 @@ def _at_knots(
 ) -> tuple[PointMatches, Current, _Ground]:
     """Match the knots from optical flow, and those that it does not reach from their neighbours.
 
-    Where the matches by flow tell that the body has turned, the knots are matched from the warps that its motion
+    Where these matches tell that the body has turned far, the knots are matched again from the warps that its motion
     predicts. Returns the matches, the part of the current image where all points will lie, and the prediction.
     """
     xy = points.knots.neighbourhoods.xy
     at_knots = as_start_values(flow_start_values(reference, current, xy, settings.radius))[:, :6]
     known = np.flatnonzero(np.isfinite(at_knots).all(axis=1))
-    _, zncc, _ = search_warps(reference, current, xy[known], at_knots[known, None], settings.radius)
+    _, zncc, _ = search_warps(reference, current, xy[known], at_knots[known, None], settings.radius, stride=_STRIDE)
     at_knots[known[~(zncc > _START_ZNCC)]] = np.nan
     known = known[zncc > _START_ZNCC]
-    turned = _at_turned_knots(reference, current, points, settings, at_knots)
-    if turned is not None:
-        return turned
     if len(known) < max(_FEWEST, _SOME * len(xy)):
-        matches = correlate_points(reference, current, xy, settings)
-        turned = _at_turned_knots(reference, current, points, settings, _warp(matches))
-        return turned or (matches, current, _Ground.level(points))
-    at = xy[known]
-    part = current.crop_by_affine_fit(at, at + at_knots[known, :2], points.pixels, settings.radius)
-    matches = correlate_points(reference, part, xy, settings, start=at_knots, prefer_neighbour=True)
-    return matches, part, _Ground.level(points)
+        part, matches = current, correlate_points(reference, current, xy, settings)
+    else:
+        at = xy[known]
+        part = current.crop_by_affine_fit(at, at + at_knots[known, :2], points.pixels, settings.radius)
+        matches = correlate_points(reference, part, xy, settings, start=at_knots, prefer_neighbour=True)
+    turned = _at_turned_knots(reference, current, points, settings, _warp(matches))
+    return turned or (matches, part, _Ground.level(points))
 
 
 def _at_turned_knots(
@@ -279,7 +278,7 @@ def _predicted_warps(first: PointMatches, ground: Floats, points: TrackedPoints,
     out = shift_warps(warp[knot], points.pixels - near.xy[knot])
     out[knot < 0] = np.nan
     curvature, known = _change_of_curvature(fit, first, np.zeros((len(first.xy), 6)), radius)
-    out[:, 6:] = curvature[points.knots.nearest(known, points.pixels)] if known.any() else 0.0
+    out[:, 6:] = points.knots.interpolate(curvature, known, points.pixels) if known.any() else 0.0
     return out + ground
 
 
@@ -313,18 +312,18 @@ def _mend_curvature(
     with np.errstate(invalid="ignore"):
         agreeing = distance <= contradiction_limit(distance)
     own, at = second.part(knots.index), ground[knots.index]
-    values = np.where(agreeing[knots.index, None], own.uv - at[:, :2], np.nan)
-    fit = knots.neighbourhoods.fit(values, np.hypot(*own.sigma.T))
+    values = np.where(agreeing[:, None], second.uv - ground[:, :2], np.nan)
+    fit = knots.neighbourhoods.fit(values, np.hypot(*second.sigma.T))
     change, known = _change_of_curvature(fit, own, own.curvature.reshape(-1, 6) - at[:, 6:], radius)
     if not known.any():
         return second, np.zeros(0, np.int64)
-    by_point = change[knots.nearest(known, points.pixels)].reshape(-1, 2, 3)
+    by_point = knots.interpolate(change, known, points.pixels).reshape(-1, 2, 3)
     bias = radius**2 / 8.0 * (by_point[..., 0] + by_point[..., 2])
     mended = replace(second, uv=second.uv - bias, curvature=second.curvature + by_point)
     bent = radius**2 / 8.0 * np.abs(mended.curvature.reshape(-1, 6) - ground[:, 6:]).max(axis=1)
     with np.errstate(invalid="ignore"):
         strong = second.good & (bent > _BENT * np.hypot(*second.sigma.T))
-    return mended, np.flatnonzero(strong & knots.one_sided[knots.of_points])
+    return mended, np.flatnonzero(strong & points.one_sided)
 
 
 def _shrinkage(values: Floats, sigma: Floats, limit: float) -> Floats:
@@ -365,7 +364,7 @@ def _reject_outliers(matches: PointMatches, points: TrackedPoints, ground: Pixel
     uv = np.where(plausible[:, None], matches.uv - ground, np.nan)
     status[points.contradict(uv, np.hypot(*matches.sigma.T))] = Status.INCONSISTENT
     good = status == Status.GOOD
-    warp = shift_warps(_warp(matches), -points.shift)
+    warp = shift_warps(_warp(matches), -points.shift) if points.shift.any() else _warp(matches)
     return ImageMatches(
         np.where(good[:, None], warp, np.nan),
         np.where(good[:, None], matches.sigma, np.nan),

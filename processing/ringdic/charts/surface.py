@@ -20,7 +20,7 @@ from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.outliers import LostPoint, grid_neighbours, surface_outliers
 from ringdic.merging import SurfacePart, merge, side_by_side
-from ringdic.mesh.mesh import Mesh
+from ringdic.mesh.mesh import Mesh, used_vertices
 
 _BEND = 0.2  # spacings by which a point lies off the middle of its neighbours on a surface bent as sharply as a finger
 _LONGEST = 4.0  # median edges, of a triangle beyond which it joins two surfaces
@@ -146,14 +146,14 @@ def _measure(cameras: Sequence[Camera], chart: Chart, step: int, sigma_max: floa
     smooth = np.stack([smooth_sigma(at, one, CELL_STEPS * step) for at, one in zip(px, sigma, strict=True)])
     n = len(chart.xy)
     points, used = triangulate_agreeing(own, px, smooth, np.zeros(n, np.int64))
-    status = _status(chart, px, uncertain, points.xyz)
+    status = _status(chart, px, points.xyz)
     xyz = np.where((status == 0)[:, None], points.xyz, np.nan)
     neighbours = grid_neighbours(chart.xy, step)
     floor = (_BEND + _off_the_grid(chart.xy, step, neighbours)) * _spacing(xyz, neighbours)
     off = surface_outliers(neighbours, xyz, floor=floor) & (status == 0)
     status[off], xyz[off] = LostPoint.SURFACE, np.nan
     faces = _without_steps(xyz, chart.faces)
-    rows = np.unique(faces)
+    rows = used_vertices(faces)
     number = np.full(n + 1, -1, np.int64)
     number[rows] = np.arange(len(rows))
 
@@ -204,7 +204,7 @@ def _lost_at(chart: Chart, status: NDArray[np.int8]) -> Indices:
     return np.column_stack([own, chart.xy[lost], status[lost]]).astype(np.int64)
 
 
-def _status(chart: Chart, px: Pixels, uncertain: Mask, xyz: Points) -> NDArray[np.int8]:
+def _status(chart: Chart, px: Pixels, xyz: Points) -> NDArray[np.int8]:
     """Reasons (n,) why points have no position, 0 where they have one."""
     lost = ~np.isfinite(xyz).all(axis=1)
     matched = (chart.status[1:] == Status.GOOD).any(axis=0)

@@ -20,7 +20,7 @@ from ringdic.arrays import Image, Indices, Mask, Points
 from ringdic.charts.body_motion import SeenBody, SurfaceFrames
 from ringdic.charts.chart import Chart, chart_with_uncertainty
 from ringdic.charts.depth_map import DepthMap, depths_at_fitting_size
-from ringdic.charts.evidence import match_evidence, why_unmatched
+from ringdic.charts.evidence import why_unmatched
 from ringdic.charts.images import ChartImages
 from ringdic.charts.matching import drop_masked, match_chart
 from ringdic.charts.patches import Patches
@@ -29,20 +29,21 @@ from ringdic.charts.surface import reference_surface
 from ringdic.charts.tracked_points import TrackedPoints, tracked_points
 from ringdic.charts.tracking import CameraMatches, match_in_two_passes, surface_grid
 from ringdic.charts.unmeasured import arrays_of_places, unmeasured_places
-from ringdic.charts.views import plan_chart
+from ringdic.charts.views import MappedSurface, plan_chart
+from ringdic.compiled import source_digest
 from ringdic.correlation import CorrelationSettings, Reference, prepare_reference, reference_bytes
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.session.folder import Capture, Session
 from ringdic.session.images import read_mask
 from ringdic.settings import Settings, SurfaceGroup
-from ringdic.tasks import Arrays, Task, code_stamp, digest, process_memory, read_output, work_folder
+from ringdic.tasks import Arrays, Task, digest, process_memory, read_output, work_folder
 from ringdic.tasks.step_images import Digests, step_image
 
 _WIDEST = 72.0  # degrees between the views of two cameras that are matched with one another
 _MOST = 2  # cameras, those with the most similar views, that a depth map is measured with
 _CHART_COST = 2.0  # of a depth map and of a chart, in units of one camera's step
-_LOOSER = 2.5  # tolerance of matches between cameras, in units of that between steps: their noise is as much larger
+_LOOSER = 4.0  # tolerance of matches between cameras, in units of that between steps: a tenth of their noise remains
 _MATCHES = ("xy", "uv", "gradient", "curvature", "sigma", "c_ls", "status")
 
 
@@ -122,11 +123,11 @@ def charts_job(
     images = tuple(steps[0].images[camera.id] for camera in cameras)
     marks = [(digests.image(steps[0], camera.id), digests.mask(camera.id)) for camera in cameras]
     reference = _ReferenceFiles(views, images, masks, correlation)
-    stamp = code_stamp()
+    stamp = digest(source_digest(), list(cameras))  # another version computes all outputs again
     maps, charts = [], []
     for k, camera in enumerate(cameras):
         used = [marks[c] for c in (k, *views.partners[k])]
-        key = digest(stamp, "depth map", k, list(cameras), correlation, used)
+        key = digest(stamp, "depth map", k, correlation, used)
         maps.append(Task(key, f"depth of camera {camera.id}", depth_task, (reference, k), folder, cost=_CHART_COST))
     needs = tuple(task.key for task in maps)
     plans = _planned_charts(views, pairs, settings)
@@ -207,13 +208,13 @@ def depth_task(files: _ReferenceFiles, k: int, *, inputs: tuple[Path, ...]) -> A
     images, depth_map = depths_at_fitting_size(
         files.views.cameras, files.image, files.correlation, k, partners[:_MOST], space, mask
     )
-    evidence = match_evidence(images, depth_map, k, partners[0], space, mask) if partners else None
+    why = why_unmatched(images, depth_map, k, partners[0] if partners else None, space, mask)
     patches = depth_map.patches
     return {
         "px": patches.px, "inverse_depth": patches.inverse_depth, "gradient": patches.gradient,
         "sigma": depth_map.sigma, "textured": depth_map.textured, "patterned": depth_map.patterned,
         "spacing": np.array(depth_map.spacing), "grey_noise": np.array(depth_map.grey_noise),
-        "points": np.array(len(patches.px)), "evidence": np.zeros(0) if evidence is None else evidence.array(),
+        "points": np.array(len(patches.px)), "why": np.array(why),
     }  # fmt: skip
 
 
@@ -225,25 +226,27 @@ def _depth_map(arrays: Mapping[str, np.ndarray]) -> DepthMap:
     return DepthMap(int(arrays["spacing"]), patches, sigma, textured, patterned, float(arrays["grey_noise"]))
 
 
-def _stored_depth_map(path: Path) -> DepthMap:
-    """The depth map of a task's output file, cached in memory for all charts that need it."""
+def _mapped_surface(camera: Camera, path: Path) -> MappedSurface:
+    """The surface of the depth map in a task's output file, cached in memory for all charts that need it."""
 
-    def size(value: DepthMap) -> int:
-        return 12 * value.patches.px.nbytes + value.textured.nbytes
+    def size(value: MappedSurface) -> int:
+        return 16 * value.map.patches.px.nbytes + value.map.textured.nbytes
 
-    return process_memory.get(("depth map", str(path)), lambda: _depth_map(read_output(path)), size)
+    return process_memory.get(
+        ("depth map", str(path)), lambda: MappedSurface(camera, _depth_map(read_output(path))), size
+    )
 
 
 def chart_task(files: _ReferenceFiles, planned: _PlannedChart, *, inputs: tuple[Path, ...]) -> Arrays:
     """Match a chart in all cameras that see it. inputs : outputs of the depth maps of all cameras."""
     cameras, k, incidence = files.views.cameras, planned.camera, planned.incidence
-    maps = {c: _stored_depth_map(inputs[c]) for c in (k, *planned.partners)}
-    plan = plan_chart(k, cameras, maps, incidence, planned.partners, whole=not planned.curved)
+    surfaces = {c: _mapped_surface(cameras[c], inputs[c]) for c in (k, *planned.partners)}
+    plan = plan_chart(k, surfaces, incidence, planned.partners, whole=not planned.curved)
     settings = replace(files.correlation, tolerance=_LOOSER * files.correlation.tolerance)
     images = ChartImages(cameras, files.image, settings)
-    matches = match_chart(images, k, maps[k], plan, files.mask(k), incidence, curved=planned.curved)
+    matches = match_chart(images, k, surfaces[k].map, plan, files.mask(k), incidence, curved=planned.curved)
     drop_masked(matches, files.mask)
-    noise = np.array([maps[c].grey_noise for c in matches.cameras])
+    noise = np.array([surfaces[c].map.grey_noise for c in matches.cameras])
     chart = chart_with_uncertainty(images, matches, noise)
     return {**chart.arrays(), "points": np.array(int(np.isfinite(chart.px[..., 0]).sum()))}
 
@@ -259,7 +262,7 @@ def surface_task(views: RigViews, step: int, settings: SurfaceGroup, *, inputs: 
         depths = list(pool.map(read_output, inputs[: len(cameras)]))
         charts = [pool.submit(read_output, path) for path in inputs[len(cameras) :]]
     maps = [_depth_map(one) for one in depths]
-    why = why_unmatched(cameras, maps, [one["evidence"] for one in depths])
+    why = [str(one["why"]) for one in depths]
     try:
         measured = [Chart.from_arrays(chart.result()) for chart in charts]
         surface = reference_surface(cameras, measured, step, settings.sigma_max_px, settings.merge)
@@ -278,7 +281,8 @@ def tracking_task(
     inputs : output of the surface.
     """
     prepared, points = _reference_and_points(cameras, k, settings, reference, inputs[0])
-    matches = match_in_two_passes(prepared, step_image(image, cameras[k]), points, settings, curved=curved)
+    current = step_image(image, cameras[k], again=False)
+    matches = match_in_two_passes(prepared, current, points, settings, curved=curved)
     arrays = {name: getattr(matches, name) for name in _MATCHES}
     return {**arrays, "step": np.array(matches.step), "points": np.array(len(points.positions))}
 

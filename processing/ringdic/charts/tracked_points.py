@@ -12,6 +12,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels
@@ -22,7 +23,8 @@ from ringdic.correlation.quadratic import Neighbourhoods, QuadraticFit
 #: Side of the squares with one knot each, in subset radii.
 APART = 1.5
 _REACH = 3.0  # subset radii about a knot, of the neighbours that its curvature is computed from
-_FINE = (0.4, 2.5)  # subset radii, side of the squares and reach of the fine knots
+_FINE = (1.0, 2.5)  # subset radii, side of the squares and reach of the fine knots
+_LEAST_SHARE = 0.1  # of known knots about a point, from which a value is interpolated
 _ONE_SIDED = 0.12  # windows between a knot and the mean of its neighbours; 0.42 where these are a half disc
 _LATTICE = 0.2  # subset radii between the pixels by which the extent of subsets that are cut off is judged
 _SCATTERS = 8.0  # standard deviations from the neighbours' quadratic beyond which a point contradicts it
@@ -35,27 +37,26 @@ _UNLIKE = 3.0  # times the usual mean square difference that noise alone, which 
 class Knots:
     """Some of n points, about which local quadratics of a field are fitted: m knots.
 
-    index : (m,) int, among the points. of_points : (n,) int, the knot next to each point. neighbourhoods : of the
+    index : (m,) int, among the points. of_points : (n,) int, the knot next to each point. shares : (n, m), of the
+    knots about each point in what is interpolated there, bilinear where they lie on a lattice. neighbourhoods : of the
     knots, at whole pixels.
     """
 
     index: Indices
     of_points: Indices
+    shares: csr_array
     neighbourhoods: Neighbourhoods
 
     @classmethod
-    def of(cls, pixels: Pixels, side: float, window: float) -> Knots:
+    def of(cls, pixels: Pixels, side: float, window: float, *, alone: bool = False) -> Knots:
         """Choose the knots of points.
 
-        pixels : (n, 2) px. side : px, of squares with one knot each. window : px, radius of the neighbourhoods.
+        pixels : (n, 2) px. side : px, of squares with one knot each. window : px, radius of the neighbourhoods. alone :
+        whether only knots are neighbours of a knot, else all points are.
         """
         index = thin_to_grid(pixels, side)
-        return cls(index, _nearest(pixels, index, side), Neighbourhoods(pixels[index], window))
-
-    @property
-    def one_sided(self) -> Mask:
-        """Knots (m,) bool whose neighbours lie to one side, as at the rim of the surface."""
-        return np.asarray(self.neighbourhoods.eccentricity > _ONE_SIDED)
+        about = Neighbourhoods(pixels[index], window) if alone else Neighbourhoods(pixels, window, index)
+        return cls(index, *_about(pixels, index, side), about)
 
     def nearest(self, known: Mask, pixels: Pixels, reach: float = np.inf) -> Indices:
         """Nearest known knot of every point.
@@ -69,9 +70,24 @@ class Knots:
         lost = np.flatnonzero(~known[out])
         if len(lost):
             which = np.flatnonzero(known)
-            distance, index = cKDTree(self.neighbourhoods.xy[which]).query(pixels[lost], distance_upper_bound=reach)
+            distance, index = cKDTree(self.neighbourhoods.centres[which]).query(
+                pixels[lost], distance_upper_bound=reach
+            )
             out[lost] = np.where(np.isfinite(distance), which[np.minimum(index, len(which) - 1)], -1)
         return out
+
+    def interpolate(self, values: Floats, known: Mask, pixels: Pixels) -> Floats:
+        """Values (n, k) at every point from those of the knots about it, else of the nearest knot where they are known.
+
+        values : (m, k), of the knots. known : (m,) bool, some of them at least. pixels : (n, 2) px, the points.
+        """
+        share = self.shares @ np.column_stack([np.where(known[:, None], values, 0.0), known])
+        alone = np.flatnonzero(share[:, -1] < _LEAST_SHARE)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            out = share[:, :-1] / share[:, -1:]
+        if len(alone):
+            out[alone] = values[self.nearest(known, pixels)[alone]]
+        return np.asarray(out)
 
 
 @dataclass(frozen=True)
@@ -99,6 +115,13 @@ class TrackedPoints:
     def shift(self) -> Pixels:
         """Offsets from the points to their whole pixels, (n, 2) px."""
         return self.pixels - self.positions
+
+    @cached_property
+    def one_sided(self) -> Mask:
+        """Points (n,) bool whose neighbours lie to one side, as at the rim of the surface."""
+        knots = self.fine_knots
+        eccentricity = knots.neighbourhoods.eccentricity[:, None]
+        return knots.interpolate(eccentricity, np.ones(len(eccentricity), bool), self.pixels)[:, 0] > _ONE_SIDED
 
     @cached_property
     def next_to_knots(self) -> Indices:
@@ -155,7 +178,7 @@ def tracked_points(
     positions : (n, 2) float64, px. body : what the camera sees of the surface.
     """
     pixels, radius = np.rint(positions), settings.radius
-    knots = Knots.of(pixels, APART * radius, _REACH * radius)
+    knots = Knots.of(pixels, APART * radius, _REACH * radius, alone=True)
     fine_knots = Knots.of(pixels, _FINE[0] * radius, _FINE[1] * radius)
     least = (reference.grey_range / 255.0) ** 2
     variance = _variance(reference, pixels, radius)
@@ -174,21 +197,26 @@ def thin_to_grid(xy: Pixels, side: float) -> Indices:
     return np.sort(order[np.flatnonzero(np.diff(label[order], prepend=-1))])
 
 
-def _nearest(xy: Pixels, index: Indices, side: float) -> Indices:
-    """The knot nearest to each point, of those in its square of a grid and in the eight about it.
+def _about(xy: Pixels, index: Indices, side: float) -> tuple[Indices, csr_array]:
+    """Find the knot next to each point, and the weights by which values are interpolated from the knots about it.
 
     xy : (n, 2) px. index : (m,), the knots among the points, one in every square that is not empty. side : px, of the
-    squares. Returns (n,) numbers of knots.
+    squares. Returns (n,) numbers of knots and shares (n, m).
     """
-    cell = np.floor((xy - xy.min(axis=0)) / side).astype(np.int64) + 1
-    table = np.full(cell.max(axis=0) + 2, -1)
-    table[tuple(cell[index].T)] = np.arange(len(index))
-    out, least = np.zeros(len(xy), np.int64), np.full(len(xy), np.inf)
-    for shift in np.ndindex(3, 3):
-        knot = table[tuple((cell + shift - 1).T)]
-        distance = np.where(knot >= 0, np.hypot(*(xy - xy[index[knot]]).T), np.inf)
-        out, least = np.where(distance < least, knot, out), np.minimum(distance, least)
-    return out
+    x, y = np.ascontiguousarray((xy - xy.min(axis=0)).T) / side
+    column, row = x.astype(np.int64) + 1, y.astype(np.int64) + 1
+    width = int(column.max()) + 2
+    cell = row * width + column
+    table = np.full(int(cell.max()) + width + 2, len(index))  # the last one stands for none
+    table[cell[index]] = np.arange(len(index))
+    knot_x, knot_y = np.append(x[index], np.inf), np.append(y[index], np.inf)
+    knot = np.stack([table[cell + (j - 1) * width + i - 1] for j, i in np.ndindex(3, 3)], axis=1)
+    share = np.maximum(1.0 - np.abs(x[:, None] - knot_x[knot]), 0.0)
+    share *= np.maximum(1.0 - np.abs(y[:, None] - knot_y[knot]), 0.0)
+    some = share > 0
+    begin = np.append(0, np.cumsum(some.sum(axis=1)))
+    shares = csr_array((share[some], knot[some], begin), shape=(len(xy), len(index)))
+    return knot[np.arange(len(xy)), share.argmax(axis=1)], shares
 
 
 def robust_quadratics(neighbourhoods: Neighbourhoods, values: Pixels, sigma: Floats) -> QuadraticFit:

@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Image, Mask, Pixels
-from ringdic.charts.step_matching import match_tracked_points
+from ringdic.charts.step_matching import ImageMatches, match_tracked_points
 from ringdic.charts.tracked_points import TrackedPoints
 from ringdic.correlation import CorrelationSettings, Reference, Status, prepare_current
 from ringdic.correlation.lattice_field import interpolate_lattice
+from ringdic.mesh.adjacency import shared_edges
+from ringdic.mesh.mesh import half_edges
 
 _LEAST = 0.02  # least weight of the matched corners about a point for an interpolated value
 _DIGITS = 4  # binary digits after the point of the corners of drawn triangles
@@ -44,8 +46,8 @@ class CameraMatches:
     """Matches of the n points of a camera's grid in its image of one step, NaN where lost.
 
     xy : (n, 2) int, px, the grid. step : px, of the grid. uv : (n, 2) px, displacement. gradient : (n, 2, 2),
-    du_i/dx_j. curvature : (n, 2, 3) 1/px, second derivatives by xx, xy, yy. sigma : (n, 2) px. c_ls : (n,).
-    status : (n,) int, 0 where good.
+    du_i/dx_j. curvature : (n, 2, 3) 1/px, second derivatives by xx, xy, yy. sigma : (n, 2) px of the later image.
+    c_ls : (n,). status : (n,) int, 0 where good.
     """
 
     xy: NDArray[np.int32]
@@ -83,7 +85,8 @@ def surface_grid(size: tuple[int, int], step: int, views: Sequence[ChartView]) -
         seen: Mask = np.asarray(np.isfinite(px).all(axis=1))
         first, second, third = seen[faces.T]
         corners = np.rint(np.where(seen[:, None], px, 0.0) * 2**_DIGITS).astype(np.int32)
-        cv2.fillPoly(region, list(corners[faces[first & second & third]]), 1, shift=_DIGITS)
+        outlines = [corners[loop] for loop in _outlines(faces[first & second & third])]
+        cv2.fillPoly(region, outlines, 1, shift=_DIGITS)
         at = px[seen]
         at = at[(at >= 0).all(axis=1) & (at <= (width - 1, height - 1)).all(axis=1)]
         column, row = np.floor(at / step).astype(np.int64).T
@@ -93,6 +96,26 @@ def surface_grid(size: tuple[int, int], step: int, views: Sequence[ChartView]) -
     inside = grown[::step, ::step].T
     column, row = np.nonzero(inside & wanted[: inside.shape[0], : inside.shape[1]])
     return CameraGrid(grown, step * np.stack([column, row], axis=1).astype(np.float64), step)
+
+
+def _outlines(faces: NDArray[np.int32]) -> list[list[int]]:
+    """Closed loops of vertices about triangles (m, 3), of edges that belong to one triangle alone."""
+    half = half_edges(faces.astype(np.int64))
+    _, alone = shared_edges(half)
+    onward: dict[int, list[int]] = {}
+    for start, end in half[alone].tolist():
+        onward.setdefault(start, []).append(end)
+    loops = []
+    while onward:
+        loop, (at, _) = [], next(iter(onward.items()))
+        while at in onward:
+            loop.append(at)
+            ends = onward[at]
+            at = ends.pop()
+            if not ends:
+                del onward[loop[-1]]
+        loops.append(loop)
+    return loops
 
 
 def match_in_two_passes(
@@ -112,10 +135,16 @@ def match_in_two_passes(
         matches.warp[:, :2],
         matches.warp[:, 2:6].reshape(-1, 2, 2).astype(np.float32),
         matches.warp[:, 6:].reshape(-1, 2, 3).astype(np.float32),
-        matches.sigma.astype(np.float32),
+        _sigma_in_current(matches).astype(np.float32),
         matches.c_ls.astype(np.float32),
         matches.status.astype(np.int8),
     )
+
+
+def _sigma_in_current(matches: ImageMatches) -> Pixels:
+    """Standard deviations (n, 2) of matches in pixels of the later image; the correlation states the reference's."""
+    G = np.eye(2) + matches.warp[:, 2:6].reshape(-1, 2, 2)
+    return np.sqrt(np.einsum("nij,nj->ni", G**2, matches.sigma**2))
 
 
 def interpolate_matches(matches: CameraMatches, xy: Pixels) -> CameraPixels:

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels, Points
 from ringdic.charts.depth_map import DepthMap
-from ringdic.charts.patches import STENCIL, Patches, depths
+from ringdic.charts.patches import STENCIL, Patches, depths, focal_length
 from ringdic.charts.surface import ReferenceSurface
 from ringdic.correlation import Status
 from ringdic.geometry.camera import Camera
@@ -189,7 +189,7 @@ def _coverage(
     column, row = _cells(middle[at], origin, spacing)
     cell, depth = column * shape[1] + row, depth[at]
     np.minimum.at(nearest, cell, depth)
-    at = at[depth < nearest[cell] + _BEHIND / _STEEPEST * spacing * depth / _focal_length(camera)]
+    at = at[depth < nearest[cell] + _BEHIND / _STEEPEST * spacing * depth / focal_length(camera)]
     first, second = b[at] - a[at], c[at] - a[at]
     area = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
     share = np.zeros(len(nearest))
@@ -199,13 +199,6 @@ def _coverage(
         share += np.bincount(index, area, len(share))
     share, nearest = share.reshape(shape), nearest.reshape(shape)
     return share / (3.0 * spacing**2), nearest
-
-
-def _focal_length(camera: Camera) -> float:
-    """Focal length, px: pixels across for each unit of the tangent of the angle to the axis."""
-    middle = (np.array(camera.size) - 1.0) / 2.0
-    ends = camera.ray(np.stack([middle, middle + np.array([1.0, 0.0])]))
-    return 1.0 / float(np.linalg.norm(ends[1] - ends[0]))
 
 
 def _of_camera(k: int, lattices: Sequence[_Lattice], lost: Sequence[Indices], limit: float) -> UnmeasuredPlaces:
@@ -218,7 +211,7 @@ def _of_camera(k: int, lattices: Sequence[_Lattice], lost: Sequence[Indices], li
     points = patches.points(own.camera, STENCIL[:5])
     xyz = points[:, 0]
     one_px = np.linalg.norm(np.cross(points[:, 1] - points[:, 2], points[:, 3] - points[:, 4]), axis=1) / 4.0
-    across = spacing * depths(own.camera, xyz) / _focal_length(own.camera)
+    across = spacing * depths(own.camera, xyz) / focal_length(own.camera)
     area = np.minimum(one_px * spacing**2, across**2 / _STEEPEST)
     views, shares, square, best = (np.zeros(len(index)) for _ in range(4))
     status = np.full(len(index), Status.NOT_REACHED, np.int8)

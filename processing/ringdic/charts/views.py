@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from ringdic.arrays import Floats, Image, Indices, Mask, Pixels, Points, Vectors
 from ringdic.charts.contrast import contrast
 from ringdic.charts.depth_map import DepthMap
-from ringdic.charts.patches import depths
+from ringdic.charts.patches import depths, focal_length
 from ringdic.correlation import grid
 from ringdic.geometry.camera import Camera
 
@@ -31,6 +31,8 @@ _HOLE = 0.7  # subset radii, of a circle as large as the largest gap between spe
 _LEAST_CONTRAST = 0.3  # close to a point, of the usual one: a subset beyond the last speckles is ill determined
 _BRIGHTER = 0.15  # of the range of its grey levels, by which a surface's pixels exceed the brightest of its places
 _LAMP = 0.4  # subset radii, least width of a spot that is brighter than that and no part of the surface
+_HOLE_STEPS = 2  # places across, even, of the widest hole of a map with depths on both sides
+_FINE = 10  # px, radius of subsets from twice of which on every second pixel tells where the pattern is
 _OVERLAP = 1  # steps of the lattice by which a chart exceeds the part that its camera faces most squarely
 _RIM = 3.0  # steps of the lattice by which matches may reach beyond the last place with a depth
 
@@ -39,43 +41,43 @@ _RIM = 3.0  # steps of the lattice by which matches may reach beyond the last pl
 class ChartPlan:
     """What one camera measures: n places of its depth map, and the cameras in which the surface about each is matched.
 
-    inside : (n,) bool, places of the chart. sees : (n, C) bool, cameras that see the place, without the camera itself.
+    inside : (n,) bool, places of the chart. sees : by index of the camera, for each of the others, (n,) bool, whether
+    it sees the place.
     """
 
     inside: Mask
-    sees: Mask
+    sees: dict[int, Mask]
 
 
 def plan_chart(
-    k: int, cameras: Sequence[Camera], maps: Sequence[DepthMap] | Mapping[int, DepthMap], incidence_deg: float,
-    partners: Sequence[int],
-    *, whole: bool = False,
-) -> ChartPlan:  # fmt: skip
+    k: int, surfaces: Mapping[int, MappedSurface], incidence_deg: float, partners: Sequence[int], *, whole: bool = False
+) -> ChartPlan:
     """Determine the part of the surface that a camera faces most squarely, with a margin round it.
 
     Parameters
     ----------
     k : index of the camera.
-    cameras : the C cameras.
-    maps : their depth maps, or at least those of the camera and of these others, by index.
+    surfaces : as the depth maps of the camera and of these others show it, by index.
     incidence_deg : degrees, largest angle of incidence of a view that is used.
     partners : indices of the cameras that it may be matched with.
     whole : whether the chart is all that the camera shares with a partner, instead of what it faces most squarely.
     """
-    view = _MapViews(cameras[k], maps[k])
+    own = surfaces[k]
     limit = math.cos(math.radians(incidence_deg))
-    own = cameras[k].incidence_cosine(view.xyz, view.normals)
-    squarest = np.full(len(view.xyz), -1.0)
-    sees = np.zeros((len(view.xyz), len(cameras)), bool)
+    squarest, seen = np.full(len(own.xyz), -1.0), np.zeros(len(own.xyz), bool)
+    sees = {}
     for c in partners:
-        cosine = cameras[c].incidence_cosine(view.xyz, view.normals)
-        same, hidden = _MapViews(cameras[c], maps[c]).compare(view.xyz, view.step_mm)
+        camera = surfaces[c].camera
+        cosine = camera.incidence_cosine(own.xyz, own.normals)
+        same, hidden = surfaces[c].compare(own.xyz, own.step_mm)
+        same &= ~(own.inner & surfaces[c].in_hole(own.xyz))
         squarest = np.maximum(squarest, np.where(same, cosine, -1.0))
-        sees[:, c] = (cosine > limit) & ~hidden & _inside(cameras[c], view.xyz)
-    usable = (own > limit) & sees.any(axis=1)
+        sees[c] = np.asarray((cosine > limit) & ~hidden & _inside(camera, own.xyz))
+        seen |= sees[c]
+    usable = (own.squareness > limit) & seen
     if whole:
         return ChartPlan(usable, sees)
-    return ChartPlan(_dilated(maps[k], usable & (own >= squarest)) & usable, sees)
+    return ChartPlan(_dilated(own.map, usable & (own.squareness >= squarest)) & usable, sees)
 
 
 def facing_pairs(
@@ -88,40 +90,66 @@ def facing_pairs(
     Returns the pairs of camera ids, with pairs that are not among those given appended, and the index (n,) of each
     point's pair among them.
     """
-    best = np.sort(np.argsort(-squarely, axis=0)[:2], axis=0)
-    listed = [(first, second) for first, second in pairs]
+    n = squarely.shape[1]
+    others, best = squarely.copy(), squarely.argmax(axis=0)
+    others[best, np.arange(n)] = -np.inf
+    second = others.argmax(axis=0)
+    number = np.minimum(best, second) * len(cameras) + np.maximum(best, second)
+    listed = [(one, other) for one, other in pairs]
     index = {frozenset(pair): k for k, pair in enumerate(listed)}
-    pair_of_point = np.empty(squarely.shape[1], np.int64)
-    for a, b in np.unique(best, axis=1).T:
+    of_number = np.full(len(cameras) ** 2, -1)
+    for each in np.flatnonzero(np.bincount(number)).tolist():
+        a, b = divmod(each, len(cameras))
         pair = (cameras[a].id, cameras[b].id)
         if frozenset(pair) not in index:
             index[frozenset(pair)] = len(listed)
             listed.append(pair)
-        pair_of_point[(best[0] == a) & (best[1] == b)] = index[frozenset(pair)]
-    return tuple(listed), pair_of_point
+        of_number[each] = index[frozenset(pair)]
+    return tuple(listed), of_number[number]
 
 
-class _MapViews:
-    """Points and normals of a depth map, and a comparison of other points with it."""
+class MappedSurface:
+    """The surface as a camera's depth map shows it, and a comparison of other points with it.
+
+    Attributes
+    ----------
+    camera, map : the camera and its depth map.
+    xyz, normals : (n, 3) mm and (n, 3), of the places of the map.
+    squareness : (n,), cosine of the angle of incidence at which the camera sees them.
+    inner : (n,) bool, places of the map whose four neighbours on the lattice are places too.
+    """
 
     def __init__(self, camera: Camera, depth_map: DepthMap) -> None:
         self.camera, self.map = camera, depth_map
         patches = depth_map.patches
         self.xyz: Points = patches.points(camera, np.zeros((1, 2)))[:, 0]
         self.normals: Vectors = patches.normals(camera)
+        self.squareness: Floats = camera.incidence_cosine(self.xyz, self.normals)
         self._tree = cKDTree(patches.px) if len(patches.px) else None
+        cells = self._cells(patches.px)
+        known = np.zeros(cells.max(axis=0, initial=0) + 2, np.uint8)
+        known[tuple(cells.T)] = 1
+        cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+        self.inner: Mask = np.asarray(cv2.erode(known, cross)[tuple(cells.T)] > 0)
+        lines = (np.ones(shape, np.uint8) for shape in ((_HOLE_STEPS + 1, 1), (1, _HOLE_STEPS + 1)))
+        closed = np.maximum(*(cv2.morphologyEx(known, cv2.MORPH_CLOSE, line) for line in lines))
+        self._holes: Mask = np.asarray(closed > known)
+
+    def _cells(self, px: Pixels) -> Indices:
+        """Cells (n, 2) of the lattice, with a margin before its first, in which pixels (n, 2) lie."""
+        return np.rint(px / self.map.spacing).astype(np.int64) + 1
 
     @property
     def step_mm(self) -> float:
         """Spacing of the lattice on a surface that faces the camera, mm."""
-        if not len(self.xyz):
-            return 0.0
-        px = self.map.patches.px[:1]
-        angle = np.linalg.norm(self.camera.ray(px + np.array([self.map.spacing, 0.0])) - self.camera.ray(px))
-        return float(np.median(np.linalg.norm(self.xyz - self.camera.centre, axis=1)) * angle)
+        away = depths(self.camera, self.xyz)
+        return self.map.spacing * float(np.median(away)) / focal_length(self.camera) if len(away) else 0.0
 
     def compare(self, xyz: Points, step_mm: float) -> tuple[Mask, Mask]:
-        """Which points (n, 3) mm the map shows at the same depth, and before which it shows something nearer."""
+        """Which points the map shows at the same depth, and before which it shows something nearer, (n,) each.
+
+        xyz : (n, 3) mm. step_mm : mm, of the lattice on the surface.
+        """
         same, hidden = np.zeros(len(xyz), bool), np.zeros(len(xyz), bool)
         if self._tree is None or not len(xyz):
             return same, hidden
@@ -135,11 +163,20 @@ class _MapViews:
         depth = depths(self.camera, xyz[near])
         with np.errstate(divide="ignore"):
             nearer = depth - 1.0 / inverse
-        slant = np.maximum(self.camera.incidence_cosine(self.xyz[index], self.normals[index]), 0.2)
+        slant = np.maximum(self.squareness[index], 0.2)
         tolerance = _SAME * step_mm / slant
         same[near] = np.abs(nearer) < tolerance
         hidden[near] = nearer > 3.0 * tolerance
         return same, hidden
+
+    def in_hole(self, xyz: Points) -> Mask:
+        """Which points lie in a narrow hole of the map, (n,) bool: there is no depth, but there is on both sides.
+
+        xyz : (n, 3) mm.
+        """
+        cells = self._cells(self.camera.project(xyz))
+        inside = np.all((cells >= 0) & (cells < self._holes.shape), axis=1)
+        return inside & self._holes[tuple(np.where(inside[:, None], cells, 0).T)]
 
 
 def _inside(camera: Camera, xyz: Points) -> Mask:
@@ -171,29 +208,57 @@ def chart_region(grey: Image, depth_map: DepthMap, inside: Mask, radius: int) ->
     there is texture close by. A point beyond the pixels of its subset would be an extrapolation, which knows nothing of
     an edge of the surface between.
     """
-    spacing, px = depth_map.spacing, depth_map.patches.px
     region, of_points = np.zeros(grey.shape, bool), np.zeros(grey.shape, bool)
     if not inside.any():
         return region, of_points
-    cells = _cells(depth_map, inside)
-    half, reach = spacing // 2 + 1, spacing
-    left, top = np.maximum(np.floor(cells.min(axis=0)).astype(int) - half - reach, 0)
-    right, bottom = np.ceil(cells.max(axis=0)).astype(int) + half + reach
-    part = grey[top:bottom, left:right]
-    mask = np.zeros(part.shape, np.uint8)
-    column, row = (np.rint(cells).astype(int) - (left, top)).T
-    mask[row, column] = 1
-    side = 2 * reach + 1
-    grown = cv2.dilate(mask, np.ones((side + 2 * half,) * 2, np.uint8))  # of squares about the cells
-    closed = np.asarray(cv2.erode(grown, np.ones((side, side), np.uint8))) > 0
-    textured, close = _textured_pixels(part, float(np.median(contrast(grey, px[inside], radius))), radius)
-    column, row = np.rint(px[inside]).astype(np.int64).T
-    lamps = _lamps(part, grey[row, column], radius)
-    pattern = (_without_gaps(closed & textured, radius) & ~lamps).astype(np.uint8)
-    inner = cv2.erode(pattern, np.ones((2 * round(_EDGE * radius) + 1,) * 2, np.uint8)) > 0
-    region[top:bottom, left:right] = inner
-    of_points[top:bottom, left:right] = inner & _without_gaps(close, radius)
+    thin = max(1, radius // _FINE)
+    cells, reach = _cells(depth_map, inside), depth_map.spacing
+    beyond = reach + reach // 2 + 1
+    left, top = np.maximum(np.floor(cells.min(axis=0)).astype(int) - beyond, 0) // thin * thin
+    right, bottom = np.ceil(cells.max(axis=0)).astype(int) + beyond
+    part = _thinned(grey[top:bottom, left:right], thin)
+
+    def place(px: Pixels) -> tuple[Indices, Indices]:
+        """Row and column of pixels of the image in its part."""
+        column, row = np.floor((np.rint(px) - (left, top)) / thin).astype(np.int64).T
+        return np.minimum(row, part.shape[0] - 1), np.minimum(column, part.shape[1] - 1)
+
+    known = np.stack(place(depth_map.patches.px[inside])[::-1], axis=1)
+    pattern, close = _pattern_and_texture(part, place(cells), known, reach // thin, round(radius / thin))
+    whole = [np.repeat(np.repeat(each, thin, axis=0), thin, axis=1) for each in (pattern, close)]
+    margin = round(_EDGE * radius)
+    inner = cv2.erode(whole[0].view(np.uint8), np.ones((2 * margin + 1,) * 2, np.uint8)) > 0
+    there = np.s_[top : top + inner.shape[0], left : left + inner.shape[1]]
+    region[there], of_points[there] = inner, inner & whole[1]
     return region, of_points
+
+
+def _thinned(grey: Image, thin: int) -> Image:
+    """Reduce an image by averaging squares of ``thin`` pixels a side; what lies beyond whole squares is cut."""
+    if thin == 1:
+        return grey
+    height, width = (side // thin for side in grey.shape)
+    means = np.empty_like(grey, shape=(height, width))
+    cv2.resize(grey[: height * thin, : width * thin], (width, height), dst=means, interpolation=cv2.INTER_AREA)
+    return means
+
+
+def _pattern_and_texture(
+    grey: Image, cells: tuple[Indices, Indices], known: Indices, spacing: int, radius: int
+) -> tuple[Mask, Mask]:
+    """Pixels of the pattern about cells of a chart, and those with texture close by, two masks of an image's shape.
+
+    grey : (height, width) grey levels. cells : rows and columns of the cells. known : (n, 2) px, whole, places with a
+    depth. spacing : px, of the cells. radius : px, of the subsets.
+    """
+    mask = np.zeros(grey.shape, np.uint8)
+    mask[cells] = 1
+    side = 2 * spacing + 1
+    grown = cv2.dilate(mask, np.ones((side + 2 * (spacing // 2 + 1),) * 2, np.uint8))  # of squares about the cells
+    closed = np.asarray(cv2.erode(grown, np.ones((side, side), np.uint8))) > 0
+    textured, close = _textured_pixels(grey, float(np.median(contrast(grey, known.astype(float), radius))), radius)
+    lamps = _lamps(grey, grey[known[:, 1], known[:, 0]], radius)
+    return _without_gaps(closed & textured, radius) & ~lamps, _without_gaps(close, radius)
 
 
 def _lamps(grey: Image, levels: NDArray, radius: int) -> Mask:
@@ -214,7 +279,7 @@ def _without_gaps(mask: Mask, radius: int) -> Mask:
     inside = (left > 0) & (top > 0) & (left + wide < mask.shape[1]) & (top + high < mask.shape[0])
     gap = inside & (area < np.pi * (_HOLE * radius) ** 2)
     gap[0] = False  # number 0 is the mask
-    return np.asarray(mask | gap[label])
+    return np.asarray(mask | gap.take(label, mode="clip"))
 
 
 def grid_to_the_border(mask: Mask, step: int) -> tuple[Pixels, NDArray[np.int32]]:

@@ -17,7 +17,7 @@ import typer
 import ringdic
 from ringdic.cli.console import print_json, say, show_table
 from ringdic.cli.measuring import measure_app, strain_command
-from ringdic.cli.options import AsJson, Reference, Run, Session, SethHill, Window, WithoutRigidMotion
+from ringdic.cli.options import AsJson, FamilyChoice, Session, spread_options
 from ringdic.cli.reporting import animate_command, overlay_command, report_command
 
 PLUGINS = "ringdic.commands"
@@ -122,24 +122,20 @@ def correlate_command(
         say(f"{summary['good']} of {summary['points']} points matched, written to {out}")
 
 
+@spread_options
 def export_command(
     session: Session,
     format_: Annotated[str, typer.Option("--format", help="npz, vtkhdf, vtp, mat, csv, ply or glb.")] = "npz",
     out: Annotated[Path | None, typer.Option(help="File or folder to write; in the run's folder unless given.")] = None,
-    reference: Reference = "first",
-    without_rigid_motion: WithoutRigidMotion = False,
-    window: Window = None,
-    seth_hill: SethHill = None,
     colour: Annotated[str | None, typer.Option(help="Field that ply and glb are coloured by.")] = None,
-    run: Run = None,
+    *,
+    choice: FamilyChoice,
     as_json: AsJson = False,
 ) -> None:
     """Export results in a file format of other programs, with fields evaluated from the stored positions."""
     from ringdic.export import export as export_session
-    from ringdic.results.evaluation import Evaluation
 
-    how = Evaluation.of(reference, without_rigid_motion, window, seth_hill)
-    written = export_session(session, format_, out, how, colour, run)
+    written = export_session(session, format_, out, choice.evaluation(), colour, choice.run)
     if as_json:
         print_json({"written": str(written)})
     else:

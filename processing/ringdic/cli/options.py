@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from ringdic.results.evaluation import EvaluatedResults
+    from ringdic.results.evaluation import EvaluatedResults, Evaluation
 
 Session = Annotated[Path, typer.Argument(help="The session folder.")]
 Run = Annotated[int | None, typer.Option(help="Number of the processing run; the newest unless given.")]
@@ -30,9 +30,18 @@ class RunChoice:
     run: Run = None
     reference: Reference = "first"
 
+    def evaluation(self) -> Evaluation:
+        """How the fields of the run are evaluated. Raises InputError for an option that is not allowed."""
+        from ringdic.results.evaluation import Evaluation
+
+        return Evaluation.of(**{name: value for name, value in vars(self).items() if name != "run"})
+
     def results(self, session: Path) -> EvaluatedResults:
         """Read the results of the run for evaluation with these options. Raises InputError where there is none."""
-        return _results(session, **vars(self))
+        from ringdic.results.evaluation import evaluate_results
+        from ringdic.session.folder import newest_results
+
+        return evaluate_results(newest_results(session, self.run), self.evaluation())
 
 
 @dataclass(frozen=True)
@@ -72,18 +81,3 @@ def spread_options(command: Callable[..., None]) -> Callable[..., None]:
         parameters += [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
     spread.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     return spread
-
-
-def _results(
-    session: Path,
-    run: int | None,
-    reference: str,
-    without_rigid_motion: bool = False,
-    window: float | None = None,
-    seth_hill: float | None = None,
-) -> EvaluatedResults:
-    from ringdic.results.evaluation import Evaluation, evaluate_results
-    from ringdic.session.folder import newest_results
-
-    how = Evaluation.of(reference, without_rigid_motion, window, seth_hill)
-    return evaluate_results(newest_results(session, run), how)

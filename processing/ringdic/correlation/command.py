@@ -28,7 +28,6 @@ def correlate_files(
     *,
     mask: Path | None = None,
     threads: int | None = None,
-    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Match one image file in another and write ``points.npz``; returns the summary of ``ringdic correlate --json``.
 
@@ -39,7 +38,6 @@ def correlate_files(
     settings : subset, grid and tolerances; the defaults unless given.
     mask : an image file of the reference's size; its pixels above 0 are the region of interest.
     threads : cores to use; all unless given.
-    progress : is called with the points matched so far and their whole number.
 
     Returns
     -------
@@ -63,7 +61,7 @@ def correlate_files(
     region = None if mask is None else read_mask(mask, (images[0].shape[0], images[0].shape[1]))
     reading = time.perf_counter() - began
     names = str(reference), str(current), str(mask)
-    matches, faces = correlate_images(*images, region, settings, threads=threads, progress=progress, names=names)
+    matches, faces = correlate_images(*images, region, settings, threads=threads, names=names)
     write_points(out, matches, faces)
     seconds = {**matches.seconds, "prepare": reading + matches.seconds["prepare"]}
     return {
@@ -145,17 +143,8 @@ def write_points(path: Path, matches: PointMatches, faces: NDArray[np.int32]) ->
     partial = path.with_name(f".{path.name}.partial")
     try:
         with partial.open("wb") as file:
-            np.savez(
-                file,
-                xy=matches.xy,
-                uv=matches.uv,
-                gradient=matches.gradient,
-                zncc=matches.zncc,
-                iterations=matches.iterations,
-                status=matches.status,
-                sigma=matches.sigma,
-                faces=faces,
-            )
+            names = ("xy", "uv", "gradient", "zncc", "iterations", "status", "sigma")
+            np.savez(file, faces=faces, **{name: getattr(matches, name) for name in names})
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)

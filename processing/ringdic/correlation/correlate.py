@@ -112,7 +112,8 @@ def correlate_points(
         values that are less certain than a neighbour's match.
     threads : number of threads; all cores by default. The results do not depend on it.
     progress : called with the numbers of matched and of all points after every wave.
-    kept : cache of the reference's subsets for more points than these, and the row (n,) of each of these in it.
+    kept : cache of the reference's subsets for more points than these, and the row (n,) of each of these in it. The
+        current image is then used in its box as it is, since more points will be matched there.
 
     Returns
     -------
@@ -128,7 +129,8 @@ def correlate_points(
         seconds = {"prepare": time.perf_counter() - began, "start": 0.0, "refine": 0.0}
         # Where start values are given, the kernel's own test of each subset is enough.
         textureless = None if start is None else np.zeros(len(xy), bool)
-        points = Propagation(reference, current, xy, settings, progress, textureless=textureless, kept=kept)
+        region = None if kept is None else current
+        points = Propagation(reference, current, xy, settings, progress, region, textureless=textureless, kept=kept)
         if start is None:
             _match_automatically(points, seconds)
         else:

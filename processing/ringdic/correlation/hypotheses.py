@@ -22,6 +22,7 @@ _MANY = 16  # warps per point from which on a first trial on fewer pixels pays
 _THINNED = 2  # stride of the first trial, in strides of the final one
 _DOUBT = 0.3  # error of the first trial's ZNCC: three standard deviations for 80 pixels of unrelated texture
 _LEAST = 16  # points that are worth a thread
+_SEPARATION = 4.0  # px, by which another warp's displacement must differ to count for the second peak
 _ANY_PIXEL = np.zeros((0, 0), bool)  # in place of a mask: all pixels count
 
 
@@ -57,7 +58,7 @@ class BestWarps:
 
     warps : (n, 6) float64, u v ux uy vx vy (u, v in px); NaN where no warp keeps the subset inside the current image.
     zncc : (n,) float64, its ZNCC; -1 where there is none.
-    second_peak : (n,) float64, highest ZNCC of a warp whose displacement clearly differs; -1 where there is none.
+    second_peak : (n,) float64, highest ZNCC of a warp whose displacement differs by more than 4 px; -1 for none.
     index : (n,) int64, which of the K warps it is.
     """
 
@@ -68,16 +69,9 @@ class BestWarps:
 
 
 def search_warps(
-    reference: Reference,
-    current: Current,
-    xy: Pixels,
-    warps: Floats,
-    radius: int,
-    *,
-    stride: int = 2,
-    separation: float = 4.0,
+    reference: Reference, current: Current, xy: Pixels, warps: Floats, radius: int, *, stride: int = 2
 ) -> tuple[Floats, Floats, Floats]:
-    """Best of K given affine warps at each point, by ZNCC over every second pixel of a circular subset.
+    """Best of K given affine warps at each point, by ZNCC over some of the pixels of a circular subset.
 
     Parameters
     ----------
@@ -85,21 +79,18 @@ def search_warps(
     xy : (n, 2) float64, px, points of the reference image.
     warps : (n, K, 6) float64, u v ux uy vx vy at the points (u, v in px); NaN where not to be tried.
     radius : px, of the subset. stride : px, spacing of the pixels that are compared.
-    separation : px, by which another warp's displacement must differ to count for the second peak.
 
     Returns
     -------
-    warps : (n, 6), the best; NaN where no warp keeps the subset inside the current image.
-    zncc : (n,), its ZNCC; -1 where there is none.
-    second_peak : (n,), highest ZNCC among the warps that differ by more than ``separation``.
+    warps (n, 6), zncc (n,) and second_peak (n,) of `BestWarps`.
 
     Raises ValueError if the shapes do not agree.
     """
     if warps.ndim != 3 or warps.shape[::2] != (len(xy), 6) or xy.shape != (len(xy), 2):
         raise ValueError(f"warps must be (n, K, 6) for xy (n, 2), not {warps.shape} for {xy.shape}")
     hypotheses = WarpHypotheses(warps, np.arange(warps.shape[1], dtype=np.float64))
-    best = _search(
-        reference.image, reference.mask, reference.box, current, xy, hypotheses, radius, stride, separation, -1.0
+    best = search_hypotheses(
+        reference.image, current, xy, hypotheses, radius, stride=stride, mask=reference.mask, corner=reference.box[:2]
     )
     return best.warps, best.zncc, best.second_peak
 
@@ -113,60 +104,26 @@ def search_hypotheses(
     *,
     stride: int = 2,
     zncc_min: float = -1.0,
-    separation: float = 4.0,
+    mask: Mask = _ANY_PIXEL,
+    corner: tuple[int, int] = (0, 0),
 ) -> BestWarps:
     """Best of the interpolated warp hypotheses at each point, by ZNCC over the pixels of a circular subset.
 
-    image : (h, w) grey levels of the reference; all its pixels count. xy : (n, 2) float64, px, points of it.
+    image : (height, width) grey levels of the reference. xy : (n, 2) float64, px, points of it.
     hypotheses : the warps of these points into the current image. radius : px, of the subset.
     stride : px, spacing of the pixels that are compared.
     zncc_min : points for which a first trial on fewer pixels shows that no warp reaches this ZNCC keep the ZNCC of that
-        trial, which saves time. separation : px, by which another warp's displacement must differ to count for the
-        second peak.
-    """
-    return _search(image, _ANY_PIXEL, (0, 0), current, xy, hypotheses, radius, stride, separation, zncc_min)
-
-
-def _search(
-    image: NDArray,
-    mask: Mask,
-    corner: tuple[int, ...],
-    current: Current,
-    xy: Pixels,
-    hypotheses: WarpHypotheses,
-    radius: int,
-    stride: int,
-    separation: float,
-    zncc_min: float,
-) -> BestWarps:
-    """Allocate the results, run the kernel over all points and return the best warps.
-
+        trial, which saves time.
     mask : (h, w) bool, the pixels of ``image`` that count in a box whose upper left corner is at ``corner`` (x, y) px;
-    an empty mask lets all count.
+        an empty mask lets all count.
     """
     n = len(xy)
     best = BestWarps(np.full((n, 6), np.nan), np.full(n, -1.0), np.full(n, -1.0), np.zeros(n, np.int64))
     in_ranges(
-        _best_warps,
-        n,
-        image,
-        mask,
-        corner[0],
-        corner[1],
-        current.image,
-        np.ascontiguousarray(xy, dtype=np.float64),
-        np.ascontiguousarray(hypotheses.knots, dtype=np.float64),
-        hypotheses.knot_coordinates,
-        radius,
-        stride,
-        separation,
-        zncc_min,
-        best.warps,
-        best.zncc,
-        best.second_peak,
-        best.index,
-        least=_LEAST,
-    )
+        _best_warps, n, image, mask, *corner, current.image, np.ascontiguousarray(xy, dtype=np.float64),
+        np.ascontiguousarray(hypotheses.knots, dtype=np.float64), hypotheses.knot_coordinates,
+        radius, stride, _SEPARATION, zncc_min, best.warps, best.zncc, best.second_peak, best.index, least=_LEAST,
+    )  # fmt: skip
     return best
 
 

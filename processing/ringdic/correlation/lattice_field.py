@@ -77,7 +77,8 @@ def _blend(values, row, low, spacing, xy, out, weight):  # type: ignore[no-untyp
                         weight[p] += near
                     elif near > 0.0:
                         row_values, near = values[row[c, r]], near / weight[p]
-                        out[p] += near * row_values
+                        for m in range(len(row_values)):
+                            out[p, m] += near * row_values[m]
                         for m in range(2):
                             by_x, by_y = row_values[2 + 2 * m], row_values[3 + 2 * m]
                             xx, xy_, yy = row_values[6 + 3 * m], row_values[7 + 3 * m], row_values[8 + 3 * m]

@@ -74,24 +74,14 @@ def _make_levels(quintic: bool) -> tuple[Any, Any]:
         c, out, qx, qy, v, n = pointer(coef), pointer(grey), bend[0], bend[1], _U(0), _U(bits.shape[0])
         while v < n:
             while v < n and cell[2, v] == 0:
-                p, tx, sx, ty, sy = (
-                    first_tap(stride, origin, cell, v),
-                    place[0, v],
-                    place[1, v],
-                    place[2, v],
-                    place[3, v],
-                )
+                p = first_tap(stride, origin, cell, v)
+                tx, sx, ty, sy = place[0, v], place[1, v], place[2, v], place[3, v]
                 g = inside(c, p, stride, tx, sx, qx, ty, sy, qy)
                 store(out, v * _L, blend(mask_from_bits(bits[v]), g - level, _F(0)))
                 v += _U(1)
             if v < n:
-                p, tx, sx, ty, sy = (
-                    first_tap(stride, origin, cell, v),
-                    place[0, v],
-                    place[1, v],
-                    place[2, v],
-                    place[3, v],
-                )
+                p = first_tap(stride, origin, cell, v)
+                tx, sx, ty, sy = place[0, v], place[1, v], place[2, v], place[3, v]
                 g = crossing(c, p, stride, cell[2, v], tx, sx, qx, ty, sy, qy, pointer(spare))
                 store(out, v * _L, blend(mask_from_bits(bits[v]), g - level, _F(0)))
                 v += _U(1)

@@ -21,6 +21,7 @@ _AROUND = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 _MOST_CELLS = 64  # per point, of a grid that neighbours are read from; those of sparser points come from a k-d tree
 _MIN_DEVIATION = 0.5  # px; smaller deviations from the neighbours are never outliers
 _MAX_SCATTER_RATIO = 8.0  # deviation of an outlier, in standard deviations of all deviations
+_FITTED = 12  # good points of an affine fit
 _MIN_ISLAND = 4  # points of the smallest group that remains
 _LEAST = 1000  # points that are worth a thread
 
@@ -210,7 +211,6 @@ def local_affine_fit(
     good: Mask,
     near: Indices,
     wanted: Indices,
-    count: int = 12,
 ) -> Floats:
     """Parameters of unmatched points from an affine least-squares fit of the good points around each.
 
@@ -218,14 +218,14 @@ def local_affine_fit(
     ----------
     xy : (n, 2) float64, px. parameters : (n, 12) float64, px and derivatives. good : (n,) bool.
     near : (n, 8) int64, indices of neighbours, -1 for none; good points are collected from neighbour to neighbour.
-    wanted : (k,) int64, indices of the points to fit for. count : of good points in a fit.
+    wanted : (k,) int64, indices of the points to fit for.
 
     Returns
     -------
     fit : (k, 12), px and derivatives; NaN where fewer than six good points can be reached.
     """
     out = np.full((len(wanted), parameters.shape[1]), np.nan)
-    _fit_affine(xy, parameters, good, near, wanted, count, out)
+    _fit_affine(xy, parameters, good, near, wanted, _FITTED, out)
     return out
 
 

@@ -23,33 +23,44 @@ _FIT_POINTS = 500  # points at most, of an affine fit to the motion of a region
 
 
 @dataclass(frozen=True)
-class Reference:
-    """A reference image in a box around the region of interest, with gradients and spline computed on first use.
+class _PreparedImage:
+    """An image in a box, with B-spline coefficients computed on first use.
 
     image : (height, width) grey levels of the whole image, in its own type.
     box : x0, y0, x1, y1 px, ends exclusive.
-    mask : (h, w) bool, the region of interest in the box.
     degree : of the B-spline, 3 or 5. precision : float32, or float64 for tolerances that need it.
-    grey_range : largest grey level, 255 or, of 16 bits, that of the image.
     """
 
     image: NDArray = field(repr=False)
     box: Box
-    mask: Mask = field(repr=False)
     degree: int
     precision: type
-    grey_range: float
-    _cache: dict[Hashable, Any] = field(default_factory=dict, repr=False, compare=False)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Height and width of the whole image, px."""
-        return self.image.shape[0], self.image.shape[1]
 
     @property
     def origin(self) -> Pixels:
         """Position (x, y) of the box's first pixel in the image. (2,) float64, px."""
         return np.array(self.box[:2], dtype=np.float64)
+
+    @cached_property
+    def coef(self) -> Levels:
+        """B-spline coefficients of the box, padded. (h + 2 PAD, w + 2 PAD).
+
+        They are those of the whole image, since the filter also takes the pixels around the box.
+        """
+        return coefficients(self.image, self.degree, self.box, self.precision)
+
+
+@dataclass(frozen=True)
+class Reference(_PreparedImage):
+    """A reference image in a box around the region of interest, with gradients computed on first use.
+
+    mask : (h, w) bool, the region of interest in the box.
+    grey_range : largest grey level, 255 or, of 16 bits, that of the image.
+    """
+
+    mask: Mask = field(repr=False)
+    grey_range: float
+    _cache: dict[Hashable, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def grey(self) -> Levels:
@@ -60,11 +71,6 @@ class Reference:
     def gradient(self) -> tuple[Levels, Levels]:
         """Derivatives of the grey levels of the box, ∂/∂x and ∂/∂y, grey levels per px. Two (h, w)."""
         return self.get_or_compute("gradient", lambda: gradients(self.image, self.degree, self.box, self.precision))
-
-    @cached_property
-    def coef(self) -> Levels:
-        """B-spline coefficients of the box, padded; needed only for points between pixels. (h + 2 PAD, w + 2 PAD)."""
-        return coefficients(self.image, self.degree, self.box, self.precision)
 
     @cached_property
     def transpose(self) -> Reference:
@@ -89,35 +95,8 @@ class Reference:
 
 
 @dataclass(frozen=True)
-class Current:
-    """A current image in a box where matches can lie, with B-spline coefficients computed on first use.
-
-    image : (height, width) grey levels of the whole image, in its own type.
-    box : x0, y0, x1, y1 px, ends exclusive. degree : of the B-spline, 3 or 5. precision : float32 or float64.
-    """
-
-    image: NDArray = field(repr=False)
-    box: Box
-    degree: int
-    precision: type
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Height and width of the whole image, px."""
-        return self.image.shape[0], self.image.shape[1]
-
-    @property
-    def origin(self) -> Pixels:
-        """Position (x, y) of the box's first pixel in the image. (2,) float64, px."""
-        return np.array(self.box[:2], dtype=np.float64)
-
-    @cached_property
-    def coef(self) -> Levels:
-        """B-spline coefficients of the box, padded. (h + 2 PAD, w + 2 PAD).
-
-        They are those of the whole image, since the filter also takes the pixels around the box.
-        """
-        return coefficients(self.image, self.degree, self.box, self.precision)
+class Current(_PreparedImage):
+    """A current image in a box where matches can lie."""
 
     @cached_property
     def transpose(self) -> Current:
@@ -131,7 +110,7 @@ class Current:
         """
         x0, y0, x1, y1 = self.box
         (left, right), (top, bottom) = (
-            (int(np.floor(at.min() - margin)), int(np.ceil(at.max() + margin)) + 1) for at in positions.T
+            (int(np.floor(at.min() - margin)), int(np.ceil(at.max() + margin)) + 1) for at in positions.T.copy()
         )
         box = (
             max(x0, min(left, x1 - 8)), max(y0, min(top, y1 - 8)),
@@ -139,7 +118,7 @@ class Current:
         )  # fmt: skip
         if (box[2] - box[0]) * (box[3] - box[1]) > 0.7 * (x1 - x0) * (y1 - y0):
             return self
-        return Current(self.image, box, self.degree, self.precision)
+        return replace(self, box=box)
 
     def crop_by_affine_fit(self, at: Pixels, to: Pixels, xy: Pixels, radius: int) -> Current:
         """The current image with its box reduced to where an affine fit of some matches predicts all points.
@@ -175,7 +154,7 @@ def prepare_reference(
     margin = 2 + REACH  # the mirrored border is not the image: keep the reach of the filter around the mask
     box = _clip((columns[0] - margin, rows[0] - margin, columns[-1] + 1 + margin, rows[-1] + 1 + margin), image.shape)
     region = np.ascontiguousarray(mask[box[1] : box[3], box[0] : box[2]])
-    return Reference(image, box, region, settings.degree, settings.precision, _grey_range(image))
+    return Reference(image, box, settings.degree, settings.precision, region, _grey_range(image))
 
 
 def prepare_current(image: NDArray, roi: Box | None = None, settings: CorrelationSettings | None = None) -> Current:

@@ -31,6 +31,7 @@ _RETRIES = 3  # neighbours from which a point is started at most
 _DRIFT_ZNCC = 0.9  # a point above it that twice did not converge is not started a third time
 _REPEATED_ITERATIONS = 15  # at most, of points that have failed before
 _FEWEST = 8  # start values from which an affine fit extrapolates where the region of interest lies
+_MANY = 500  # points from which on it is judged anew whether the images are transposed
 _STRETCH = 4.0  # largest stretch and compression of a subset between two images
 
 
@@ -62,6 +63,7 @@ class Propagation:
         both images show, they would drift to the same place from any.
     deviation : (n,) float64, px, and stale : (n,) bool, cache of ``inconsistent_points``.
     subsets : cache of what depends on the reference alone.
+    steep : whether points are refined in transposed images; a few do not pay for filtering these as well.
     """
 
     reference: Reference
@@ -87,10 +89,13 @@ class Propagation:
     deviation: Floats = field(init=False)
     stale: Mask = field(init=False)
     subsets: SubsetCache | None = field(init=False, default=None)
+    steep: bool | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         n = len(self.xy)
-        self.near = np.full((n, COUNT), -1) if self.independent else point_neighbours(self.xy, self.settings.step)
+        if self.repeated and self.kept is None:
+            self.subsets = subset_cache(self.reference, self.xy, self.settings)
+        self.near = np.full((n, COUNT), -1) if self.independent else self._neighbours()
         self.parameters = np.full((n, kernels.N_PARAMETERS), np.nan)
         self.status = np.full(n, Status.NOT_REACHED, np.int64)
         self.zncc = np.full(n, np.nan)
@@ -102,8 +107,14 @@ class Propagation:
         if self.textureless is None:
             self.textureless = textureless_points(self.reference, self.xy, self.settings)
         self.status[self.textureless] = Status.NO_TEXTURE
-        if self.repeated and self.kept is None:
-            self.subsets = subset_cache(self.reference, self.xy, self.settings)
+
+    def _neighbours(self) -> Indices:
+        """Indices (n, 8) of the neighbours of all points, -1 for none."""
+        if self.subsets is None:
+            return point_neighbours(self.xy, self.settings.step)
+        if self.subsets.near is None:
+            self.subsets.near = point_neighbours(self.xy, self.settings.step)
+        return self.subsets.near
 
     @property
     def good(self) -> Mask:
@@ -138,7 +149,9 @@ class Propagation:
         """
         settings = replace(self._settings_for(index), order=1) if fixed_curvature else self._settings_for(index)
         part = self.region if self.region is not None else self._initial_region(start, index)
-        steep = steep_along_rows(start)
+        if len(index) >= _MANY or self.steep is None:
+            self.steep = steep_along_rows(start)
+        steep = self.steep
         self._filter_part(part, steep)
         cache = None if fixed_curvature else self._cache_rows(index)
         status, zncc, iterations, sigma, parameters = refine(
@@ -147,8 +160,8 @@ class Propagation:
         outside = np.flatnonzero(status == Status.OUTSIDE)
         if part is not self.current and len(outside):  # outside the region, but perhaps inside the image
             part = self.current
-            self._filter_part(part, steep_along_rows(start[outside]))
-            second = refine(self.reference, part, self.xy[index[outside]], start[outside], settings)
+            self._filter_part(part, steep)
+            second = refine(self.reference, part, self.xy[index[outside]], start[outside], settings, steep=steep)
             status[outside], zncc[outside], iterations[outside], sigma[outside], parameters[outside] = second
         self.region = part
         limit = self.settings.zncc_min if zncc_min is None else zncc_min

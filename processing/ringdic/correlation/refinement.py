@@ -42,15 +42,17 @@ class SubsetMatches(NamedTuple):
 
 
 class SubsetCache:
-    """Cached normal matrices of n subsets of a reference image, which every later current image reuses.
+    """Cached normal matrices and neighbours of n subsets of a reference image, which every later current image reuses.
 
     values : (n, width_of_subset) float64, in the layout of ``kernels``. known : (n,) bool, rows that are filled.
-    transpose : the cache of the subsets with x and y exchanged; None where these are not kept.
+    transpose : the cache of the subsets with x and y exchanged; None where these are not kept. near : (n, 8) int64,
+    indices of the neighbours of each point; None before they are known.
     """
 
     def __init__(self, n: int, order: int, *, transposed: bool = False) -> None:
         self.values = np.empty((n, width_of_subset(order)))
         self.known = np.zeros(n, bool)
+        self.near: Indices | None = None
         self.transpose = SubsetCache(n, order) if transposed else None
 
 
@@ -62,7 +64,8 @@ def subset_cache(reference: Reference, xy: Pixels, settings: CorrelationSettings
     if len(xy) < _MIN_CACHED:
         return None
     sets: dict[tuple[object, ...], SubsetCache] = reference.get_or_compute("subsets", dict)
-    key = (sha256(xy.tobytes()).digest(), settings.radius, settings.order, settings.subset, settings.texture_min)
+    kind = (settings.radius, settings.step, settings.order, settings.subset, settings.texture_min)
+    key = (sha256(xy.tobytes()).digest(), *kind)
     cache = sets.pop(key, None) or SubsetCache(len(xy), settings.order)
     while len(sets) >= _CACHED_SETS:
         sets.pop(next(iter(sets)))

@@ -14,7 +14,9 @@ from ringdic.arrays import Floats, Indices, Pixels
 from ringdic.correlation.prepared import Current, Reference, as_8_bit
 
 _SEEDS = 150
-_FLOW_SIDE = 700  # px of the longer side of the reduced region
+_FLOW_SIDE = 300  # px of the longer side of the reduced region
+_FLOW_TIMES = 8.0  # times that it is reduced at most
+_FLOW_BLUR = 0.5  # subset radii, standard deviation of the Gaussian that smooths the flow
 _FLOW_MARGIN = 96  # px around the region
 _LEVELLED = 35  # px of the reduced image over which mean and contrast are equalised
 _SEARCH = 160  # px, largest displacement of the template search
@@ -60,8 +62,11 @@ def flow_start_values(reference: Reference, current: Current, xy: Pixels, radius
     if min(height, width) < 16:
         return np.full((len(xy), 12), np.nan)
     flow_search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    # The whole resolution of a small image is more exact, and faster, than a part of a large one's and smoothing there.
+    flow_search.setFinestScale(0)
+    flow_search.setVariationalRefinementIterations(0)
     flow = flow_search.calc(ref[:height, :width], cur[:height, :width], np.zeros((height, width, 2), np.float32))
-    smooth = np.float32(1.0 / scale) * cv2.GaussianBlur(flow, (0, 0), max(0.25 * radius * scale, 0.5)).astype(
+    smooth = np.float32(1.0 / scale) * cv2.GaussianBlur(flow, (0, 0), max(_FLOW_BLUR * radius * scale, 0.5)).astype(
         np.float32
     )
     at = _reduced_position(xy - (x0, y0), scale)
@@ -80,7 +85,7 @@ def _flow_scale(side: int) -> float:
 
     From about a half down it is one over a whole number: averages over whole pixels cost a tenth.
     """
-    times = min(max(side / _FLOW_SIDE, 1.0), 4.0)
+    times = min(max(side / _FLOW_SIDE, 1.0), _FLOW_TIMES)
     return 1.0 / (round(times) if times > 1.5 else times)
 
 

@@ -72,13 +72,6 @@ class Intrinsics:
         xy = np.asarray(lens.undistort_points(_rows(target), self.distortion)).reshape(px.shape)
         return xy * np.array([fx, fy]) + np.array([cx, cy])
 
-    def to_distorted(self, px: Pixels) -> Pixels:
-        """Image pixels of undistorted pixels. px : (..., 2) px. Returns (..., 2) px."""
-        px = np.asarray(px, dtype=float)
-        (fx, s, cx), (_, fy, cy) = self.K[0], self.K[1]
-        xy_d = self.distort_normalised((px - np.array([cx, cy])) / np.array([fx, fy]))
-        return np.stack([fx * xy_d[..., 0] + s * xy_d[..., 1] + cx, fy * xy_d[..., 1] + cy], axis=-1)
-
 
 @dataclass(frozen=True)
 class Camera:

@@ -47,18 +47,18 @@ def _residuals(pairs: Indices, values: Floats, doubt: Floats, rows: Indices) -> 
     return np.asarray(kernels.fill_midpoint_residuals(pairs, np.ascontiguousarray(values, dtype=float), doubt, rows))
 
 
-def surface_outliers(pairs: Indices, values: Points, factor: float = 10.0, floor: float | Floats = 0.1) -> Mask:
+def surface_outliers(pairs: Indices, values: Points, floor: float | Floats = 0.1) -> Mask:
     """Which points lie off the surface that their neighbours form, (n,) bool.
 
     pairs : (n, 4, 2) indices of opposite neighbours, of :func:`grid_neighbours`.
     values : (n, 3) mm, positions, NaN where lost.
-    factor, floor : a point is an outlier if it lies off the middle of its neighbours by more than ``factor`` times the
-        median of that distance over all points, and by more than ``floor`` mm, one for all or (n,).
+    floor : mm, one for all or (n,); an outlier lies off the middle of its neighbours by more than this, and by more
+        than ten times the median of that distance over all points.
     """
     n = len(values)
     residual = _residuals(pairs, values, np.zeros(n), np.arange(n))
     median = float(np.nanmedian(residual)) if np.isfinite(residual).any() else 0.0
-    limit = np.maximum(factor * median, np.broadcast_to(floor, n))
+    limit = np.maximum(10.0 * median, np.broadcast_to(floor, n))
     with np.errstate(invalid="ignore"):
         suspect = residual > limit
         # At the rim a good point may have a wrong one as its only neighbour, which then lies further off itself.

@@ -15,13 +15,13 @@ import json
 import logging
 import os
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from ringdic.errors import RingdicError
 from ringdic.jobs.allocation import keep_freed_memory
-from ringdic.jobs.serving import carry_out, progress_values, serve
-from ringdic.progress import Progress
+from ringdic.jobs.serving import carry_out, serve
 from ringdic.settings import load_settings
 
 
@@ -40,7 +40,7 @@ def main() -> int:
         return _serve_to_the_end()
     try:
         settings = load_settings(arguments.settings, arguments.overrides)
-        _line(carry_out(arguments.session, settings, lambda at: _line(progress_values(at))))
+        _line(carry_out(arguments.session, settings, lambda at: _line(asdict(at))))
     except RingdicError as error:
         _line({"state": "failed", "error": str(error)})
         return error.exit_code
@@ -54,10 +54,6 @@ def _serve_to_the_end() -> int:
         logging.exception("the processing failed through a fault of its own")
         return 1
     return 0
-
-
-def _line_of_progress(progress: Progress) -> None:
-    _line(progress_values(progress))
 
 
 def _line(value: dict[str, Any]) -> None:

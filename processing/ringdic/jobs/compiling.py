@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -70,6 +70,7 @@ def _compile_parts(tell: Tell) -> bool:
     return not failed
 
 
+@cache
 def _parts() -> dict[str, Callable[[], object]]:
     """What is run to compile the kernels, by name; those that take longest come first."""
     parts: dict[str, Callable[[], object]] = {

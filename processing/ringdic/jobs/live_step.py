@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from ringdic.calibration.calibrated_rig import CalibratedRig, calibrate_rig
 from ringdic.errors import InputError
 from ringdic.jobs.pipeline import match_session
 from ringdic.progress import Report, Stages, silent
-from ringdic.results.writer import write_series
+from ringdic.results.writer import write_steps
 from ringdic.session.folder import Capture, Session, new_live, open_session
 from ringdic.settings import CalibrationGroup, Settings
 from ringdic.tasks import Executor, digest, process_memory
@@ -44,8 +45,10 @@ def process_step(
     summary = {"warnings": list(matches.warnings), "seconds": round(time.monotonic() - began, 2)}
     stages.at("deform", 0.0)
     with new_live(path, capture_id) as folder:
-        series = matches.series.without_matches()
-        write_series(folder / "results.h5", series, lambda done: stages.at("deform", done), {}, summary)
+        write_steps(
+            folder / "results.h5", matches.series.names, lambda k: replace(matches.series.at(k), matches=()),
+            lambda done: stages.at("deform", done), {}, summary,
+        )  # fmt: skip
     return session.path / "live" / capture_id
 
 

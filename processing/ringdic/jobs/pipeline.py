@@ -22,13 +22,12 @@ from ringdic.charts.tasks import charts_job
 from ringdic.charts.unmeasured import places_of_arrays
 from ringdic.correlation.correlate import load_kernels
 from ringdic.errors import ComputationError, InputError
-from ringdic.geometry.camera import Camera
 from ringdic.jobs import summary
 from ringdic.jobs.compiling import compile_once
 from ringdic.progress import COMPILING, Report, Stages, silent
 from ringdic.results import noise_floor
 from ringdic.results.results import Results
-from ringdic.results.series import StepCache, join_steps
+from ringdic.results.series import StepCache
 from ringdic.results.uncertainty import StepUncertainty, camera_covariance
 from ringdic.results.writer import ResultsWriter, StepRecord, map_in_order
 from ringdic.session.folder import Capture, Session, new_run, open_session
@@ -120,8 +119,16 @@ def match_session(
     stages.at("calibrate", 0.0)
     rig = calibrate(session, settings.calibration, lambda done, who: stages.at("calibrate", done, who))
     errors, warnings = _usable_pairs(session, rig, steps)
-    matching = _Matching(session, rig, tuple(errors), steps, settings, stages, executor)
-    series = _charts_surface(matching)
+    cameras = [each.camera for id_, each in rig.cameras.items() if id_ in steps[0].images]
+    job, work = charts_job(session, cameras, tuple(errors), steps, settings), work_folder(session.path)
+    _run_tasks(job.tasks, work, stages, executor or LocalExecutor())
+    stages.at("triangulate", 0.0)
+    found = read_output(job.surface.output)
+    series = SurfaceSeries(
+        session.rig.name, cameras, tuple(errors), job.names, [step.id for step in steps],
+        ReferenceSurface.from_arrays(found), job.matches, settings, StepCache(work),
+        places_of_arrays(cameras, found), found["unmatched"].tolist(),
+    )  # fmt: skip
     warnings = (*rig.warnings, *warnings, *series.warnings)
     return SessionMatches(series, rig, errors, series.drift, series.agreement, warnings)
 
@@ -135,10 +142,13 @@ def _deform(
     path : of the results file. began : start of the run on the monotonic clock, seconds.
     """
     series = matches.series
-    uncertainty = StepUncertainty(series.reference, camera_covariance(matches.rig.bundle))
+    known = camera_covariance(matches.rig.bundle)
+    uncertainty = None if known is None else StepUncertainty(series.reference, known)
     written = [k for k, step in enumerate(steps) if step.kind != "static"]
-    reference = uncertainty.complete(series.reference)
-    at_rest = [replace(series.reference, matches=())]
+    reference = series.reference
+    if uncertainty is not None:
+        reference = uncertainty.complete(reference, reference.deformation(0))
+    at_rest: list[Results] = []
     figures: list[summary.StepFigures] = []
     with ResultsWriter(path, reference, [series.names[k] for k in written]) as file:
 
@@ -148,7 +158,8 @@ def _deform(
                 return replace(results, matches=())
             last = len(results.steps) - 1
             motion, deformation = results.motion(last), results.deformation(last)
-            results = uncertainty.complete(results, deformation) if k else reference
+            if k and uncertainty is not None:
+                results = uncertainty.complete(results, deformation)
             return file.record(results, motion, deformation), summary.step_figures(results, motion, deformation)
 
         for k, one in enumerate(map_in_order(compute, range(len(steps)))):
@@ -162,22 +173,17 @@ def _deform(
         values = summary.summarise(
             reference, figures, matches.rig, matches.errors, drift, matches.agreement, matches.warnings
         )
-        values["noise_floor"] = noise_floor.noise_floor(join_steps(at_rest)) if len(at_rest) > 1 else None
+        values["noise_floor"] = noise_floor.noise_floor(at_rest) if at_rest else None
         values["seconds"] = round(time.monotonic() - began, 2)
         file.finish(matches.calibration, values)
     return values
 
 
-def _specimen_steps(session: Session) -> tuple[Capture, ...]:
+def _with_captures_at_rest(session: Session) -> tuple[Capture, ...]:
+    """The reference, then the captures at rest, which show the specimen unmoved, then the other steps."""
     steps = session.of_kind("specimen")
     if not steps:
         raise InputError(f"{session.path}: no capture of the specimen; capture or import the reference and the steps")
-    return steps
-
-
-def _with_captures_at_rest(session: Session) -> tuple[Capture, ...]:
-    """The reference, then the captures at rest, which show the specimen unmoved, then the other steps."""
-    steps = _specimen_steps(session)
     return (steps[0], *session.of_kind("static"), *steps[1:])
 
 
@@ -209,59 +215,18 @@ def _usable_pairs(
     return usable, tuple(warnings)
 
 
-@dataclass(frozen=True)
-class _Matching:
-    """A session whose rig is calibrated, with all that its matching needs.
+def _run_tasks(tasks: Sequence[Task], folder: Path, stages: Stages, executor: Executor) -> None:
+    """Run tasks and report their progress, then remove old outputs beyond the size limit of the work folder."""
+    total_cost = sum(task.cost for task in tasks)
+    began, cost, points = time.monotonic(), 0.0, 0
 
-    pairs : camera ids of the pairs that can be used. steps : captures, the reference first.
-    """
+    def report(task: Task, outcome: TaskReport, count: int, total: int) -> None:
+        nonlocal cost, points
+        cost += task.cost
+        points += outcome.points
+        rate = f"{points / max(time.monotonic() - began, 1e-3):,.0f} points/s" if points else ""
+        stages.at("correlate", cost / total_cost, f"{task.name} ({count} of {total})", rate)
 
-    session: Session
-    rig: CalibratedRig
-    pairs: tuple[tuple[str, str], ...]
-    steps: tuple[Capture, ...]
-    settings: Settings
-    stages: Stages
-    executor: Executor | None
-
-    @property
-    def cameras(self) -> list[Camera]:
-        """All calibrated cameras."""
-        return [each.camera for each in self.rig.cameras.values()]
-
-    @property
-    def names(self) -> list[str]:
-        """Capture ids of the steps."""
-        return [step.id for step in self.steps]
-
-    def run(self, tasks: Sequence[Task]) -> None:
-        """Run tasks and report their progress, then remove old outputs beyond the size limit of the work folder."""
-        total_cost = sum(task.cost for task in tasks)
-        began, cost, points = time.monotonic(), 0.0, 0
-
-        def report(task: Task, outcome: TaskReport, count: int, total: int) -> None:
-            nonlocal cost, points
-            cost += task.cost
-            points += outcome.points
-            rate = f"{points / max(time.monotonic() - began, 1e-3):,.0f} points/s" if points else ""
-            self.stages.at("correlate", cost / total_cost, f"{task.name} ({count} of {total})", rate)
-
-        self.stages.at("correlate", 0.0)
-        (self.executor or LocalExecutor()).run(tasks, report)
-        tidy(work_folder(self.session.path), tasks)
-
-
-def _charts_surface(matching: _Matching) -> SurfaceSeries:
-    """Match every chart in all cameras that see it, track it in time, as tasks, and triangulate one surface."""
-    session, settings, steps = matching.session, matching.settings, matching.steps
-    cameras = [camera for camera in matching.cameras if camera.id in steps[0].images]
-    job = charts_job(session, cameras, matching.pairs, steps, settings)
-    matching.run(job.tasks)
-    matching.stages.at("triangulate", 0.0)
-    found = read_output(job.surface.output)
-    surface, unmeasured = ReferenceSurface.from_arrays(found), places_of_arrays(cameras, found)
-    cache = StepCache(work_folder(session.path))
-    return SurfaceSeries(
-        session.rig.name, cameras, matching.pairs, job.names, matching.names, surface, job.matches, settings, cache,
-        unmeasured, found["unmatched"].tolist(),
-    )  # fmt: skip
+    stages.at("correlate", 0.0)
+    executor.run(tasks, report)
+    tidy(folder, tasks)

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from pyvista import Plotter
 
-    from ringdic.pictures.scale import Scale
-
 Position = Sequence[float]
 """A position in space in the world frame, (x, y, z) mm."""
 
@@ -113,7 +111,7 @@ class Run:
 
         Raises InputError for a reference, window or exponent that does not exist.
         """
-        how = _evaluation(**evaluation)
+        how = Evaluation.of(**evaluation)
         return self._evaluated.setdefault(how, EvaluatedResults(self.results, how))
 
     def field(self, name: str, step: int | str = -1, **evaluation: Unpack[EvaluationOptions]) -> Floats:
@@ -168,10 +166,11 @@ class Run:
         '0008-specimen'
         """
         from ringdic.pictures.axes import draw_surface
+        from ringdic.pictures.scale import scale_of
 
         results = self.evaluated(**evaluation)
         number = self._step(step)
-        return draw_surface(axes, results, _scale(results, name, limits), number, azimuth, elevation)
+        return draw_surface(axes, results, scale_of(results, name, limits), number, azimuth, elevation)
 
     def view(
         self,
@@ -194,9 +193,10 @@ class Run:
         Raises InputError where the extra ``viewer`` is not installed.
         """
         from ringdic.pictures.axes import surface_in_viewer
+        from ringdic.pictures.scale import scale_of
 
         results = self.evaluated(**evaluation)
-        plotter = surface_in_viewer(results, _scale(results, name, limits), self._step(step))
+        plotter = surface_in_viewer(results, scale_of(results, name, limits), self._step(step))
         if show:
             plotter.show()
         return plotter
@@ -370,7 +370,7 @@ class Run:
             raise InputError(f"{path}: end the name with one of .{', .'.join(FORMATS)}, or give the format")
         if format is None and chosen in FOLDERS:
             path = path.with_suffix("")
-        return export_run(self.session.path, chosen, path, _evaluation(**evaluation), colour, self.number)
+        return export_run(self.session.path, chosen, path, Evaluation.of(**evaluation), colour, self.number)
 
     def report(self, path: str | Path | None = None, progress: Callable[[float], None] = lambda _: None) -> Path:
         """Write the run's report as one self-contained HTML file; returns its path.
@@ -392,21 +392,6 @@ class Run:
         if not -count <= step < count:
             raise InputError(f"no step {step}; there are {count}, from 0, the reference")
         return int(step) % count
-
-
-def _evaluation(
-    reference: str = "first",
-    without_rigid_motion: bool = False,
-    window: float | None = None,
-    seth_hill: float | None = None,
-) -> Evaluation:
-    return Evaluation.of(reference, without_rigid_motion, window, seth_hill)
-
-
-def _scale(results: EvaluatedResults, name: str, limits: tuple[float, float] | None) -> Scale:
-    from ringdic.pictures.scale import scale_of
-
-    return scale_of(results, name, limits)
 
 
 def _three(position: Position) -> tuple[float, float, float]:

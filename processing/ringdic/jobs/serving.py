@@ -16,6 +16,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import asdict
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
@@ -87,16 +88,11 @@ def carry_out(session: Path, settings: Settings, report: Report, step: str | Non
     return {"state": "done", "run": run.name, "summary": summary}
 
 
-def progress_values(progress: Progress) -> dict[str, Any]:
-    """JSON values of a progress report, for one line of output."""
-    return {name: getattr(progress, name) for name in ("stage", "done", "message", "rate", "left_s")}
-
-
 def _carried_out(order: dict[str, Any], say: Say, orders: _Orders) -> dict[str, Any]:
     def report(progress: Progress) -> None:
         if orders.stopped(order["order"]):
             raise StoppedError
-        say(progress_values(progress))
+        say(asdict(progress))
 
     settings = order.get("settings")
     try:

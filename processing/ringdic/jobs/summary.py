@@ -16,6 +16,7 @@ from ringdic.measure.window_study import gauge
 from ringdic.results.fields import available
 from ringdic.results.results import Results
 from ringdic.results.unmeasured import unmeasured_areas, unmeasured_rows, unmeasured_sentences
+from ringdic.session.json_values import json_value
 from ringdic.strain.deformation import Deformation
 from ringdic.strain.rigid_motion import RigidMotion
 
@@ -60,8 +61,8 @@ def summarise(
     warnings : sentences for the operator.
     """
     control = {
-        "mean_mm": _mean([error.mean for error in errors.values()]),
-        "rms_mm": _mean([error.rms for error in errors.values()]),
+        "mean_mm": float(np.mean([error.mean for error in errors.values()])),
+        "rms_mm": float(np.mean([error.rms for error in errors.values()])),
     }
     names = tuple(step.row["step"] for step in steps)
     last = [step for step in steps if step.row["measured"]][-1]
@@ -76,7 +77,7 @@ def summarise(
         "control_points": control,
         "cameras": [asdict(row) for row in rig.quality],
         "calibration": _calibration(rig),
-        "drift_px": {who: _finite(values) for who, values in drift.items()},
+        "drift_px": json_value(dict(drift)),
         "agreement": dict(agreement),
         "strain": _strain(reference),
         "uncertainty": {**last.uncertainty, "why": None if rig.bundle is not None else ALONE},
@@ -120,7 +121,7 @@ def _strain(results: Results) -> dict[str, float | None]:
 
 def _uncertainty(results: Results, step: int) -> dict[str, Any]:
     """Medians of the standard deviations at a step, due to noise and to the calibration; None where unknown."""
-    arrays = results.quality(step).fields()
+    arrays = results.quality(step)
     known = {entry.name: entry for entry in available(arrays.names)}
 
     def row(names: Mapping[str, str]) -> dict[str, float | None]:
@@ -214,13 +215,5 @@ def _rms(values: Floats) -> float | None:
     return float(np.sqrt(np.mean(finite**2))) if len(finite) else None
 
 
-def _mean(values: list[float]) -> float:
-    return float(np.mean(values))
-
-
 def _number(value: float) -> float | None:
     return round(value, 4) if np.isfinite(value) else None
-
-
-def _finite(values: Floats) -> list[float | None]:
-    return [float(value) if np.isfinite(value) else None for value in values]

@@ -247,31 +247,20 @@ def _funnel(left: Floats, right: Floats, first: Floats, last: Floats) -> list[tu
     """Corners of the shortest line from first to last through portals: point, number of the portal, side (0 left)."""
     ends = [*zip(left, right, strict=True), (last, last)]
     corners: list[tuple[Floats, int, int]] = []
-    apex, lo, hi = first, ends[0][0], ends[0][1]
-    at_lo = at_hi = 0
+    apex, limits, at = first, [*ends[0]], [0, 0]
     k = 1
     while k < len(ends):
-        new_lo, new_hi = ends[k]
-        if _turn(apex, hi, new_hi) >= 0:  # the right side closes in
-            if np.array_equal(apex, hi) or _turn(apex, lo, new_hi) < 0:
-                hi, at_hi = new_hi, k
-            else:  # and crosses the left: the path turns there
-                corners.append((lo, at_lo, 0))
-                apex, k = lo, at_lo
-                hi, at_hi = apex, k
-                lo, at_lo = apex, k
-                k += 1
+        for side, inwards in ((1, 1.0), (0, -1.0)):
+            new, other = ends[k][side], 1 - side
+            if inwards * _turn(apex, limits[side], new) < 0:  # this side does not close in
                 continue
-        if _turn(apex, lo, new_lo) <= 0:
-            if np.array_equal(apex, lo) or _turn(apex, hi, new_lo) > 0:
-                lo, at_lo = new_lo, k
-            else:
-                corners.append((hi, at_hi, 1))
-                apex, k = hi, at_hi
-                lo, at_lo = apex, k
-                hi, at_hi = apex, k
-                k += 1
-                continue
+            if np.array_equal(apex, limits[side]) or inwards * _turn(apex, limits[other], new) < 0:
+                limits[side], at[side] = new, k
+            else:  # it crosses the other: the path turns there
+                apex, k = limits[other], at[other]
+                corners.append((apex, k, other))
+                limits, at = [apex, apex], [k, k]
+                break
         k += 1
     return [corner for corner in corners if corner[1] < len(left)]
 

@@ -116,7 +116,7 @@ def region_statistics(results: EvaluatedResults, region: Region, fields: Sequenc
     if not inside.any():
         raise InputError("the region holds no triangle of the surface")
     areas = np.where(inside, mesh.areas, 0.0)
-    weights = {"face": areas, "point": _shares(mesh, areas)}
+    weights = area_weights(mesh, areas)
     rows: list[dict[str, Any]] = []
     for entry in entries:
         for step, name in enumerate(results.steps):
@@ -149,5 +149,7 @@ def statistics(values: Floats, weights: Floats) -> dict[str, float | int]:
     return {**dict(zip(names, map(float, figures), strict=True)), "measured": len(v), "lost": lost}
 
 
-def _shares(mesh: Mesh, areas: Floats) -> Floats:
-    return np.asarray(np.bincount(mesh.faces.ravel(), np.repeat(areas / 3.0, 3), len(mesh.vertices)), dtype=float)
+def area_weights(mesh: Mesh, areas: Floats) -> dict[str, Floats]:
+    """Weights in mm²: areas (M,) of the triangles, and for each of the N points a third of those of its triangles."""
+    shares = np.bincount(mesh.faces.ravel(), np.repeat(areas / 3.0, 3), len(mesh.vertices))
+    return {"face": areas, "point": np.asarray(shares, dtype=float)}

@@ -9,7 +9,7 @@ import numpy as np
 from ringdic.arrays import Indices, Mask
 from ringdic.mesh.mesh import Mesh, half_edges
 from ringdic.mesh.polygon import triangulate_polygon
-from ringdic.mesh.topology import Border, Kind, borders
+from ringdic.mesh.topology import Border, Kind, borders, vector_area
 
 _LONGEST = 150  # vertices of a border whose hole may be filled
 _THIN = 0.1  # height over longest edge of triangles that are used only where there is no other way
@@ -46,7 +46,7 @@ def fill(mesh: Mesh, area: float, bridge: float, seam: Mask, seam_area: float) -
                 continue
             outline = np.array(loop[::-1])  # counter-clockwise round the hole
             points = mesh.vertices[outline]
-            vector = 0.5 * np.cross(points - points[0], np.roll(points, -1, axis=0) - points[0]).sum(axis=0)
+            vector = vector_area(points)
             size = float(np.linalg.norm(vector))
             limit = seam_area if seam[outline].any() else area
             if size == 0 or size > limit or normals[outline].mean(axis=0) @ vector < _FACING * size:

@@ -159,27 +159,6 @@ def _separation(one, two, nx, ny, nz):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def rivals(M, competing):  # type: ignore[no-untyped-def]
-    """Collect for each triangle those that it overlaps, in lists concatenated to one array.
-
-    M : number of triangles. competing : (P, 2), pairs of triangles. Returns where each list begins (M + 1,), and the
-    array.
-    """
-    start = np.zeros(M + 1, np.int64)
-    for first, second in competing:
-        start[first + 1] += 1
-        start[second + 1] += 1
-    for f in range(1, M + 1):
-        start[f] += start[f - 1]
-    free, row = start[:-1].copy(), np.empty(2 * len(competing), np.int64)
-    for first, second in competing:
-        row[free[first]], row[free[second]] = second, first
-        free[first] += 1
-        free[second] += 1
-    return start, row
-
-
-@nb.njit(cache=True, nogil=True)
 def smooth_over_neighbours(values, known, beside, rounds):  # type: ignore[no-untyped-def]
     """Smooth values on triangles by repeatedly averaging over neighbouring triangles.
 

@@ -12,9 +12,9 @@ import numpy as np
 from ringdic.arrays import Floats, Indices, Mask, Points
 from ringdic.merging.fill import fill
 from ringdic.merging.mismatch import Mismatch, mismatches
-from ringdic.merging.overlap import MEASURES, badness, close_pairs, cover, peel, regrow
+from ringdic.merging.overlap import badness, close_pairs, cover, peel, regrow
 from ringdic.merging.stitch import stitch
-from ringdic.mesh.mesh import Mesh
+from ringdic.mesh.mesh import Mesh, used_vertices
 from ringdic.mesh.topology import face_neighbours, pieces, without_pinches
 
 #: Weights of the measures of each heuristic.
@@ -25,6 +25,11 @@ HEURISTICS: Mapping[str, Mapping[str, float]] = MappingProxyType(
     }
 )
 _FEWEST = 12  # triangles of the smallest piece that remains
+# Of the seams between parts: lengths in units of the triangles' mean edge, and areas in its square.
+_GAP = 0.4  # left between surfaces before they are stitched
+_BRIDGE = 3.5  # longest edge of a new triangle
+_LAYERS = 2.0  # greatest distance between two layers of one surface
+_HOLE, _SEAM_HOLE = 6.0, 30.0  # largest holes that are filled, within a surface and at a seam
 
 
 @dataclass(frozen=True)
@@ -51,34 +56,6 @@ class SurfacePart:
 
 
 @dataclass(frozen=True)
-class Seam:
-    """Parameters of joining surfaces: lengths in units of the triangles' mean edge, and areas in its square.
-
-    gap : left between surfaces before they are stitched. bridge : longest edge of a new triangle. layers : greatest
-    distance between two layers of one surface. hole : largest hole within a surface that is filled; seam_hole :
-    largest at a seam.
-    """
-
-    gap: float = 0.4
-    bridge: float = 3.5
-    layers: float = 2.0
-    hole: float = 6.0
-    seam_hole: float = 30.0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value >= 0:
-                raise ValueError(f"{name} of a seam must not be negative, not {value}")
-
-    @staticmethod
-    def mean_edge(parts: Sequence[SurfacePart]) -> float:
-        """Mean length of the edges of all triangles, mm; 0 without any."""
-        lengths = [np.linalg.norm(np.diff(s.vertices[s.faces[:, [0, 1, 2, 0]]], axis=1), axis=2) for s in parts]
-        every = np.concatenate([np.zeros(0), *(length.ravel() for length in lengths)])
-        return float(every.mean()) if len(every) else 0.0
-
-
-@dataclass(frozen=True)
 class MergedSurface:
     """One surface over the vertices of several parts, which are numbered one part after the other.
 
@@ -96,40 +73,42 @@ class MergedSurface:
     mismatch: tuple[Mismatch, ...]
 
 
-def merge(
-    parts: Sequence[SurfacePart],
-    heuristic: str = "combined",
-    weights: Mapping[str, float] | None = None,
-    seam: Seam = Seam(),
-) -> MergedSurface:
+def merge(parts: Sequence[SurfacePart], heuristic: str = "combined") -> MergedSurface:
     """Merge several surfaces into one manifold surface without overlaps.
 
     heuristic : which triangles of an overlap are worst: "correlation", "distance", "orientation" or "combined".
-    weights : of the measures, by name, instead of those of the heuristic. seam : lengths by which surfaces are
-    joined. Raises ValueError for an unknown heuristic or measure.
+    Raises ValueError for an unknown heuristic.
     """
     if heuristic not in HEURISTICS:
         raise ValueError(f"no heuristic '{heuristic}'; there are {', '.join(HEURISTICS)}")
-    chosen = HEURISTICS[heuristic] if weights is None else weights
-    if unknown := set(chosen) - set(MEASURES):
-        raise ValueError(f"no measure '{unknown.pop()}'; there are {', '.join(MEASURES)}")
     mesh, owner, correlation = _concatenate(parts)
     if not len(mesh.faces):
         return MergedSurface(mesh.faces, owner, np.zeros(0, np.int64), np.zeros(0, np.int64), 0, ())
-    edge = Seam.mean_edge(parts)
-    overlap = _Overlap.of(mesh, owner, correlation, chosen, seam.layers * edge)
+    edge = _mean_edge(mesh)
+    overlap = _Overlap.of(mesh, owner, correlation, HEURISTICS[heuristic], _LAYERS * edge)
     with ThreadPoolExecutor(1) as pool:  # the mismatches while the rest runs
-        distances = pool.submit(mismatches, parts, seam.layers * edge)
-        living = _without_overlap(mesh, owner, overlap, seam.gap * edge, seam.layers * edge)
-        faces, pair, added = _close_gaps(mesh, mesh.faces[living], parts, seam, edge)
-        return MergedSurface(faces, pair, np.unique(faces), np.flatnonzero(~living), added, distances.result())
+        distances = pool.submit(_distances, parts, edge)
+        living = _without_overlap(mesh, owner, overlap, _GAP * edge, _LAYERS * edge)
+        faces, pair, added = _close_gaps(mesh, mesh.faces[living], parts, edge)
+        return MergedSurface(faces, pair, used_vertices(faces), np.flatnonzero(~living), added, distances.result())
 
 
 def side_by_side(parts: Sequence[SurfacePart]) -> MergedSurface:
     """Several surfaces as one mesh, one over the other where they overlap, with their distances there."""
     mesh, owner, _ = _concatenate(parts)
-    distances = mismatches(parts, Seam().layers * Seam.mean_edge(parts))
+    distances = _distances(parts, _mean_edge(mesh))
     return MergedSurface(mesh.faces, owner, np.arange(len(mesh.vertices)), np.zeros(0, np.int64), 0, distances)
+
+
+def _mean_edge(mesh: Mesh) -> float:
+    """Mean length of the edges of all triangles, mm; 0 without any."""
+    lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.faces[:, [0, 1, 2, 0]]], axis=1), axis=2)
+    return float(lengths.mean()) if lengths.size else 0.0
+
+
+def _distances(parts: Sequence[SurfacePart], edge: float) -> tuple[Mismatch, ...]:
+    """Distances between every two parts. edge : mm, mean edge of their triangles."""
+    return mismatches([Mesh(part.vertices, part.faces) for part in parts], _LAYERS * edge)
 
 
 def _concatenate(parts: Sequence[SurfacePart]) -> tuple[Mesh, Indices, Floats]:
@@ -215,7 +194,7 @@ def _tidy(mesh: Mesh, living: Mask) -> Mask:
 
 
 def _close_gaps(
-    mesh: Mesh, triangles: Indices, parts: Sequence[SurfacePart], seam: Seam, edge: float
+    mesh: Mesh, triangles: Indices, parts: Sequence[SurfacePart], edge: float
 ) -> tuple[Indices, Indices, int]:
     """Stitch the gaps between the parts and fill the holes.
 
@@ -223,11 +202,11 @@ def _close_gaps(
     (M',), -1 where they join parts, and the number of new ones.
     """
     part_of = np.repeat(np.arange(len(parts)), [len(part.vertices) for part in parts])
-    new = stitch(Mesh(mesh.vertices, triangles), part_of, seam.bridge * edge)
+    new = stitch(Mesh(mesh.vertices, triangles), part_of, _BRIDGE * edge)
     whole = Mesh(mesh.vertices, np.concatenate([triangles, new]))
     seam_vertex = np.zeros(len(mesh.vertices), bool)
     seam_vertex[new] = True
-    fillings = fill(whole, seam.hole * edge**2, seam.bridge * edge, seam_vertex, seam.seam_hole * edge**2)
+    fillings = fill(whole, _HOLE * edge**2, _BRIDGE * edge, seam_vertex, _SEAM_HOLE * edge**2)
     faces = np.concatenate([whole.faces, fillings])
     is_new = np.arange(len(faces)) >= len(triangles)
     sound = without_pinches(Mesh(mesh.vertices, faces))

@@ -7,27 +7,16 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Protocol
 
 import numba as nb
 import numpy as np
 
-from ringdic.arrays import Floats, Indices, Mask, Points
+from ringdic.arrays import Floats, Mask
 from ringdic.mesh.adjacency import shared_edges
-from ringdic.mesh.mesh import Mesh, half_edges
+from ringdic.mesh.mesh import Mesh, half_edges, used_vertices
 from ringdic.mesh.projection import Projector
 
-
-class Surface(Protocol):
-    """A triangulated surface whose normals point outwards."""
-
-    @property
-    def vertices(self) -> Points:
-        """Vertices (N, 3) mm, NaN where lost."""
-
-    @property
-    def faces(self) -> Indices:
-        """Triangles (M, 3), indices of their vertices."""
+_FEWEST = 20  # vertices that two surfaces share for a mismatch
 
 
 @dataclass(frozen=True)
@@ -49,20 +38,21 @@ class Mismatch:
     largest: float
 
 
-def mismatches(surfaces: Sequence[Surface], reach: float, fewest: int = 20) -> tuple[Mismatch, ...]:
-    """Mismatch of every two surfaces that share at least ``fewest`` vertices.
+def mismatches(surfaces: Sequence[Mesh], reach: float) -> tuple[Mismatch, ...]:
+    """Mismatch of every two surfaces that share at least twenty vertices.
 
-    reach : mm, greatest distance along the normal from one surface to the other.
+    surfaces : with normals outwards, vertices NaN where lost. reach : mm, greatest distance along the normal from one
+    surface to the other.
     """
 
     def between(pair: tuple[int, int]) -> Mismatch | None:
         i, j = pair
         signed = np.concatenate([curved[i].outside(curved[j]), -curved[j].outside(curved[i])])
         signed = signed[np.isfinite(signed)]
-        return _summary(i, j, signed) if len(signed) >= fewest else None
+        return _summary(i, j, signed) if len(signed) >= _FEWEST else None
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        curved = list(pool.map(lambda s: CurvedSurface(Mesh(s.vertices, s.faces).without_lost(), reach), surfaces))
+        curved = list(pool.map(lambda surface: CurvedSurface(surface.without_lost(), reach), surfaces))
         pairs = pool.map(between, combinations(range(len(curved)), 2))
         return tuple(mismatch for mismatch in pairs if mismatch is not None)
 
@@ -79,7 +69,7 @@ class CurvedSurface:
         half = half_edges(mesh.faces)
         before, alone = shared_edges(half)
         self.mesh = mesh
-        self.used = np.unique(mesh.faces)
+        self.used = used_vertices(mesh.faces)
         self.normals = _average_normals(np.nan_to_num(mesh.vertex_normals), half, before)
         self._projector = Projector(mesh, reach)
         on_border = np.zeros(len(mesh.vertices), bool)

@@ -17,12 +17,10 @@ import scipy
 
 from ringdic.arrays import Floats, Indices, Mask
 from ringdic.merging import kernels
+from ringdic.mesh.adjacency import counting_sort
 from ringdic.mesh.mesh import Mesh
 from ringdic.mesh.nearest import away_from_other_labels, cubes
 from ringdic.mesh.projection import Projector, triangle_spheres
-
-#: Measures of how bad a triangle is, each relative to its median over the overlaps.
-MEASURES = ("correlation", "distance", "orientation", "margin")
 
 _SMOOTHING = 6  # rounds of averaging over neighbouring triangles, so that no single triangle's noise decides
 _PARTS = 16  # into which the triangles are divided among the cores
@@ -161,6 +159,13 @@ def _from_border(mesh: Mesh, owner: Indices) -> Floats:
     return distance
 
 
+def _rivals(count: int, competing: Indices) -> tuple[Indices, Indices]:
+    """For each of ``count`` triangles those that it competes with, one list after the other, and where each begins."""
+    both = np.concatenate([competing, competing[:, ::-1]])
+    start, order = counting_sort(both[:, 0], count)
+    return start, both[order, 1]
+
+
 def peel(neighbours: Indices, alive: Mask, competing: Indices, bad: Floats) -> Mask:
     """Remove border triangles that compete with remaining ones, the worst first, until no two compete.
 
@@ -168,7 +173,7 @@ def peel(neighbours: Indices, alive: Mask, competing: Indices, bad: Floats) -> M
     indices. bad : (M,), the larger the worse. Returns the triangles that remain, (M,) bool.
     """
     competing = competing[alive[competing].all(axis=1)]
-    start, rival = kernels.rivals(len(neighbours), competing)
+    start, rival = _rivals(len(neighbours), competing)
     living = alive.copy()
     kernels.peel_triangles(start, rival, neighbours, living, bad)
     for first, second in competing[living[competing].all(axis=1)].tolist():  # pairs that no border reached
@@ -185,7 +190,7 @@ def regrow(neighbours: Indices, alive: Mask, candidate: Mask, competing: Indices
     competing : (P, 2) indices, among those alive and the candidates. bad : (M,), the larger the worse. Returns the
     triangles that then remain, (M,) bool.
     """
-    start, rival = kernels.rivals(len(neighbours), competing)
+    start, rival = _rivals(len(neighbours), competing)
     living = alive.copy()
     kernels.regrow_triangles(start, rival, neighbours, living, candidate & ~alive, bad)
     return living

@@ -8,13 +8,11 @@ points on a circle, a border that is not Delaunay) the gap is left to :mod:`ring
 
 from __future__ import annotations
 
-from collections import Counter
-
 import numpy as np
 
 from ringdic.arrays import Floats, Indices
 from ringdic.merging.stars import stars
-from ringdic.mesh.mesh import Mesh
+from ringdic.mesh.mesh import Mesh, used_vertices
 from ringdic.mesh.nearest import cubes
 
 _SAME_SIDE = 0.2  # least cosine between the normals of vertices of one side of the body
@@ -30,7 +28,7 @@ def stitch(mesh: Mesh, group: Indices, bridge: float) -> Indices:
     border = mesh.boundary_edges()
     if not len(border):
         return np.zeros((0, 3), np.int64)
-    used = np.unique(mesh.faces)
+    used = used_vertices(mesh.faces)
     at, normals = mesh.vertices[used], np.nan_to_num(mesh.vertex_normals[used])
     index = np.full(len(mesh.vertices), -1)
     index[used] = np.arange(len(used))
@@ -53,14 +51,10 @@ def _consistent(candidates: Indices, at: Floats, edges: Indices) -> Indices:
     corners = at[candidates]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1, initial=0.0)
     half_edges = set(map(tuple, edges.tolist()))
-    count = Counter((min(a, b), max(a, b)) for a, b in half_edges)
     consistent = []
     for a, b, c in candidates[np.argsort(longest, kind="stable")].tolist():
-        half = ((a, b), (b, c), (c, a))
-        undirected = [(min(e), max(e)) for e in half]
-        if any(e in half_edges for e in half) or any(count[e] > 1 for e in undirected):
-            continue
-        half_edges.update(half)
-        count.update(undirected)
-        consistent.append((a, b, c))
+        half = {(a, b), (b, c), (c, a)}
+        if half_edges.isdisjoint(half):  # no triangle runs along these edges in the same direction
+            half_edges |= half
+            consistent.append((a, b, c))
     return np.array(consistent, np.int64).reshape(-1, 3)

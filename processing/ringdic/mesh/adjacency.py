@@ -10,8 +10,8 @@ import numpy as np
 
 
 @nb.njit(cache=True, nogil=True)
-def _starts(key, size):  # type: ignore[no-untyped-def]
-    """Counting sort of items by their keys, 0 ≤ key < size.
+def counting_sort(key, size):  # type: ignore[no-untyped-def]
+    """Sort items by their keys (n,), 0 ≤ key < size, by counting.
 
     Returns start (size + 1,) and order (n,): the items with key c are ``order[start[c] : start[c + 1]]``.
     """
@@ -34,7 +34,7 @@ def twins(half):  # type: ignore[no-untyped-def]
     twin = np.full(len(half), -1)
     if not len(half):
         return twin
-    start, order = _starts(half[:, 0], half.max() + 1)
+    start, order = counting_sort(half[:, 0], half.max() + 1)
     for h in range(len(half)):
         a, b = half[h]
         for at in range(start[b], start[b + 1]):
@@ -56,7 +56,7 @@ def shared_edges(half):  # type: ignore[no-untyped-def]
         return before, alone
     least = np.minimum(half[:, 0], half[:, 1])
     most = np.maximum(half[:, 0], half[:, 1])
-    start, order = _starts(least, most.max() + 1)
+    start, order = counting_sort(least, most.max() + 1)
     for c in range(len(start) - 1):
         for at in range(start[c], start[c + 1]):
             h = order[at]

@@ -50,7 +50,8 @@ class Mesh:
     @property
     def centroids(self) -> Points:
         """Centroids of the triangles, (M, 3) mm."""
-        return self.vertices[self.faces].mean(axis=1)
+        first, second, third = self.faces.T
+        return (self.vertices[first] + self.vertices[second] + self.vertices[third]) / 3.0
 
     @property
     def vertex_normals(self) -> Vectors:
@@ -67,7 +68,9 @@ class Mesh:
 
     def edges(self) -> tuple[Indices, Indices]:
         """All edges, each once, as vertex indices (K, 2), the smaller first; and numbers of triangles at each (K,)."""
-        unique, count = np.unique(self._edge_numbers(), return_counts=True)
+        first, second = half_edges(self.faces).T
+        numbers = np.minimum(first, second) * len(self.vertices) + np.maximum(first, second)  # ordered as the pairs
+        unique, count = np.unique(numbers, return_counts=True)
         return np.stack(np.divmod(unique, len(self.vertices)), axis=1), count
 
     def boundary_edges(self) -> Indices:
@@ -78,14 +81,10 @@ class Mesh:
         _, alone = shared_edges(half)
         return half[alone]
 
-    def _edge_numbers(self) -> Indices:
-        """One number for the edge of each half-edge, (3M,), equal in both directions, ordered as the vertex pairs."""
-        half = half_edges(self.faces)
-        return half.min(axis=1) * len(self.vertices) + half.max(axis=1)
-
     def whole_faces(self) -> Mask:
         """Which triangles have three measured corners and an area, (M,) bool."""
-        return np.isfinite(self.vertices[self.faces]).all(axis=(1, 2)) & (np.nan_to_num(self.areas) > 0)
+        measured: Mask = np.asarray(np.isfinite(self.vertices).all(axis=1))
+        return measured[self.faces].all(axis=1) & (np.nan_to_num(self.areas) > 0)
 
     def without_lost(self) -> Mesh:
         """The mesh with all its vertices but without the triangles that have lost a corner or have no area."""
@@ -93,25 +92,15 @@ class Mesh:
 
     def compact(self) -> tuple[Mesh, Indices]:
         """The mesh without unused vertices, and the index (K,) that each of its K vertices had before."""
-        used = np.unique(self.faces)
+        used = used_vertices(self.faces)
         renumber = np.full(len(self.vertices), -1, dtype=np.int64)
         renumber[used] = np.arange(len(used))
         return Mesh(self.vertices[used], renumber[self.faces]), used
 
-    def flipped(self, which: Mask) -> Mesh:
-        """The mesh with the orientation of some triangles reversed. which : (M,) bool."""
-        faces = self.faces.copy()
-        faces[which] = faces[which][:, ::-1]
-        return Mesh(self.vertices, faces)
 
-    def facing(self, viewpoints: Points) -> Mesh:
-        """The mesh with every triangle oriented so that its normal points to the side of its viewpoint.
-
-        viewpoints : (3,) or (M, 3) mm, a point in front of each triangle, such as the mean of its cameras' centres.
-        """
-        towards = np.asarray(viewpoints, dtype=float) - self.centroids
-        with np.errstate(invalid="ignore"):
-            return self.flipped(np.einsum("mi,mi->m", self.area_vectors, towards) < 0)
+def used_vertices(faces: Indices) -> Indices:
+    """Vertices that triangles use, each once, ascending. faces : (M, 3) vertex indices. Returns indices (K,)."""
+    return np.flatnonzero(np.bincount(faces.ravel()))
 
 
 def half_edges(faces: Indices) -> Indices:

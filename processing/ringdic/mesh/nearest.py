@@ -8,6 +8,7 @@ import numba as nb
 import numpy as np
 
 from ringdic.arrays import Floats, Indices, Points
+from ringdic.mesh.adjacency import counting_sort
 
 _MOST = 4  # cubes for each point: a few far points must not make very many empty cubes
 
@@ -43,30 +44,9 @@ def cubes(points: Points, size: float) -> Cubes:
     while np.prod(np.floor(extent / size) + 1) > max(_MOST * len(points), 64):
         size *= 1.26  # twice the volume
     shape = np.floor(extent / size).astype(np.int64) + 1
-    start, order = _sorted(points, low, size, shape)
+    cell = np.minimum(((points - low) / size).astype(np.int64), shape - 1)
+    start, order = counting_sort(np.ravel_multi_index(tuple(cell.T), shape.tolist()), np.prod(shape))
     return Cubes(low, size, shape, start, order, points[order])
-
-
-@nb.njit(cache=True, nogil=True)
-def _sorted(points, low, size, shape):  # type: ignore[no-untyped-def]
-    """Counting sort of points by their cubes: where each cube begins (C + 1,), and the order of the points (n,)."""
-    n = len(points)
-    cube = np.empty(n, np.int64)
-    start = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int64)
-    for i in range(n):
-        x, y, z = (points[i, 0] - low[0]) / size, (points[i, 1] - low[1]) / size, (points[i, 2] - low[2]) / size
-        cube[i] = (min(int(x), shape[0] - 1) * shape[1] + min(int(y), shape[1] - 1)) * shape[2] + min(
-            int(z), shape[2] - 1
-        )
-        start[cube[i] + 1] += 1
-    for c in range(1, len(start)):
-        start[c] += start[c - 1]
-    free = start[:-1].copy()
-    order = np.empty(n, np.int64)
-    for i in range(n):
-        order[free[cube[i]]] = i
-        free[cube[i]] += 1
-    return start, order
 
 
 @nb.njit(cache=True, nogil=True)

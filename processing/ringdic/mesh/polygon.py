@@ -38,19 +38,22 @@ def triangulate_polygon(
     side = np.where(not_allowed, np.inf, distance**2)
     rim = np.arange(n - 1)
     side[rim, rim + 1] = side[0, n - 1] = 0.0
+    about, (x, y, z) = points - points.mean(axis=0), normal
+    # Twice the area that two corners enclose with the middle, along the normal; three such make a triangle's.
+    sector = about @ np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]) @ about.T
     cost = np.full((n, n), np.inf)
     cost[rim, rim + 1] = 0.0
     choice = np.zeros((n, n), np.int64)
     for width in range(2, n):
-        for i in range(n - width):
-            j = i + width
-            between = slice(i + 1, j)
-            twice_area = np.cross(points[between] - points[i], points[j] - points[i]) @ normal
-            longest_edge = np.maximum(np.maximum(distance[i, between], distance[between, j]), distance[i, j])
-            facing = twice_area > thinnest * longest_edge**2
-            total = np.where(facing, cost[i, between] + cost[between, j], np.inf) + side[i, j]
-            best = int(np.argmin(total))
-            cost[i, j], choice[i, j] = total[best], i + 1 + best
+        i, j = np.arange(n - width), np.arange(width, n)
+        first, last = i[:, None], j[:, None]
+        between = first + np.arange(1, width)
+        twice_area = sector[first, between] + sector[between, last] + sector[last, first]
+        longest_edge = np.maximum(np.maximum(distance[first, between], distance[between, last]), distance[first, last])
+        facing = twice_area > thinnest * longest_edge**2
+        total = np.where(facing, cost[first, between] + cost[between, last], np.inf)
+        best = np.argmin(total, axis=1)
+        cost[i, j], choice[i, j] = total[i, best] + side[i, j], between[i, best]
     return _triangles(choice) if np.isfinite(cost[0, n - 1]) else None
 
 

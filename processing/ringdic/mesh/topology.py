@@ -12,7 +12,7 @@ from enum import Enum
 import numpy as np
 import scipy
 
-from ringdic.arrays import Floats, Indices, Mask, Points
+from ringdic.arrays import Floats, Indices, Mask, Points, Vectors
 from ringdic.mesh.adjacency import fan_numbers, piece_numbers, shared_edges, twins, vertices_of_several_fans
 from ringdic.mesh.mesh import Mesh, half_edges
 from ringdic.mesh.projection import line_hits
@@ -66,38 +66,24 @@ def inconsistent_edges(mesh: Mesh) -> Indices:
     return np.stack(np.divmod(unique[count > 1], len(mesh.vertices)), axis=1)
 
 
-def non_manifold_vertices(mesh: Mesh) -> Indices:
-    """Vertices with more than one fan of triangles, where two pieces or two borders touch. Returns indices (K,)."""
-    corners = mesh.faces.ravel()
-    return np.unique(corners[vertices_of_several_fans(corners, fans(mesh))])
+def without_pinches(mesh: Mesh) -> Mask:
+    """Which triangles remain when every vertex keeps only its fan of the largest area, (M,) bool.
 
-
-def fans(mesh: Mesh) -> Indices:
-    """The number of the fan of each triangle corner, (3M,), the three corners of a triangle in succession.
-
-    A fan is a set of triangles at one vertex that are connected by edges which end in that vertex.
-    """
-    return np.asarray(fan_numbers(half_edges(mesh.faces)))
-
-
-def without_pinches(mesh: Mesh, weights: Floats | None = None) -> Mask:
-    """Which triangles remain when every vertex keeps only its fan of the largest weight, (M,) bool.
-
-    weights : (M,) mm², of the triangles; their areas unless given. Of fans of equal weight the first stays.
+    A fan is a set of triangles at one vertex that are connected by edges which end in that vertex. Of fans of equal
+    area the first stays.
     """
     remaining = np.ones(len(mesh.faces), bool)
     while True:
         left = np.flatnonzero(remaining)
         part = Mesh(mesh.vertices, mesh.faces[left])
-        fan = fans(part)
+        fan = np.asarray(fan_numbers(half_edges(part.faces)))  # of each triangle corner, (3M,)
         pinched = vertices_of_several_fans(part.faces.ravel(), fan)
         if not pinched.any():
             return remaining
-        weights = np.nan_to_num(mesh.areas) if weights is None else weights
-        weight = np.bincount(fan, np.repeat(weights[left], 3))
+        area = np.bincount(fan, np.repeat(np.nan_to_num(part.areas), 3))
         corners = np.flatnonzero(pinched)
-        # Sorted by the weight of their fans, the last corner at each vertex belongs to its largest fan.
-        order = np.lexsort((-fan[corners], weight[fan[corners]], part.faces.ravel()[corners]))
+        # Sorted by the area of their fans, the last corner at each vertex belongs to its largest fan.
+        order = np.lexsort((-fan[corners], area[fan[corners]], part.faces.ravel()[corners]))
         corners = corners[order]
         vertex = part.faces.ravel()[corners]
         last = np.flatnonzero(np.append(vertex[1:] != vertex[:-1], True))
@@ -121,14 +107,18 @@ def borders(mesh: Mesh) -> tuple[Border, ...]:
     if not (alone | ((twin >= 0) & (twin[twin] == np.arange(len(half))))).all():
         raise ValueError("a surface with non-manifold edges or triangles turned over has no borders in order")
     following = np.arange(len(half)) // 3 * 3 + (np.arange(len(half)) + 1) % 3
-    angle = _corner_angles(mesh).ravel()
     border = np.flatnonzero(twin < 0)
+    at_border = np.zeros(len(mesh.vertices), bool)
+    at_border[half[border]] = True
+    of_interest = at_border[mesh.faces].any(axis=1)
+    angle = np.full((len(mesh.faces), 3), np.nan)
+    angle[of_interest] = _corner_angles(Mesh(mesh.vertices, mesh.faces[of_interest]))
     # From the end of a border edge, across the triangles of its fan, to the next border edge.
     ahead = following[border]
-    inner_angle = angle[ahead]
+    inner_angle = angle.flat[ahead]
     while (inner := twin[ahead] >= 0).any():
         ahead[inner] = following[twin[ahead[inner]]]
-        inner_angle[inner] += angle[ahead[inner]]
+        inner_angle[inner] += angle.flat[ahead[inner]]
     succeeding = dict(zip(border.tolist(), ahead.tolist(), strict=True))
     turning = dict(zip(border.tolist(), (np.pi - inner_angle).tolist(), strict=True))
     loops = []
@@ -139,7 +129,8 @@ def borders(mesh: Mesh) -> tuple[Border, ...]:
             loop.append(onward)
             onward = succeeding.pop(onward)
         at = half[loop, 0]
-        loops.append(Border(at, _enclosed(mesh.vertices[at]), sum(turning[h] for h in loop) / (2 * np.pi)))
+        area = float(np.linalg.norm(vector_area(mesh.vertices[at])))
+        loops.append(Border(at, area, sum(turning[h] for h in loop) / (2 * np.pi)))
     return tuple(sorted(loops, key=lambda border: -len(border.loop)))
 
 
@@ -199,10 +190,12 @@ def overlap_area(mesh: Mesh, reach: float) -> float:
     return float(0.5 * (doubly_covered(mesh, reach) * mesh.areas).sum())
 
 
-def _enclosed(points: Points) -> float:
-    """Size of the vector area (mm²) that a closed line of points (n, 3) mm encloses."""
+def vector_area(points: Points) -> Vectors:
+    """Vector area that a closed line encloses. points : (n, 3) mm, along the line. Returns (3,) mm²."""
     about = points - points.mean(axis=0)
-    return float(np.linalg.norm(0.5 * np.cross(about, np.roll(about, -1, axis=0)).sum(axis=0)))
+    x, y, z = about.T
+    ahead_x, ahead_y, ahead_z = np.concatenate([about[1:], about[:1]]).T
+    return 0.5 * np.array([y @ ahead_z - z @ ahead_y, z @ ahead_x - x @ ahead_z, x @ ahead_y - y @ ahead_x])
 
 
 def _corner_angles(mesh: Mesh) -> Floats:

@@ -48,7 +48,7 @@ def surface_frames(results: EvaluatedResults, scale: Scale, azimuth: float, side
     common: Extent = (float(low[0]), float(high[1]), float(low[2]), float(high[3]))
     for step, mesh in enumerate(meshes):
         view = from_side(mesh, azimuth, height=2 * side, extent=common)  # twice as fine, for smooth rims
-        values = on_faces(results, scale.field, results.step(step).scalar(scale.field), step)
+        values = on_faces(results, scale.field, step)
         drawn = face_colours(view.faces, values, scale)
         picture = np.where(drawn[..., 3:] > 0, np.rint(255.0 * drawn[..., :3]), 255.0).astype(np.uint8)
         picture[view.inside] = _INSIDE

@@ -87,7 +87,7 @@ def draw_surface(
     towards = mean_azimuth(results.results.mesh) if azimuth is None else float(np.radians(azimuth))
     view = from_side(mesh, towards, _HEIGHT, float(np.radians(elevation)))
     axes = _axes(axes, float(np.clip(view.aspect, *_FORMS)))
-    picture = face_colours(view.faces, _on_faces(results, scale, step), scale)
+    picture = face_colours(view.faces, on_faces(results, scale.field, step), scale)
     picture[view.inside] = _INNER_SIDE
     axes.imshow(picture, extent=view.extent, interpolation="antialiased")
     _widen(axes, view.extent)
@@ -110,7 +110,7 @@ def surface_in_viewer(results: EvaluatedResults, scale: Scale, step: int) -> Plo
         raise missing_extra(error) or error from error
     mesh, _, measured = results.measured(step)
     body = pyvista.PolyData.from_regular_faces(mesh.vertices, mesh.faces)
-    body.cell_data[scale.title] = _on_faces(results, scale, step)[measured]
+    body.cell_data[scale.title] = on_faces(results, scale.field, step)[measured]
     plotter = pyvista.Plotter()
     plotter.add_mesh(
         body, scalars=scale.title, cmap=scale.mappable().cmap, clim=(scale.low, scale.high),
@@ -118,11 +118,6 @@ def surface_in_viewer(results: EvaluatedResults, scale: Scale, step: int) -> Plo
     )  # fmt: skip
     plotter.add_text(results.steps[step], font_size=10)
     return plotter
-
-
-def _on_faces(results: EvaluatedResults, scale: Scale, step: int) -> Floats:
-    """Values of the scale's field on all triangles, (M,); NaN where not measured."""
-    return on_faces(results, scale.field, results.step(step).scalar(scale.field), step)
 
 
 def _axes(axes: Axes | None, aspect: float) -> Axes:

@@ -36,7 +36,7 @@ def overlay(
     if not 0.0 <= opacity <= 1.0:
         raise InputError(f"the opacity of an overlay is from 0 to 1, not {opacity:g}")
     mesh = Mesh(results.results.vertices[step], results.results.faces)
-    values = on_faces(results, scale.field, results.step(step).scalar(scale.field), step)
+    values = on_faces(results, scale.field, step)
     drawn = face_colours(through_camera(mesh, camera), values, scale)
     weight = opacity * drawn[..., 3:]
     grey = np.asarray(image, dtype=float) / np.iinfo(image.dtype).max

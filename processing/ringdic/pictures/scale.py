@@ -75,12 +75,12 @@ def scale_of(results: EvaluatedResults, name: str, limits: tuple[float, float] |
     return Scale(results.field(name), float(low), float(high))
 
 
-def on_faces(results: EvaluatedResults, entry: Field, values: Floats, step: int) -> Floats:
+def on_faces(results: EvaluatedResults, entry: Field, step: int) -> Floats:
     """Values of a field on the triangles (M,), in its unit, NaN where a corner was not measured at the step.
 
-    values : (N,) or (M,) of the field, by its location; values of points are averaged over a triangle's corners.
+    Values of points are averaged over a triangle's corners.
     """
-    faces = results.results.faces
+    faces, values = results.results.faces, results.step(step).scalar(entry)
     if entry.location == "point":
         values = values[faces].mean(axis=1)
     lost = ~np.isfinite(results.results.vertices[step]).all(axis=1)

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats
-from ringdic.measure.region import statistics
+from ringdic.measure.region import area_weights, statistics
 from ringdic.pictures.scale import Scale, on_faces
 from ringdic.results.evaluation import EvaluatedResults
 from ringdic.results.fields import Field
@@ -43,7 +42,7 @@ def gather(
     """Evaluate the named fields, where the run has them, at every step. shown : steps whose values maps need."""
     fields = [entry for name in names for entry in results.fields if entry.name == name]
     ranges = Ranges(fields)
-    weights = _weights(results)
+    weights = area_weights(results.results.mesh, results.results.mesh.areas)
     faces: dict[tuple[str, int], NDArray[np.float32]] = {}
     values: dict[tuple[str, int], NDArray[np.float32]] = {}
     figures: dict[tuple[str, int], dict[str, Any]] = {}
@@ -55,7 +54,7 @@ def gather(
             figures[entry.name, step] = statistics(scalar, weights[entry.location])
             if step in shown:
                 values[entry.name, step] = scalar[np.isfinite(scalar)].astype(np.float32)
-                faces[entry.name, step] = on_faces(results, entry, scalar, step).astype(np.float32)
+                faces[entry.name, step] = on_faces(results, entry, step).astype(np.float32)
         progress((step + 1) / len(results.steps))
     scales = {entry.name: _scale(entry, row) for entry, row in zip(fields, ranges.table(), strict=True)}
     return Gathered(results.steps, tuple(shown), scales, faces, values, figures)
@@ -63,11 +62,3 @@ def gather(
 
 def _scale(entry: Field, row: dict[str, Any]) -> Scale:
     return Scale(entry, *even_limits(row["range"], entry.centre))
-
-
-def _weights(results: EvaluatedResults) -> dict[str, Floats]:
-    """Weights in mm²: the reference area of each triangle, and for each point a third of that of its triangles."""
-    mesh = results.results.mesh
-    areas = mesh.areas
-    shares = np.bincount(mesh.faces.ravel(), np.repeat(areas / 3.0, 3), len(mesh.vertices))
-    return {"face": areas, "point": np.asarray(shares, dtype=float)}

@@ -1,7 +1,7 @@
 """The results of a processing run: their arrays, the file that stores them, and the fields evaluated from them.
 
 ``results``        the results and the 2D matches, as arrays
-``series``         results of many steps, one step at a time
+``series``         some of the steps of results, and a cache of what is computed for each step
 ``layout``         the layout of the file, results.h5, which ``writer`` writes and ``reader`` reads
 ``vtkhdf``         the part of the file that ParaView opens
 ``fields``         the table of fields, and their values at one step
@@ -11,5 +11,4 @@
 ``unmeasured``     textured places that were not measured, and why
 ``noise_floor``    statistics of a specimen at rest
 ``colours``        colours of field values
-``json_values``    arrays and numbers as JSON values
 """

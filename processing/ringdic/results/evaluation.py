@@ -47,17 +47,18 @@ class Evaluation:
     def of(
         cls,
         reference: str = "first",
-        rigid_motion_removed: bool = False,
+        without_rigid_motion: bool = False,
         window: float | None = None,
-        exponent: float | None = None,
+        seth_hill: float | None = None,
     ) -> Evaluation:
-        """Evaluation options with the reference given by name: "first", or "previous" for the step before each step.
+        """Evaluation by the names that its options have on the command line and in a run's methods.
 
-        Raises InputError for any other word; the other arguments are those of the class.
+        reference : "first", or "previous" for the step before each step. without_rigid_motion, window, seth_hill :
+        rigid_motion_removed, window and exponent of the class. Raises InputError for another reference.
         """
         if reference not in ("first", "previous"):
             raise InputError(f"a step is compared with the 'first' or the 'previous' one, not with '{reference}'")
-        return cls(reference == "previous", rigid_motion_removed, window, exponent)
+        return cls(reference == "previous", without_rigid_motion, window, seth_hill)
 
 
 class EvaluatedResults:

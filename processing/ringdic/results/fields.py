@@ -298,37 +298,6 @@ class StepFields:
         return entry.from_arrays(arrays.__getitem__, rigid_motion_removed, through)
 
 
-@dataclass(frozen=True)
-class StepQuality:
-    """Correlation and standard deviations of the points and triangles at one step; None where unknown.
-
-    correlation : (N,) C_LS. sigma_xyz, sigma_displacement : (N, 3) mm, and sigma_lambda : (M, 2), of λ1 and λ2, all due
-    to image noise. chi2 : (N,) χ² a degree of freedom. sigma_calibration, sigma_displacement_calibration :
-    (N, 3) mm, and sigma_lambda_calibration : (M, 2), due to the covariance of the cameras' parameters.
-    """
-
-    correlation: Floats
-    sigma_xyz: Floats
-    sigma_displacement: Floats | None = None
-    sigma_lambda: Floats | None = None
-    chi2: Floats | None = None
-    sigma_calibration: Floats | None = None
-    sigma_displacement_calibration: Floats | None = None
-    sigma_lambda_calibration: Floats | None = None
-
-    def fields(self) -> StepFields:
-        """The arrays that are known, by name; those of λ1 and λ2 with 1 and 2 appended to the name."""
-        point = {"correlation": self.correlation, "sigma_xyz": self.sigma_xyz}
-        face: dict[str, Floats] = {}
-        for name, kind in OPTIONAL_ARRAYS.items():
-            values = getattr(self, name)
-            if values is not None and kind == "face":
-                face[f"{name}1"], face[f"{name}2"] = values.T
-            elif values is not None:
-                point[name] = values
-        return StepFields(point, face)
-
-
 def field(name: str) -> Field:
     """The field of a name; raises KeyError where there is none.
 
@@ -365,7 +334,7 @@ def compute_fields(
     current: Points,
     faces: Indices,
     to_reference: RigidMotion,
-    quality: StepQuality,
+    quality: StepFields,
     pair: Indices,
     window: StrainWindow | None = None,
     scatter: WindowScatter | None = None,
@@ -379,7 +348,7 @@ def compute_fields(
     reference, current : (N, 3) mm, positions of the vertices at the reference and at the step, NaN where lost.
     faces : (M, 3) vertex indices.
     to_reference : the rigid motion that takes the step back onto the reference.
-    quality : correlation and standard deviations at the step.
+    quality : correlation and standard deviations at the step, of `Results.quality`.
     pair : (M,) index of the camera pair of each triangle.
     window : adds strain over these windows to that of the triangles.
     scatter : adds standard deviations of the strain over the windows, where those of the displacements are known.
@@ -387,26 +356,25 @@ def compute_fields(
     both_tensors : whether to add the Euler-Almansi tensor, from which no field follows.
     """
     deformed = deformation(reference, current, faces) if known_deformation is None else known_deformation
-    known = quality.fields()
     point = {
         "displacement": current - reference,
         "displacement_without_rigid_motion": to_reference.apply(current) - reference,
-        **known.point,
+        **quality.point,
     }
     face = {
         **_deformation_arrays(deformed, both_tensors),
         **_linear(deformed, to_reference),
         "isotropy": deformed.isotropy,
         "area": deformed.area,
-        "face_correlation": quality.correlation[faces].max(axis=1),
+        "face_correlation": quality.point["correlation"][faces].max(axis=1),
         "pair": pair.astype(float),
-        **known.face,
+        **quality.face,
     }
     if window is not None:
         over = window.deformation(current, reference)
         face |= {f"window_{name}": values for name, values in _deformation_arrays(over, both_tensors).items()}
-        if scatter is not None and quality.sigma_displacement is not None:
-            sigma = scatter.stretch_sigma(over, quality.sigma_displacement)
+        if scatter is not None and "sigma_displacement" in quality.point:
+            sigma = scatter.stretch_sigma(over, quality.point["sigma_displacement"])
             face["window_sigma_lambda1"], face["window_sigma_lambda2"] = sigma.T
     return StepFields(point, face)
 

@@ -5,6 +5,7 @@ Captures of kind ``static`` are tracked as steps right after the reference and l
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,19 +15,18 @@ from ringdic.results.results import Results
 from ringdic.strain.window import strain_window
 
 
-def noise_floor(at_rest: Results) -> dict[str, Any]:
+def noise_floor(at_rest: Sequence[Results]) -> dict[str, Any]:
     """Statistics of displacement, stretch and strain over all captures at rest, as JSON values.
 
-    at_rest : results whose steps after the reference are the captures at rest.
+    at_rest : for each capture at rest results of two steps, the reference and that capture.
     Returns a dictionary: ``captures``, ``steps`` : their number and ids. ``moved_mm`` : the largest median displacement
     of a capture, which shows whether the specimen or the cameras did move. ``quantities`` : by name the label, unit,
     mean, std, rms and median of the values and p95 of their magnitudes, None where nothing was measured;
     ``displacement_rest`` among them is the displacement after the rigid motion is removed.
     """
-    steps = range(1, len(at_rest.steps))
-    displacements = [at_rest.vertices[k] - at_rest.vertices_ref for k in steps]
-    residuals = [at_rest.motion(k).apply(at_rest.vertices[k]) - at_rest.vertices_ref for k in steps]
-    deformations = [at_rest.deformation(k) for k in steps]
+    displacements = [one.vertices[1] - one.vertices_ref for one in at_rest]
+    residuals = [one.motion(1).apply(one.vertices[1]) - one.vertices_ref for one in at_rest]
+    deformations = [one.deformation(1) for one in at_rest]
     lengths = [np.linalg.norm(each, axis=1) for each in displacements]
     rows: list[tuple[str, str, str, list[Floats]]] = [
         ("displacement", "Displacement", "mm", lengths),
@@ -44,13 +44,14 @@ def noise_floor(at_rest: Results) -> dict[str, Any]:
         ("lambda2", "Larger stretch λ2 − 1", "", [each.lambda2 - 1.0 for each in deformations]),
         ("E_magnitude", "Green-Lagrange strain, magnitude", "", [each.E_magnitude for each in deformations]),
     ]
-    if at_rest.window_mm > 0:
-        window = strain_window(at_rest.mesh, at_rest.window_mm)
-        over = [at_rest.deformation(k, window=window).E_magnitude for k in steps]
-        rows.append(("window_E_magnitude", f"The same over {at_rest.window_mm:g} mm", "", over))
+    width = at_rest[0].window_mm
+    if width > 0:
+        window = strain_window(at_rest[0].mesh, width)
+        over = [one.deformation(1, window=window).E_magnitude for one in at_rest]
+        rows.append(("window_E_magnitude", f"The same over {width:g} mm", "", over))
     return {
-        "captures": len(at_rest.steps) - 1,
-        "steps": list(at_rest.steps[1:]),
+        "captures": len(at_rest),
+        "steps": [one.steps[1] for one in at_rest],
         "moved_mm": max((_median(each) for each in lengths), default=0.0),
         "quantities": {
             name: {"label": label, "unit": unit, **_statistics(np.concatenate(values))}

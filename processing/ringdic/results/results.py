@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ringdic.arrays import Floats, Indices, Pixels, Points
 from ringdic.geometry.camera import Camera
 from ringdic.mesh.mesh import Mesh
-from ringdic.results.fields import OPTIONAL_ARRAYS, StepFields, StepQuality, compute_fields
+from ringdic.results.fields import OPTIONAL_ARRAYS, StepFields, compute_fields
 from ringdic.results.unmeasured import UnmeasuredPlaces
 from ringdic.settings import settings_of_run
 from ringdic.strain.deformation import Deformation, deformation
@@ -204,49 +204,43 @@ class Results:
         reference, quality = self.reference_positions(step, previous), self.quality(step, previous)
         return compute_fields(reference, current, self.faces, motion, quality, self.pair, window, scatter)
 
-    def quality(self, step: int, previous: bool = False) -> StepQuality:
-        """Correlation coefficients and standard deviations at a step.
+    def quality(self, step: int, previous: bool = False) -> StepFields:
+        """Collect the correlation coefficients and the known standard deviations of a step, by name of the field.
 
         previous : those of the motion since the step before, instead of since the reference; the part of
         the calibration is then unknown and left out.
         """
-        of_motion = None if previous else step
-        return StepQuality(
-            self.correlation[step],
-            self.sigma_xyz[step],
-            self._motion_sigma(self.sigma_displacement, step, previous),
-            self._stretch_sigma(step, previous),
-            _at(self.chi2, step),
-            _at(self.sigma_calibration, step),
-            _at(self.sigma_displacement_calibration, of_motion),
-            _at(self.sigma_lambda_calibration, of_motion),
-        )
+        known = {name: values[step] for name in OPTIONAL_ARRAYS if (values := getattr(self, name)) is not None}
+        if previous:
+            known.pop("sigma_displacement_calibration", None)
+            known.pop("sigma_lambda_calibration", None)
+            known |= self._noise_since_step_before(step) if step >= 2 else {}
+        point = {"correlation": self.correlation[step], "sigma_xyz": self.sigma_xyz[step]}
+        face: dict[str, Floats] = {}
+        for name, values in known.items():
+            if OPTIONAL_ARRAYS[name] == "face":
+                face[f"{name}1"], face[f"{name}2"] = values.T
+            else:
+                point[name] = values
+        return StepFields(point, face)
 
-    def _motion_sigma(self, sigma: Floats | None, step: int, previous: bool) -> Floats | None:
-        """Standard deviations of a motion, since the reference or since the step before it.
+    def _noise_since_step_before(self, step: int) -> dict[str, Floats]:
+        """Standard deviations of displacements (N, 3) mm and stretches (M, 2) since the step before, as far as known.
 
         Half of the variance of a motion since the reference comes from the reference image and half from the step's
-        own. The reference image cancels between two steps, which leaves their own halves.
+        own. The reference image cancels between two steps, which leaves their own halves. Both stretches get the mean
+        variance of the two, because the principal directions have turned in between, divided by the area ratio of the
+        step before, because the triangle has changed its size.
         """
-        if sigma is None or not previous or step < 2:
-            return _at(sigma, step)
-        return np.asarray(np.sqrt(0.5 * (sigma[step] ** 2 + sigma[step - 1] ** 2)))
-
-    def _stretch_sigma(self, step: int, previous: bool) -> Floats | None:
-        """Standard deviations (M, 2) of λ1 and λ2, since the reference or since the step before it.
-
-        Since the step before, both get the mean variance of the two, because the principal directions have turned in
-        between, divided by the area ratio of the step before, because the triangle has changed its size.
-        """
-        sigma = self._motion_sigma(self.sigma_lambda, step, previous)
-        if sigma is None or not previous or step < 2:
-            return sigma
-        mean = np.sqrt(np.mean(sigma**2, axis=1, keepdims=True) / self.deformation(step - 1).J[:, None])
-        return np.broadcast_to(mean, sigma.shape)
-
-
-def _at(values: Floats | None, step: int | None) -> Floats | None:
-    return None if values is None or step is None else values[step]
+        known: dict[str, Floats] = {}
+        for name in ("sigma_displacement", "sigma_lambda"):
+            sigma = getattr(self, name)
+            if sigma is not None:
+                known[name] = np.sqrt(0.5 * (sigma[step] ** 2 + sigma[step - 1] ** 2))
+        if (sigma := known.get("sigma_lambda")) is not None:
+            mean = np.sqrt(np.mean(sigma**2, axis=1, keepdims=True) / self.deformation(step - 1).J[:, None])
+            known["sigma_lambda"] = np.broadcast_to(mean, sigma.shape)
+        return known
 
 
 def _check(holder: object, shapes: dict[str, tuple[int, ...]]) -> None:

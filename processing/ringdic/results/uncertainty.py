@@ -39,28 +39,9 @@ def camera_covariance(fit: BundleFit | None) -> CameraCovariance | None:
 
 
 class StepUncertainty:
-    """The standard deviations of a run's results due to the calibration, computed one step at a time.
+    """The standard deviations of a run's results due to the covariance of the cameras, computed one step at a time.
 
-    reference : the results of the reference alone. known : covariance of the cameras, None where it is unknown.
-    """
-
-    def __init__(self, reference: Results, known: CameraCovariance | None) -> None:
-        self._calibration = None if known is None else _CalibrationUncertainty(reference, known)
-
-    def complete(self, results: Results, deformation: Deformation | None = None) -> Results:
-        """Complete the results of one step with its standard deviations.
-
-        results : of the reference and this step, from `Series.at`. deformation : of the step since the reference;
-        computed where it is None.
-        """
-        if self._calibration is None:
-            return results
-        deformed = results.deformation(len(results.steps) - 1) if deformation is None else deformation
-        return replace(results, **self._calibration.arrays(results, deformed))
-
-
-class _CalibrationUncertainty:
-    """Standard deviations due to the covariance of the cameras.
+    reference : the results of the reference alone. known : covariance of the cameras.
 
     They vary smoothly over the surface. On a large one they are computed at a sample of the triangles and their
     corners, and every other triangle and point has those of the nearest one.
@@ -81,8 +62,11 @@ class _CalibrationUncertainty:
         )
         self._position = self._points.spread(sensitivity_sigma(self._at_reference))
 
-    def arrays(self, results: Results, deformed: Deformation) -> dict[str, Any]:
-        """The standard deviations at the reference and at the step, by the names of the arrays of `Results`."""
+    def complete(self, results: Results, deformed: Deformation) -> Results:
+        """Complete the results of one step with its standard deviations.
+
+        results : of the reference and this step, or of the reference alone. deformed : from the reference to the step.
+        """
         N, M = len(results.vertices_ref), len(results.faces)
         rows = [(self._position, np.zeros((N, 3)), np.zeros((M, 2)))]
         if len(results.steps) > 1:
@@ -99,7 +83,8 @@ class _CalibrationUncertainty:
             of_triangles[~np.isfinite(deformed.J)] = np.nan
             rows.append((of_points[:, :3], of_points[:, 3:], of_triangles))
         names = ("sigma_calibration", "sigma_displacement_calibration", "sigma_lambda_calibration")
-        return {name: np.stack(values) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
+        arrays: dict[str, Any] = dict(zip(names, map(np.stack, zip(*rows, strict=True)), strict=True))
+        return replace(results, **arrays)
 
 
 class _Nearest:

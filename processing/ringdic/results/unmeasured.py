@@ -75,12 +75,8 @@ REASONS = (
     _reason(UncountedPlace.RIM, "at the edge of the pattern", "extend the pattern beyond what is to be measured"),
 )
 _BY_NAME = {reason.name: reason for reason in REASONS}
-_BY_CODE = {reason.code: reason for reason in REASONS}
-
-
-def reason_of(code: int) -> Reason:
-    """The reason that a status stands for."""
-    return _BY_CODE[code]
+#: All reasons by the status that stands for them.
+BY_CODE = {reason.code: reason for reason in REASONS}
 
 
 @dataclass(frozen=True)
@@ -119,7 +115,7 @@ def unmeasured_areas(places: Sequence[UnmeasuredPlaces], measured_mm2: float) ->
     return {
         "total_cm2": round(sum(area[code] for code in counted), 2),
         "measured_cm2": round(0.01 * measured_mm2, 2),
-        "by_reason": {reason_of(code).name: round(area[code], 2) for code in counted},
+        "by_reason": {BY_CODE[code].name: round(area[code], 2) for code in counted},
         "seen_by_one_cm2": round(area.get(UncountedPlace.ONE_VIEW, 0.0), 2),
         "rim_cm2": round(area.get(UncountedPlace.RIM, 0.0), 2),
     }

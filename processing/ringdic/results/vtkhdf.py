@@ -68,15 +68,14 @@ def write_step(
             _array(group, place, name, values)[step * len(values) : (step + 1) * len(values)] = values
 
 
-def write_constant(group: h5py.Group, place: str, name: str, values: NDArray[np.generic]) -> None:
-    """Write an array that is the same at every step.
+def write_constant(group: h5py.Group, name: str, values: NDArray[np.generic]) -> None:
+    """Write an array of the triangles that is the same at every step.
 
-    place : "PointData" for an array of the vertices, "CellData" for one of the triangles.
-    values : (N, ...) or (M, ...), in the unit of the field of this name.
+    values : (M, ...), in the unit of the field of this name.
     """
-    group[place].create_dataset(name, data=values)
+    group["CellData"].create_dataset(name, data=values)
     steps = int(group["Steps"].attrs["NSteps"])
-    group["Steps"][f"{place}Offsets"].create_dataset(name, data=np.zeros(steps, dtype=np.int64))
+    group["Steps/CellDataOffsets"].create_dataset(name, data=np.zeros(steps, dtype=np.int64))
 
 
 def read_step(group: h5py.Group, place: str, name: str, step: int) -> NDArray[np.generic]:

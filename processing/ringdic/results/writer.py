@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from ringdic.arrays import Floats, Points
 from ringdic.results import vtkhdf
 from ringdic.results.fields import StepFields, available, compute_fields
-from ringdic.results.json_values import json_value
 from ringdic.results.layout import CONSTANT_ARRAYS, SCHEMA, STEP_ARRAYS
 from ringdic.results.ranges import Extent, Ranges
 from ringdic.results.results import MATCH_ARRAYS, Matches, Results
-from ringdic.results.series import InMemorySeries, Series
+from ringdic.results.series import select_steps
+from ringdic.session.json_values import json_value
 from ringdic.strain.deformation import Deformation
 from ringdic.strain.rigid_motion import RigidMotion
 from ringdic.strain.window import strain_window
@@ -34,36 +34,42 @@ from ringdic.strain.window import strain_window
 T = TypeVar("T")
 
 
-def write_results(path: Path, results: Results, progress: Callable[[float], None] = lambda _: None) -> None:
+def write_results(path: Path, results: Results) -> None:
     """Compute the fields of all steps and write the file.
 
-    path : of the new file; FileExistsError where there is one. progress : called with the share done, 0 to 1.
+    path : of the new file; FileExistsError where there is one.
     """
-    write_series(path, InMemorySeries(results), progress, results.calibration, results.summary)
+
+    def at(step: int) -> Results:
+        return select_steps(results, [0, step] if step else [0])
+
+    write_steps(path, results.steps, at, lambda _: None, results.calibration, results.summary)
 
 
-def write_series(
+def write_steps(
     path: Path,
-    series: Series,
+    names: Sequence[str],
+    at: Callable[[int], Results],
     progress: Callable[[float], None],
     calibration: dict[str, Any],
     summary: dict[str, Any],
 ) -> None:
-    """Compute the fields of a series of steps and write the file, with no more than a few steps in memory at a time.
+    """Compute the fields of some steps and write the file, with no more than a few steps in memory at a time.
 
-    path : of the new file; FileExistsError where there is one. progress : called with the share done, 0 to 1.
-    calibration, summary : JSON values.
+    path : of the new file; FileExistsError where there is one. names : (F,) capture ids of the steps. at : function
+    that returns the results of the reference and of a later step; for step 0 those of the reference alone.
+    progress : called with the share done, 0 to 1. calibration, summary : JSON values.
     """
-    with ResultsWriter(path, series.reference, series.names) as file:
+    with ResultsWriter(path, at(0), names) as file:
 
         def step_record(step: int) -> StepRecord:
-            results = series.at(step)
+            results = at(step)
             last = len(results.steps) - 1
             return file.record(results, results.motion(last), results.deformation(last))
 
-        for step, record in enumerate(map_in_order(step_record, range(len(series.names)))):
+        for step, record in enumerate(map_in_order(step_record, range(len(names)))):
             file.write(step, record)
-            progress((step + 1) / len(series.names))
+            progress((step + 1) / len(names))
         file.finish(calibration, summary)
 
 
@@ -116,7 +122,7 @@ class ResultsWriter:
         self._file = h5py.File(path, "x")
         self._group = vtkhdf.create_group(self._file, reference.faces, len(reference.vertices_ref), len(self._names))
         for name in CONSTANT_ARRAYS:
-            vtkhdf.write_constant(self._group, "CellData", name, first.face[name].astype(np.float32))
+            vtkhdf.write_constant(self._group, name, first.face[name].astype(np.float32))
         self._own = self._file.create_group("ringdic")
         for k, matches in enumerate(reference.matches):
             self._begin(self._own.create_group(f"matches/{k}"), matches)

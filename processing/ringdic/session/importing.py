@@ -38,8 +38,6 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm")
 #: more views than another.
 _COMPLETE = {"specimen": "step", "static": "capture"}
 
-Progress = Callable[[int, int, str], None]
-
 
 @dataclass(frozen=True)
 class _View:
@@ -55,7 +53,6 @@ def import_images(
     src: Path,
     session: Path,
     *,
-    progress: Progress | None = None,
     wall_ns: Callable[[], int] = time.time_ns,
 ) -> Path:
     """Create a session folder from a folder of images, after checking every image.
@@ -64,7 +61,6 @@ def import_images(
     ----------
     src : the folder that holds ``rig.toml`` and the images.
     session : the session folder to create; it must not exist.
-    progress : called with images checked, images in all, and a file's name.
     wall_ns : the time that is written into the records, ns since the Unix epoch.
 
     Returns
@@ -84,7 +80,7 @@ def import_images(
         raise InputError(f"{src}: no such folder; give the folder that holds rig.toml and the images")
     rig = read_rig(src / "rig.toml")
     views = _views(src, rig)
-    sizes = _checked_sizes(views, progress or (lambda done, total, name: None))
+    sizes = _checked_sizes(views)
     masks = _checked_masks(src, rig, sizes)
     session.parent.mkdir(parents=True, exist_ok=True)
     partial = session.with_name(f"{PARTIAL}{session.name}-{os.getpid()}")
@@ -168,15 +164,14 @@ def _warn_of_unknown_cameras(folder: Path, rig: Rig) -> None:
             log.warning("%s is left out: rig.toml has no camera '%s'", path, path.name)
 
 
-def _checked_sizes(views: Sequence[_View], progress: Progress) -> dict[str, tuple[int, int]]:
+def _checked_sizes(views: Sequence[_View]) -> dict[str, tuple[int, int]]:
     """Decode every image; the size of each camera's images, (height, width) px.
 
     InputError where an image is damaged, or two images of a camera differ in size.
     """
     sizes: dict[str, tuple[int, int]] = {}
     first: dict[str, Path] = {}
-    for done, view in enumerate(views):
-        progress(done, len(views), view.path.name)
+    for view in views:
         height, width = read_gray(view.path).shape
         known = sizes.setdefault(view.camera, (height, width))
         first.setdefault(view.camera, view.path)
@@ -185,7 +180,6 @@ def _checked_sizes(views: Sequence[_View], progress: Progress) -> dict[str, tupl
                 f"{view.path}: {width} x {height} px, but {first[view.camera]} of the same "
                 f"camera '{view.camera}' has {known[1]} x {known[0]} px; all images of a camera must have one size"
             )
-    progress(len(views), len(views), "")
     return sizes
 
 

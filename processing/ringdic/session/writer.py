@@ -374,27 +374,5 @@ class CaptureWriter:
         replace_json(self._record_path, record.to_json())
 
 
-def verify(session: Path) -> list[str]:
-    """Check all images of a session folder against their recorded checksums; returns a sentence for each fault."""
-    problems = []
-    for path in sorted(Path(session).glob("captures/*/capture.json")):
-        record = read_capture_record(path)
-        recorded = {"capture.json"}
-        for camera, entry in record.cameras.items():
-            if entry.file is None:
-                continue
-            recorded.add(entry.file)
-            where = f"{record.capture_id}/{entry.file}"
-            image = path.parent / entry.file
-            if not image.is_file():
-                problems.append(f"{where}: the image of camera {camera} is missing")
-            elif hashlib.sha256(image.read_bytes()).hexdigest() != entry.sha256:
-                problems.append(f"{where}: the image of camera {camera} differs from its checksum")
-        for image in path.parent.iterdir():
-            if image.name not in recorded:
-                problems.append(f"{record.capture_id}/{image.name}: the record does not know this file")
-    return problems
-
-
 def _iso(wall_ns: int) -> str:
     return datetime.fromtimestamp(wall_ns / 1e9, UTC).isoformat(timespec="milliseconds")

@@ -17,8 +17,6 @@ from ringdic.arrays import Floats, Indices, Points, Vectors
 from ringdic.strain import families as strain
 from ringdic.strain import kernels
 
-_I = np.eye(3)
-
 
 @dataclass(frozen=True)
 class Deformation:
@@ -39,8 +37,6 @@ class Deformation:
         the sign is arbitrary, direction 2 is normal × direction 1.
     direction1_current, direction2_current : (..., M, 3) unit principal directions in the current configuration, the
         images of the reference ones.
-    shear_direction_reference, shear_direction_current : (..., M, 2, 3) the two lines of largest shear, ± 45° from the
-        principal directions of that configuration.
     directors_reference : (M, 3, 3); directors_current : (..., M, 3, 3) mm, rows D1 D2 and the unit normal.
     area : (M,) mm², reference. isotropy : (..., M) shape, 1 equilateral … 0 degenerate, current.
     normal_reference : (M, 3); normal_current : (..., M, 3), unit normals.
@@ -86,22 +82,22 @@ class Deformation:
     @property
     def E_magnitude(self) -> Floats:
         """Frobenius norm of the Green-Lagrange strain, (..., M) without unit."""
-        return _norm(self.E)
+        return strain.magnitude(self.E1, self.E2)
 
     @property
     def e_magnitude(self) -> Floats:
         """Frobenius norm of the Euler-Almansi strain, (..., M) without unit."""
-        return _norm(self.e)
+        return strain.magnitude(self.e1, self.e2)
 
     @property
     def E_equivalent(self) -> Floats:
         """Equivalent strain √(⅔ dev:dev) of the Green-Lagrange strain, (..., M) without unit."""
-        return _equivalent(self.E)
+        return strain.equivalent(self.E1, self.E2)
 
     @property
     def e_equivalent(self) -> Floats:
         """Equivalent strain √(⅔ dev:dev) of the Euler-Almansi strain, (..., M) without unit."""
-        return _equivalent(self.e)
+        return strain.equivalent(self.e1, self.e2)
 
     @property
     def E_shear(self) -> Floats:
@@ -112,16 +108,6 @@ class Deformation:
     def e_shear(self) -> Floats:
         """Largest in-plane shear strain of the Euler-Almansi strain, (..., M) without unit."""
         return strain.shear(self.e1, self.e2)
-
-    @property
-    def shear_direction_reference(self) -> Vectors:
-        """Directions of the two lines of largest shear in the reference configuration, (..., M, 2, 3) unit vectors."""
-        return _diagonals(self.direction1_reference, self.direction2_reference)
-
-    @property
-    def shear_direction_current(self) -> Vectors:
-        """Directions of the two lines of largest shear in the current configuration, (..., M, 2, 3) unit vectors."""
-        return _diagonals(self.direction1_current, self.direction2_current)
 
     @property
     def normal_reference(self) -> Vectors:
@@ -204,19 +190,3 @@ def isotropy(vertices: Points, faces: Indices) -> Floats:
 def _matrices(tensors: Floats) -> Floats:
     """Contiguous tensors (..., 3, 3) as one list (n, 3, 3), a view that shares their memory."""
     return tensors.reshape(-1, 3, 3)
-
-
-def _norm(T: Floats) -> Floats:
-    """Frobenius norms (...) of tensors (..., 3, 3)."""
-    return np.sqrt(np.einsum("...ij,...ij->...", T, T))
-
-
-def _equivalent(T: Floats) -> Floats:
-    """Equivalent strains √(⅔ dev:dev) (...) of tensors (..., 3, 3)."""
-    deviator = T - np.einsum("...ii->...", T)[..., None, None] / 3.0 * _I
-    return np.sqrt(2.0 / 3.0) * _norm(deviator)
-
-
-def _diagonals(first: Vectors, second: Vectors) -> Vectors:
-    """Unit vectors (..., 2, 3) at ± 45° to two perpendicular unit vectors (..., 3), in their plane."""
-    return np.stack([first + second, second - first], axis=-2) / np.sqrt(2.0)

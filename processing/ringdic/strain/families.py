@@ -29,30 +29,13 @@ GREEN_LAGRANGE, BIOT, HENCKY, EULER_ALMANSI = 1.0, 0.5, 0.0, -1.0
 _LOGARITHMIC = 1e-18  # an exponent below it gives ln λ to all digits, and products with it might underflow
 
 
-def seth_hill(stretch: Floats, m: float) -> Floats:
-    """Principal strains of the Seth-Hill family: ``(λ^(2m) - 1) / (2m)``, and ``ln λ`` for m = 0.
-
-    stretch : (..., M) principal stretches λ. Returns (..., M) without unit. Computed by ``expm1`` of the logarithm, so
-    that small strains keep their digits and small m approaches the logarithm smoothly.
-    """
-    return seth_hill_of_log(np.log(stretch), m)
-
-
 def seth_hill_of_log(log: Floats, m: float) -> Floats:
     """Principal strains of the Seth-Hill family from the logarithms of the principal stretches.
 
-    log : (..., M) ln λ. Returns ``(exp(2 m ln λ) - 1) / (2m)``, (..., M) without unit.
+    log : (..., M) ln λ. Returns ``(exp(2 m ln λ) - 1) / (2m)``, (..., M) without unit. Computed by ``expm1``, so that
+    small strains keep their digits and small m approaches the logarithm smoothly.
     """
     return log if abs(m) < _LOGARITHMIC else np.expm1(2.0 * m * log) / (2.0 * m)
-
-
-def bazant(stretch: Floats, m: float) -> Floats:
-    """Principal strains of Bažant's (1998) symmetric family: ``(λ^m - λ^-m) / (2m)``, and ``ln λ`` for m = 0.
-
-    stretch : (..., M) principal stretches λ. Returns (..., M) without unit; inverse stretches have opposite strains.
-    """
-    log = np.log(stretch)
-    return log if abs(m) < _LOGARITHMIC else np.sinh(m * log) / m
 
 
 def magnitude(first: Floats, second: Floats) -> Floats:
@@ -79,28 +62,10 @@ def shear(first: Floats, second: Floats) -> Floats:
     return 0.5 * (second - first)
 
 
-def tensor(first: Floats, second: Floats, direction1: Vectors, direction2: Vectors) -> Floats:
-    """Cartesian strain tensor of two principal strains, ``first N1 ⊗ N1 + second N2 ⊗ N2``.
-
-    first, second : (...) principal strains. direction1, direction2 : (..., 3) unit principal directions N1, N2.
-    Returns (..., 3, 3).
-    """
-    return first[..., None, None] * _square(direction1) + second[..., None, None] * _square(direction2)
-
-
-def infinitesimal(F: Floats, normal_reference: Vectors) -> Floats:
-    """Linear strain ``½ (F + Fᵀ) - I``, projected onto the tangent plane of the reference.
-
-    A rotation by φ gives it a strain ``cos φ - 1``: remove the rigid motion first, and use it for small rotations only.
-    F : (..., 3, 3) deformation gradient. normal_reference : (..., 3) unit normals. Returns (..., 3, 3) without unit.
-    """
-    in_plane = np.eye(3) - _square(normal_reference)
-    linear = 0.5 * (F + np.swapaxes(F, -1, -2)) - np.eye(3)
-    return np.asarray(in_plane @ linear @ in_plane)
-
-
 def infinitesimal_principal(F: Floats, normal_reference: Vectors, turn: Floats | None = None) -> tuple[Floats, Floats]:
     """Principal values of the linear strain ``½ (F + Fᵀ) - I`` in the tangent plane of the reference.
+
+    A rotation by φ gives it a strain ``cos φ - 1``: it is for small rotations only, after the rigid motion is removed.
 
     Parameters
     ----------
@@ -119,8 +84,3 @@ def infinitesimal_principal(F: Floats, normal_reference: Vectors, turn: Floats |
     tensors = np.ascontiguousarray(F, dtype=float).reshape(-1, 3, 3)
     linear_principal(turn, tensors, normal.reshape(-1, 3), out.reshape(2, -1))
     return out[0], out[1]
-
-
-def _square(direction: Vectors) -> Floats:
-    """Dyads ``N ⊗ N`` (..., 3, 3) of vectors N (..., 3)."""
-    return direction[..., :, None] * direction[..., None, :]

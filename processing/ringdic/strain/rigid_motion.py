@@ -34,40 +34,33 @@ class RigidMotion:
         return float(np.arctan2(sine, 0.5 * (np.trace(self.R) - 1.0)))
 
 
-def kabsch(source: Points, destination: Points, weights: Floats | None = None) -> RigidMotion:
-    """Rigid motion that takes points ``source`` to ``destination`` with the least weighted sum of squared distances.
+def kabsch(source: Points, destination: Points) -> RigidMotion:
+    """Rigid motion that takes points ``source`` to ``destination`` with the least sum of squared distances.
 
-    Parameters
-    ----------
-    source, destination : (n, 3) mm; a point that is NaN in either is ignored.
-    weights : (n,) without unit, or None for equal weights.
-
-    Raises
-    ------
-    ValueError : fewer than three common points.
+    source, destination : (n, 3) mm; a point that is NaN in either is ignored. Raises ValueError for fewer than three
+    common points.
     """
     source, destination = np.asarray(source, dtype=float), np.asarray(destination, dtype=float)
-    weights = np.ones(len(source)) if weights is None else np.asarray(weights, dtype=float)
-    common = np.isfinite(source).all(axis=1) & np.isfinite(destination).all(axis=1) & (weights > 0)
+    common = np.isfinite(source).all(axis=1) & np.isfinite(destination).all(axis=1)
     if common.sum() < 3:
         raise ValueError(f"a rigid motion needs three points common to both sets; here are {common.sum()}")
-    p, q, w = source[common], destination[common], weights[common] / weights[common].sum()
-    p_mean, q_mean = w @ p, w @ q
-    U, _, Vt = np.linalg.svd((p - p_mean).T @ ((q - q_mean) * w[:, None]))
+    p, q = source[common], destination[common]
+    p_mean, q_mean = p.mean(axis=0), q.mean(axis=0)
+    U, _, Vt = np.linalg.svd((p - p_mean).T @ (q - q_mean))
     reflection = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
     R = Vt.T @ np.diag([1.0, 1.0, reflection]) @ U.T
     return RigidMotion(R, q_mean - R @ p_mean)
 
 
-def motion_to_reference(reference: Points, current: Points, weights: Floats | None = None) -> RigidMotion:
+def motion_to_reference(reference: Points, current: Points) -> RigidMotion:
     """Least-squares rigid motion that takes the current configuration back onto the reference.
 
-    reference, current : (n, 3) mm, NaN where lost. weights : (n,) without unit, or None for equal weights.
+    reference, current : (n, 3) mm, NaN where lost.
 
     ``motion.apply(current) - reference`` is the displacement without rigid motion. The identity is returned where fewer
     than three points are common to both.
     """
     try:
-        return kabsch(current, reference, weights)
+        return kabsch(current, reference)
     except ValueError:
         return RigidMotion(np.eye(3), np.zeros(3))

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from ringdic.compiled import source_digest
 from ringdic.errors import ComputationError, InputError
 from ringdic.session.records import CameraRecord
 
@@ -127,11 +126,6 @@ def digest(*parts: Any) -> str:
     for piece in _pieces(parts):
         sha.update(piece)
     return sha.hexdigest()[:32]
-
-
-def code_stamp() -> str:
-    """Digest of the source of this package. It is part of every key, so another version computes all outputs again."""
-    return source_digest()
 
 
 def file_digest(path: Path, record: CameraRecord | None = None) -> str:

@@ -102,7 +102,7 @@ def position_sensitivity(
             continue
         errors = np.concatenate([by_camera[c][place[c, index]] for c in seen], axis=2)
         roots = np.concatenate([root[known.ids.index(cameras[c].id)] for c in seen])
-        moved = errors @ roots  # point by point, which no library splits among threads that are busy already
+        moved = (errors.reshape(-1, errors.shape[2]) @ roots).reshape(len(index), 3, -1)
         if tracked_from is not None:
             moved += follows[index] @ tracked_from[1][index]
         out[index] = moved

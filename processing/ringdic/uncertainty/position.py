@@ -20,6 +20,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from ringdic.arrays import Floats, Indices, Points, Vectors
 from ringdic.geometry import kernels
@@ -29,6 +30,21 @@ from ringdic.geometry.camera import Camera, stacked_optics
 Gain = NDArray[np.floating]
 #: Standard deviations (C, n, 2) px of pixels, in single or double precision.
 Deviations = NDArray[np.floating]
+
+_RARE = 0.002  # probability of a χ² from which on it speaks of more than noise and small systematic errors
+
+
+def disagreement(chi2: Floats, degrees: Indices) -> Floats:
+    """Factor by which the standard deviations of points grow where their cameras contradict one another.
+
+    It is 1 for all but two points in a thousand where noise is all that there is, and makes the largest χ² plausible
+    where there is more (the ratio of Birge 1932, for each point).
+
+    chi2 : (n,) sums of squared residuals in units of their standard deviations. degrees : (n,) of freedom of these.
+    Returns (n,) from 1 upwards, without unit; 1 where no camera could contradict.
+    """
+    plausible = chdtri(np.maximum(degrees, 1), _RARE)
+    return np.sqrt(np.maximum(1.0, np.where(degrees > 0, np.nan_to_num(chi2), 0.0) / plausible))
 
 
 def position_gain(cameras: Sequence[Camera], xyz: Points, sigma: Deviations) -> Gain:

@@ -6,7 +6,7 @@ import hashlib
 from dataclasses import replace
 
 import pytest
-from ringdic.session.writer import Archive, verify
+from ringdic.session.writer import Archive
 from ringdic_controller.rig.intake import Intake
 from ringdic_node.wire import CaptureKey, Failure, Manifest
 
@@ -124,7 +124,7 @@ def test_an_image_that_waits_already_takes_no_second_room(tmp_path):
     assert not recorded.intake.holds(manifest_of())
 
 
-def test_images_archived_side_by_side_are_all_in_the_record(tmp_path):
+def test_images_archived_side_by_side_are_all_in_the_record(tmp_path, differing_images):
     cameras = [f"cam_{k:02d}" for k in range(40)]
     recorded = RecordedIntake(tmp_path)
     capture = recorded.session.begin_capture("board", cameras, fire_at_ns=70)
@@ -135,7 +135,7 @@ def test_images_archived_side_by_side_are_all_in_the_record(tmp_path):
     recorded.intake.stop(timeout=30)
     assert sorted(recorded.acks) == [(camera, "archived") for camera in cameras]
     assert {entry.status for entry in capture.record().cameras.values()} == {"ok"}
-    assert verify(recorded.session.path) == []
+    assert differing_images(recorded.session.path) == []
 
 
 def test_whoever_watches_does_not_keep_the_node_waiting(recorded):

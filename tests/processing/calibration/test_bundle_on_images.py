@@ -4,6 +4,8 @@ One table of figures for both ways: control points, diameter, the target moved b
 """
 
 import json
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -58,7 +60,9 @@ def calibrated(folder: Path, rig: Rig, camera: str) -> CameraCalibration:
 
 @pytest.fixture(scope="module")
 def ways(folder, rig) -> Ways:
-    start = {camera.id: calibrated(folder, rig, camera.id) for camera in rig.cameras}
+    names = [camera.id for camera in rig.cameras]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        start = dict(zip(names, pool.map(lambda name: calibrated(folder, rig, name), names), strict=True))
     return Ways(start, bundle_adjustment(start, rig.target)[0])
 
 

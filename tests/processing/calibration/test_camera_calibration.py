@@ -145,12 +145,8 @@ def test_bad_images_are_refused_with_the_camera_s_name(ring_rig, shared_data):
     folder = shared_data / "rendered_ring" / "limb"
     target = grey(folder / "target" / "cam_01.jpg")
     board = grey(folder / "board" / "cam_01" / "000.jpg")
-    with pytest.raises(InputError, match=r"camera cam_01: board image 2 is 600 x 800 pixels"):
-        calibrate_camera(ring_rig, "cam_01", [board, np.zeros((800, 600), np.uint8)], target)
-    done = []
     with pytest.raises(InputError, match=r"camera cam_01: the checkerboard was found in 0 of 2 board images"):
-        calibrate_camera(ring_rig, "cam_01", [target, target], target, progress=lambda i, n: done.append((i, n)))
-    assert done == [(1, 2), (2, 2)]
+        calibrate_camera(ring_rig, "cam_01", [target, target], target)
     with pytest.raises(InputError, match=r"camera cam_01: 0 dots"):
         calibrate_camera(ring_rig, "cam_01", [], board, distortion=False)
 

@@ -8,11 +8,11 @@ import pytest
 from ringdic.calibration.intrinsics import (
     IntrinsicsFit,
     calibrate_intrinsics,
-    intrinsics_to_dict,
     read_intrinsics,
 )
 from ringdic.errors import ComputationError, InputError
 from ringdic.geometry.camera import Intrinsics
+from ringdic.session.json_values import json_value
 
 SIZE = (1232, 1640)
 LENS = Intrinsics(
@@ -113,8 +113,9 @@ def test_the_fit_and_the_file_survive_json(tmp_path):
     fit = calibrate_intrinsics(see(4, 0.05, 1), BOARD, SIZE)
     again = IntrinsicsFit.from_dict(json.loads(json.dumps(fit.to_dict())))
     assert again.to_dict() == fit.to_dict()
+    assert "inliers" not in fit.to_dict()  # stored once, as "kept"
     path = tmp_path / "lens.json"
-    path.write_text(json.dumps(intrinsics_to_dict(LENS)))
+    path.write_text(json.dumps(json_value(LENS)))
     assert np.array_equal(values(read_intrinsics(path)), values(LENS))
     path.write_text('{"K": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}')
     with pytest.raises(InputError, match=r"lens\.json: not usable as intrinsics"):

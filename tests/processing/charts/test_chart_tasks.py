@@ -162,8 +162,12 @@ def test_another_calibration_makes_all_anew(session: Path) -> None:
     assert set(keys(session)).isdisjoint(keys(session, **{camera.id: moved}))
 
 
-def test_no_image_is_decoded_and_no_map_or_surface_read_twice(session: Path) -> None:
+def test_no_image_is_decoded_and_no_map_or_surface_read_twice(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded: list[int] = []
+    decode = cv2.imdecode
+    monkeypatch.setattr(cv2, "imdecode", lambda data, flags: decoded.append(len(data)) or decode(data, flags))
     before = process_memory.computations
     process_session(session, SETTINGS, executor=LocalExecutor(2))
-    images, references, depth_maps, surfaces = 2 * STEPS, 2, 2, 1
+    assert len(decoded) == 2 * STEPS
+    images, references, depth_maps, surfaces = 2, 2, 2, 1  # later images serve one task each and are not kept
     assert process_memory.computations - before == images + references + depth_maps + surfaces

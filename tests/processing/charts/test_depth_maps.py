@@ -1,6 +1,7 @@
 """Depth maps and charts of a rendered limb, whose truth is a formula: nothing is told of its shape or place."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ from ringdic.charts.images import ChartImages
 from ringdic.charts.matching import ChartMatches, match_chart
 from ringdic.charts.patches import Patches, optical_axis
 from ringdic.charts.plane_sweep import DepthRange
-from ringdic.charts.views import ChartPlan, chart_region, grid_to_the_border, plan_chart
+from ringdic.charts.views import ChartPlan, MappedSurface, chart_region, grid_to_the_border, plan_chart
 from ringdic.correlation import CorrelationSettings, Status, grid
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.geometry.outliers import LostPoint
@@ -56,7 +57,8 @@ def maps(images: list[np.ndarray]) -> list[DepthMap]:
 
 @pytest.fixture(scope="module")
 def plans(maps: list[DepthMap]) -> list[ChartPlan]:
-    return [plan_chart(k, CAMERAS, maps, 65.0, PARTNERS[k]) for k in range(3)]
+    surfaces = {k: MappedSurface(CAMERAS[k], depth_map) for k, depth_map in enumerate(maps)}
+    return [plan_chart(k, surfaces, 65.0, PARTNERS[k]) for k in range(3)]
 
 
 @pytest.fixture(scope="module")
@@ -103,12 +105,12 @@ def test_each_camera_gets_what_it_faces_most_squarely(maps: list[DepthMap], plan
     for k, (depth_map, plan) in enumerate(zip(maps, plans, strict=True)):
         xyz = places(k, depth_map)[plan.inside]
         azimuth.append(np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])))
-        assert not plan.sees[:, k].any()
+        assert k not in plan.sees
     assert np.percentile(azimuth[0], 95) < 15.0 + 10.0
     assert np.percentile(np.abs(azimuth[1] - 30.0), 95) < 15.0 + 10.0
     assert np.percentile(azimuth[2], 5) > 45.0 - 10.0
     assert np.histogram(np.concatenate(azimuth), np.arange(-20.0, 81.0, 10.0))[0].min() > 20
-    assert plans[1].sees[plans[1].inside][:, [0, 2]].all(axis=1).mean() > 0.6
+    assert (plans[1].sees[0] & plans[1].sees[2])[plans[1].inside].mean() > 0.6
 
 
 def test_a_chart_is_matched_without_the_bias_of_flat_subsets(middle: ChartMatches, figures: Callable) -> None:
@@ -215,6 +217,24 @@ def test_subsets_keep_away_from_the_silhouette_and_no_point_lies_beyond_their_pi
     assert max(from_border) <= 6
     assert points[subsets].mean() > 0.99
     assert not points[~subsets].any()
+
+
+def test_twice_as_fine_pixels_show_the_same_pattern() -> None:
+    grey, plate = speckled_plate()
+    patches = replace(plate.patches, px=2.0 * plate.patches.px + 0.5)
+    textured = 2.0 * plate.textured + 0.5
+    finer = replace(plate, spacing=2 * plate.spacing, patches=patches, textured=textured)
+    doubled = np.repeat(np.repeat(grey, 2, axis=0), 2, axis=1)
+    for once, twice in zip(
+        chart_region(grey, plate, np.ones(len(patches.px), bool), 10),
+        chart_region(doubled, finer, np.ones(len(patches.px), bool), 20),
+        strict=True,
+    ):
+        rows, columns = (np.flatnonzero(once.any(axis=axis)) for axis in (1, 0))
+        finer_rows, finer_columns = (np.flatnonzero(twice.any(axis=axis)) for axis in (1, 0))
+        for one, other in ((rows, finer_rows), (columns, finer_columns)):
+            assert np.abs(2 * one[[0, -1]] + 0.5 - other[[0, -1]]).max() <= 1.5
+        assert twice.sum() == pytest.approx(4 * once.sum(), rel=0.02)
 
 
 def test_a_gap_between_speckles_belongs_to_the_pattern_and_a_hole_as_large_as_a_subset_does_not() -> None:

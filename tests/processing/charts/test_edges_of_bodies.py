@@ -10,7 +10,7 @@ from ringdic.charts.images import ChartImages
 from ringdic.charts.matching import match_chart
 from ringdic.charts.plane_sweep import DepthRange
 from ringdic.charts.surface import ReferenceSurface, reference_surface
-from ringdic.charts.views import plan_chart
+from ringdic.charts.views import MappedSurface, plan_chart
 from ringdic.correlation import CorrelationSettings
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.uncertainty.position import covariance, position_gain
@@ -51,9 +51,7 @@ def measured(body: str, k: int, partners: list[int]) -> Measured:
     reduced = DepthImages.of(CAMERAS, grey.__getitem__, SETTINGS)
     order = {c: sorted(set(grey) - {c}, key=lambda other, c=c: abs(other - c)) for c in grey}
     maps = {c: measure_depths(reduced, c, order[c], space, None) for c in grey}
-    empty = measure_depths(DepthImages.of(CAMERAS, lambda _: np.full_like(grey[k], 90), SETTINGS), k, [], space, None)
-    listed = [maps.get(c, empty) for c in range(len(CAMERAS))]
-    plan = plan_chart(k, CAMERAS, listed, 65.0, order[k])
+    plan = plan_chart(k, {c: MappedSurface(CAMERAS[c], depth_map) for c, depth_map in maps.items()}, 65.0, order[k])
     images = ChartImages(CAMERAS, grey.__getitem__, SETTINGS)
     matches = match_chart(images, k, maps[k], plan, None)
     noise = np.array([maps[c].grey_noise for c in matches.cameras])

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-COMMAND = "import sys; {}; sys.argv = ['ringdic', *{}]; from ringdic.__main__ import main; main()"
+COMMAND = "import sys; {}\nsys.argv = ['ringdic', *{}]; from ringdic.__main__ import main; main()"
 
 
 def run(prepare: str, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -33,6 +33,14 @@ application()
 print({"numpy", "numba", "cv2", "scipy", "pydantic", "fastapi", "zenoh"} & set(sys.modules))"""
     done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.strip() == "set()"
+
+
+def test_the_command_has_one_thread_for_linear_algebra_before_numpy_is_loaded() -> None:
+    prepare = """import atexit, os, ringdic.__main__
+assert "numpy" not in sys.modules
+os.environ.pop("OPENBLAS_NUM_THREADS", None)
+atexit.register(lambda: print("threads", os.environ["OPENBLAS_NUM_THREADS"]))"""
+    assert "threads 1" in run(prepare, "--help").stdout
 
 
 def test_where_only_a_node_is_installed_the_command_names_the_extra() -> None:

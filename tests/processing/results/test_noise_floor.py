@@ -32,7 +32,7 @@ def sheet_at_rest() -> Results:
 
 
 def test_the_noise_that_was_put_in_is_what_is_found() -> None:
-    floor = noise_floor(select_steps(sheet_at_rest(), [0, 1]))
+    floor = noise_floor([select_steps(sheet_at_rest(), [0, 1])])
     found = floor["quantities"]
     count = SIDE * SIDE
     for axis in "xyz":
@@ -47,7 +47,7 @@ def test_the_noise_that_was_put_in_is_what_is_found() -> None:
 
 
 def test_a_common_motion_counts_as_moved_and_not_as_noise_of_the_shape() -> None:
-    floor = noise_floor(sheet_at_rest())
+    floor = noise_floor([select_steps(sheet_at_rest(), [0, k]) for k in (1, 2)])
     assert floor["moved_mm"] == pytest.approx(np.linalg.norm(SHIFT), rel=0.01)
     assert floor["quantities"]["displacement_x"]["rms"] > SHIFT[0] / 2
     assert floor["quantities"]["displacement_rest"]["rms"] == pytest.approx(np.sqrt(3) * SIGMA, rel=0.05)

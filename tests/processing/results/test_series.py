@@ -1,4 +1,4 @@
-"""Steps taken out of results and put together again, and the cache of values on disk."""
+"""Steps taken out of results, and the cache of values on disk."""
 
 from pathlib import Path
 from threading import Thread
@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from ringdic.results.fields import OPTIONAL_ARRAYS
 from ringdic.results.results import Matches, Results
-from ringdic.results.series import InMemorySeries, StepCache, join_steps, select_steps
-from ringdic.results.uncertainty import StepUncertainty
+from ringdic.results.series import StepCache, select_steps
 
 F, N = 4, 6
 
@@ -50,20 +49,6 @@ def test_a_part_of_the_steps_keeps_everything_that_belongs_to_them() -> None:
     assert part.chi2 is None
     with pytest.raises(ValueError, match="step 0"):
         select_steps(whole, [1, 2])
-
-
-def test_the_steps_of_results_one_by_one_are_the_results() -> None:
-    whole = some_results()
-    series = InMemorySeries(whole)
-    same(join_steps([series.at(k) for k in range(F)]), whole)
-    same(select_steps(join_steps([series.at(0), series.at(3)]), [0, 1]), select_steps(whole, [0, 3]))
-    assert series.without_matches().at(1).matches == ()
-
-
-def test_what_is_known_of_the_uncertainty_is_left_as_it_is() -> None:
-    whole = some_results()
-    uncertainty = StepUncertainty(InMemorySeries(whole).reference, None)
-    same(uncertainty.complete(InMemorySeries(whole).at(2)), select_steps(whole, [0, 2]))
 
 
 def test_cached_values_come_back_whichever_thread_asks(tmp_path: Path) -> None:

@@ -22,11 +22,12 @@ from ringdic.charts.series import SurfaceSeries, camera_view
 from ringdic.charts.surface import ReferenceSurface, reference_surface
 from ringdic.charts.tracked_points import tracked_points
 from ringdic.charts.tracking import CameraMatches, match_in_two_passes, surface_grid
-from ringdic.charts.views import plan_chart
+from ringdic.charts.views import MappedSurface, plan_chart
 from ringdic.correlation import CorrelationSettings, prepare_reference
 from ringdic.geometry.camera import Camera, Intrinsics
+from ringdic.results.fields import OPTIONAL_ARRAYS
 from ringdic.results.results import Results
-from ringdic.results.series import StepCache, join_steps
+from ringdic.results.series import StepCache
 from ringdic.settings import Settings
 from ringdic_node.virtual_rig.lens import VirtualCamera
 from ringdic_node.virtual_rig.render import radiance
@@ -158,8 +159,9 @@ def measure(
     maps = [measure_depths(reduced, k, others[k], space, None) for k in range(len(cameras))]
     images = ChartImages(cameras, lambda k: grey[k, 0], CORRELATION)
     charts = []
+    surfaces = {k: MappedSurface(cameras[k], depth_map) for k, depth_map in enumerate(maps)}
     for k, seen_by in partners.items():
-        plan = plan_chart(k, cameras, maps, 65.0, seen_by, whole=not curved)
+        plan = plan_chart(k, surfaces, 65.0, seen_by, whole=not curved)
         matches = match_chart(images, k, maps[k], plan, None, curved=curved)
         charts.append(chart_with_uncertainty(images, matches, np.array([maps[c].grey_noise for c in matches.cameras])))
     surface = reference_surface(cameras, charts, CORRELATION.step, 0.05)
@@ -170,7 +172,14 @@ def measure(
         "patch", cameras, list(pairwise(ids)), [ids[k] for k in partners], [str(step) for step in range(STEPS)],
         surface, lambda camera, step: later[camera][step - 1], Settings(method=method), StepCache(Path(gettempdir())),
     )  # fmt: skip
-    return Run(surface, join_steps([series.at(k) for k in range(STEPS)]))
+    return Run(surface, joined([series.at(k) for k in range(STEPS)]))
+
+
+def joined(parts: list[Results]) -> Results:
+    """Results of all steps from those of the single ones, without matches in the images."""
+    names = ("vertices", "correlation", "sigma_xyz", "status", *OPTIONAL_ARRAYS)
+    arrays = {n: np.stack([getattr(p, n)[-1] for p in parts]) for n in names if getattr(parts[0], n) is not None}
+    return replace(parts[0], steps=tuple(part.steps[-1] for part in parts), matches=(), **arrays)
 
 
 def noise_of_matches(surface: ReferenceSurface, charts: list[Chart]) -> np.ndarray:

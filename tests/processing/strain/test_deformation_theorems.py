@@ -72,7 +72,6 @@ def test_uniaxial_tension_has_the_textbook_numbers() -> None:
     np.testing.assert_allclose(fields.E_equivalent, 2 / 3 * E, atol=1e-13)
     np.testing.assert_allclose(fields.E_shear, E / 2, atol=1e-13)
     np.testing.assert_allclose(np.abs(fields.direction2_reference[:, 0]), 1.0, atol=1e-13)
-    np.testing.assert_allclose(np.abs(fields.shear_direction_reference[..., :2]), np.sqrt(0.5), atol=1e-13)
     np.testing.assert_allclose(np.abs(fields.normal_current[:, 2]), 1.0, atol=1e-13)
 
 
@@ -155,14 +154,6 @@ def test_a_rigid_motion_is_found_even_with_lost_points(vector: tuple, shift: tup
 def test_mirrored_points_do_not_make_a_reflection() -> None:
     source = np.random.default_rng(1).uniform(-50, 50, (30, 3))
     assert np.linalg.det(kabsch(source, source * [1, 1, -1]).R) == pytest.approx(1.0)
-
-
-def test_points_of_no_weight_do_not_pull() -> None:
-    source = np.random.default_rng(1).uniform(-50, 50, (30, 3))
-    destination = source + np.array([1.0, 2.0, 3.0])
-    destination[:5] += 40.0
-    motion = kabsch(source, destination, np.r_[np.zeros(5), np.ones(25)])
-    np.testing.assert_allclose(motion.t, [1, 2, 3], atol=1e-11)
 
 
 def test_too_few_common_points_are_an_error_and_no_motion_is_removed() -> None:

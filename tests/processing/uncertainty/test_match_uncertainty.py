@@ -57,8 +57,10 @@ def test_what_the_noise_does_not_explain_is_systematic_and_what_it_does_is_not()
     np.testing.assert_allclose(parts.reference[0] ** 2 + 0.85 * parts.current[0] ** 2, sigma[0] ** 2, rtol=1e-9)
     # A residual below the noise that was told: the residual counts.
     np.testing.assert_allclose(parts.reference[1] ** 2 + 0.85 * parts.current[1] ** 2, sigma[1] ** 2, rtol=1e-9)
-    # Two thirds of this residual are no noise; on the edges they count 0.7 × 5 times.
-    np.testing.assert_allclose(parts.systematic[2], sigma[2] * np.sqrt(0.7 * 5.0 * 2.0 / 3.0), rtol=1e-9)
+    # Two thirds of this residual are no noise; on the edges they count 5 times, of which a share remains.
+    between = match_uncertainty(sigma, c_ls, (texture, texture), (4.0, 4.0), np.zeros((3, 2, 2)))
+    for found, share in ((parts, 0.42), (between, 0.7)):
+        np.testing.assert_allclose(found.systematic[2], sigma[2] * np.sqrt(share * 5.0 * 2.0 / 3.0), rtol=1e-9)
     np.testing.assert_allclose(parts.reference[2] ** 2 + 0.85 * parts.current[2] ** 2, sigma[2] ** 2 / 3, rtol=1e-9)
 
 

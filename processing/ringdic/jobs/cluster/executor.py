@@ -10,9 +10,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from ringdic.compiled import source_digest
 from ringdic.errors import ComputationError, InputError
 from ringdic.jobs.cluster.worker import VISIBLE_S, Handshake, TaskOutcome, inspect, run_task, visible
-from ringdic.tasks import Agenda, OnTaskEnd, Task, code_stamp
+from ringdic.tasks import Agenda, OnTaskEnd, Task
 
 log = logging.getLogger(__name__)
 
@@ -217,6 +218,6 @@ def _handshake(folder: Path) -> Iterator[Handshake]:
     text = uuid.uuid4().hex
     file.write_text(text, encoding="utf-8")
     try:
-        yield Handshake(code_stamp(), file, text)
+        yield Handshake(source_digest(), file, text)
     finally:
         file.unlink(missing_ok=True)

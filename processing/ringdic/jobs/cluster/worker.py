@@ -13,9 +13,10 @@ from typing import Any
 import cv2
 import numba
 
+from ringdic.compiled import source_digest
 from ringdic.correlation.correlate import load_kernels
 from ringdic.errors import InputError
-from ringdic.tasks import Task, TaskReport, code_stamp
+from ringdic.tasks import Task, TaskReport
 
 VISIBLE_S = 60.0  # a shared folder may show a file of another machine with this delay
 _LOOK_S = 0.2
@@ -54,7 +55,7 @@ def inspect(handshake: Handshake) -> str | None:
     with _ready:
         if handshake in _accepted:
             return None
-        if code_stamp() != handshake.stamp:
+        if source_digest() != handshake.stamp:
             return "it runs another version of ringdic; install the same one there"
         if (
             not visible(handshake.file.is_file, handshake.file.parent, limit=10 * _LOOK_S)

@@ -12,16 +12,17 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+from ringdic.compiled import source_digest
 from ringdic.errors import InputError
 from ringdic.jobs.cluster import ClusterExecutor, worker
 from ringdic.jobs.cluster.worker import Handshake, TaskOutcome, inspect, run_task, visible
-from ringdic.tasks import Task, code_stamp, read_output
+from ringdic.tasks import Task, read_output
 
 
 @pytest.fixture
 def handshake(tmp_path: Path) -> Handshake:
     (tmp_path / "sign").write_text("here", encoding="utf-8")
-    return Handshake(code_stamp(), tmp_path / "sign", "here")
+    return Handshake(source_digest(), tmp_path / "sign", "here")
 
 
 def test_a_process_that_sees_the_folder_and_has_the_version_is_fit(handshake: Handshake):
