@@ -301,6 +301,7 @@ def process(
     set: Sequence[str] | Mapping[str, Any] = (),
     progress: ProgressChoice = None,
     cluster: str | None = None,
+    accept: Sequence[str] = (),
 ) -> Run:
     """Process a session: calibrate the cameras, correlate, triangulate, and compute deformation at every step.
 
@@ -313,10 +314,13 @@ def process(
     progress : None shows a bar, False nothing; a function is called with each :class:`ringdic.progress.Progress`.
     cluster : address of a dask scheduler whose workers see the session folder under the same path; this computer
         alone unless given.
+    accept : codes of findings that do not forbid to use the results, such as "camera-moved-unknown"; they are stored
+        with the results as the setting of this name.
 
     Returns
     -------
-    The new run; earlier runs of the session stay as they are. What an interrupted run has matched is not matched again.
+    The new run, whose `Run.verdict` says whether its results can be used; earlier runs of the session stay as they
+    are. What an interrupted run has matched is not matched again.
 
     Raises
     ------
@@ -330,6 +334,8 @@ def process(
     ('0006-specimen', '0007-specimen', '0008-specimen')
     """
     chosen = _settings(settings, set)
+    if accept:
+        chosen = _settings(chosen, {"accept": [*chosen.accept, *accept]})
     path = Path(session) if isinstance(session, str | Path) else session.path
     with _reported(progress) as report:
         report(Progress("prepare", 0.0, "loading the kernels"))
@@ -388,16 +394,19 @@ def _settings(settings: Settings | str | Path | None, changes: Sequence[str] | M
     elif isinstance(changes, str):
         changes = [changes]
     if isinstance(settings, Settings):
-        groups = settings.model_dump(exclude={"method"}).items()
+        above = [_assignment(name, getattr(settings, name)) for name in ("method", "accept")]
+        groups = settings.model_dump(exclude={"method", "accept"}).items()
         own = [_assignment(f"{group}.{name}", value) for group, values in groups for name, value in values.items()]
         if settings.calibration.method == Settings(method=settings.method).calibration.method:
             own.remove(_assignment("calibration.method", settings.calibration.method))  # it follows the method
-        return load_settings(None, [_assignment("method", settings.method), *own, *changes])
+        return load_settings(None, [*above, *own, *changes])
     return load_settings(None if settings is None else Path(settings), list(changes))
 
 
 def _assignment(name: str, value: Any) -> str:
-    """A setting as ``name=value``, where truth is written as in TOML."""
+    """A setting as ``name=value``, where truth and lists are written as in TOML."""
+    if isinstance(value, list | tuple):
+        return f"{name}={[str(each) for each in value]}"
     return f"{name}={str(value).lower() if isinstance(value, bool) else value}"
 
 

@@ -14,10 +14,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic.fields import FieldInfo
 
 from ringdic.errors import InputError
+from ringdic.findings import CODES
 
 #: Of a table in a TOML file: unknown keys are refused, and so are infinite and undefined numbers.
 TABLE = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -145,9 +146,11 @@ class Settings(_Group):
     method : best measures every point by all cameras that see it, with the curvature of the surface and of its
         displacement, after a bundle adjustment of the cameras. paper works as Solav et al. (2018): each camera by the
         direct linear transformation, each pair of neighbouring cameras a surface of its own, flat subsets.
+    accept : codes of findings (`ringdic.findings.CODES`) that do not forbid to use the results.
     """
 
     method: Literal["best", "paper"] = "best"
+    accept: tuple[str, ...] = ()
     correlation: CorrelationGroup = CorrelationGroup()
     calibration: CalibrationGroup = CalibrationGroup()
     surface: SurfaceGroup = SurfaceGroup()
@@ -163,6 +166,14 @@ class Settings(_Group):
         if isinstance(calibration, CalibrationGroup):
             calibration = calibration.model_dump(exclude_unset=True)
         return {**values, "calibration": {"method": "dlt", **calibration}} if isinstance(calibration, dict) else values
+
+    @field_validator("accept")
+    @classmethod
+    def _known_codes(cls, codes: tuple[str, ...]) -> tuple[str, ...]:
+        for code in codes:
+            if code not in CODES:
+                raise ValueError(f"{_nearest(code, list(CODES))} is no code of a finding; known are {', '.join(CODES)}")
+        return codes
 
     @model_validator(mode="after")
     def _poses_need_many_views(self) -> Settings:
@@ -182,8 +193,9 @@ class Settings(_Group):
 
     def to_toml(self) -> str:
         """Write the settings as the text of a TOML file that `load_settings` reads back."""
-        lines = [f"method = {_toml(self.method)}", ""]
-        for group, values in self.model_dump(exclude={"method"}).items():
+        above = {"method", "accept"}
+        lines = [f"{name} = {_toml(value)}" for name, value in self.model_dump(include=above).items()] + [""]
+        for group, values in self.model_dump(exclude=above).items():
             lines += [f"[{group}]", *(f"{name} = {_toml(value)}" for name, value in values.items()), ""]
         return "\n".join(lines)
 
@@ -271,6 +283,8 @@ def _value(text: str) -> Any:
 def _toml(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_toml, value))}]"
     return f'"{value}"' if isinstance(value, str) else repr(value)
 
 

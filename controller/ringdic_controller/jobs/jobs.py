@@ -25,6 +25,8 @@ from shutil import rmtree
 from threading import Condition, Thread
 from typing import Any, TextIO
 
+from ringdic.findings import DO_NOT_USE_EXIT
+
 from ringdic_controller.jobs.children import ChildPerJob, Command, Order, Processing, Work, message_of
 
 logger = logging.getLogger(__name__)
@@ -277,7 +279,7 @@ class Jobs:
     def _settle(self, job_id: str, code: int, outcome: dict[str, Any]) -> None:
         """Set the state that follows from the exit code of the processing and its last message."""
         state = outcome.get("state")
-        if code == 0 and state == "done":
+        if code in (0, DO_NOT_USE_EXIT) and state == "done":
             self._finish(job_id, state="done", done=1.0, run=outcome.get("run"), message="")
         elif code == 0 and state == "stopped":
             self._queue_again(job_id)

@@ -20,6 +20,7 @@ from ringdic.calibration.dots import Dots
 from ringdic.calibration.labels import Labels, column_labels, column_shift, has_labels, mean_label
 from ringdic.calibration.target import identify_dots, possible_azimuths
 from ringdic.errors import InputError
+from ringdic.findings import Finding
 from ringdic.geometry.camera import signed_degrees
 from ringdic.session.rig import RigCamera, Target
 
@@ -49,12 +50,12 @@ class CameraAzimuths:
     """Azimuths of all cameras, and the rotation of the target against the rig file.
 
     azimuths : by camera id, degrees. turn_deg : rotation of the target about its axis from where the azimuths in
-    rig.toml have it. warnings : sentences for the operator.
+    rig.toml have it. findings : that it is turned, where it is.
     """
 
     azimuths: dict[str, float]
     turn_deg: float
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def azimuth_candidates(image: NDArray[np.generic], dots: Dots, camera: RigCamera, target: Target) -> AzimuthCandidates:
@@ -113,14 +114,15 @@ def camera_azimuths(candidates: Mapping[str, AzimuthCandidates], target: Target)
             raise InputError(_elsewhere(id_, with_target, off, turn))
     shared = turn if abs(turn) > _TURNED else 0.0
     azimuths = {id_: (each.camera.azimuth_deg + off.get(id_, shared)) % 360.0 for id_, each in with_target.items()}
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     if abs(turn) > _TURNED:
-        warnings = (
+        sentence = (
             f"the calibration target is turned by {turn:+.1f}° from where the azimuths in rig.toml have it; the world "
-            "turns with it. Turn it back, or change azimuth_deg of all cameras",
+            "turns with it. Turn it back, or change azimuth_deg of all cameras"
         )
+        findings = (Finding("target-turned", sentence, value=turn, limit=_TURNED, unit="°"),)
     log.info("target turned by %+.1f°, %d of %d cameras numbered for certain", turn, len(off), len(candidates))
-    return CameraAzimuths(azimuths, turn, warnings)
+    return CameraAzimuths(azimuths, turn, findings)
 
 
 def _azimuth_after_shift(each: AzimuthCandidates, columns: int, target: Target) -> float:

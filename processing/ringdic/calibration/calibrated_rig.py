@@ -34,13 +34,14 @@ from ringdic.calibration.quality import (
     pair_quality,
 )
 from ringdic.errors import ComputationError, InputError
+from ringdic.findings import Finding
 from ringdic.session.folder import Capture, Session
 from ringdic.session.images import read_gray
 from ringdic.session.rig import Rig, Target
 from ringdic.settings import CalibrationGroup
 from ringdic.tasks.step_images import Digests
 
-_VERSION = 3  # of the method; raise it when stored calibrations are no longer what a new run would give
+_VERSION = 4  # of the method; raise it when stored calibrations are no longer what a new run would give
 #: Squared Mahalanobis distance per parameter between the lenses by board and by target that shows a fault of one.
 _LENS_CHI2 = 25.0
 
@@ -51,8 +52,7 @@ class CalibratedRig:
 
     target : as the rig describes it.
     cameras : calibrations by camera id.
-    warnings : sentences on cameras without an image of the target, on a rotated target, and on lenses that do not agree
-        with the board.
+    findings : cameras without an image of the target, a rotated target, and lenses that do not agree with the board.
     bundle : fit of the bundle adjustment, None where each camera was calibrated alone.
     quality, pairs : figures of each camera, and of the rig's pairs that see dots in common.
     advice : sentences on what would improve the calibration.
@@ -60,7 +60,7 @@ class CalibratedRig:
 
     target: Target
     cameras: dict[str, CameraCalibration]
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     bundle: BundleFit | None = None
     quality: tuple[CameraQuality, ...] = ()
     pairs: tuple[PairQuality, ...] = ()
@@ -81,14 +81,17 @@ def calibrate_rig(
         raise InputError(f"{session.path}: no capture of the calibration target; capture or import one")
     target = targets[-1]
     taking_part = [camera.id for camera in session.rig.cameras if camera.id in target.images]
-    warnings = tuple(
-        f"camera {camera.id} has no image of the target in {target.id} and takes no part"
+    findings = tuple(
+        Finding(
+            "camera-not-calibrated", f"camera {camera.id} has no image of the target in {target.id} and takes no part",
+            (camera.id,), target.id,
+        )
         for camera in session.rig.cameras
         if camera.id not in target.images
-    )
+    )  # fmt: skip
     digests = Digests(session)
-    rig, turn_warnings = _with_true_azimuths(session, target, taking_part, digests)
-    warnings = (*warnings, *turn_warnings)
+    rig, turned = _with_true_azimuths(session, target, taking_part, digests)
+    findings = (*findings, *turned)
     done = 0
     calibrated: dict[str, CameraCalibration] = {}
     keys: list[str] = []
@@ -103,11 +106,11 @@ def calibrate_rig(
             done += 1
             progress(done / len(taking_part), f"camera {id_}")
     if settings.method == "dlt":
-        return _with_quality(session.rig, CalibratedRig(session.rig.target, calibrated, warnings))
+        return _with_quality(session.rig, CalibratedRig(session.rig.target, calibrated, findings))
     progress(1.0, "all cameras together")
     adjusted, fit = _bundle(session, calibrated, keys, settings)
-    warnings = (*warnings, *_contradictions(fit))
-    return _with_quality(session.rig, CalibratedRig(session.rig.target, adjusted, warnings, fit))
+    findings = (*findings, *_contradictions(fit))
+    return _with_quality(session.rig, CalibratedRig(session.rig.target, adjusted, findings, fit))
 
 
 def control_points(first: CameraCalibration, second: CameraCalibration) -> ReconstructionError:
@@ -117,8 +120,8 @@ def control_points(first: CameraCalibration, second: CameraCalibration) -> Recon
 
 def _with_true_azimuths(
     session: Session, capture: Capture, ids: list[str], digests: Digests
-) -> tuple[Rig, tuple[str, ...]]:
-    """The rig with the azimuths that the images of the target show, and warnings; stored in the session's folder."""
+) -> tuple[Rig, tuple[Finding, ...]]:
+    """The rig with the azimuths that the images of the target show, and findings; stored in the session's folder."""
     target = session.rig.target
     cameras = {camera.id: camera for camera in session.rig.cameras if camera.id in ids}
     digest = hashlib.sha256(f"{_VERSION} {target} {list(cameras.values())}".encode())
@@ -134,11 +137,11 @@ def _with_true_azimuths(
 
         with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
             result = camera_azimuths(dict(zip(cameras, pool.map(candidates, cameras), strict=True)), target)
-        values = {"azimuths": result.azimuths, "warnings": list(result.warnings)}
+        values = {"azimuths": result.azimuths, "findings": [each.to_json() for each in result.findings]}
         _store(path, values)
     azimuths = values["azimuths"]
     entries = (replace(c, azimuth_deg=azimuths.get(c.id, c.azimuth_deg)) for c in session.rig.cameras)
-    return replace(session.rig, cameras=tuple(entries)), tuple(values["warnings"])
+    return replace(session.rig, cameras=tuple(entries)), tuple(map(Finding.from_json, values["findings"]))
 
 
 def _with_quality(rig: Rig, ring: CalibratedRig) -> CalibratedRig:
@@ -214,17 +217,19 @@ def _bundle(
     return adjusted, fit
 
 
-def _contradictions(fit: BundleFit) -> tuple[str, ...]:
-    """A sentence that names cameras whose lenses by target and by board contradict each other; none if all agree."""
+def _contradictions(fit: BundleFit) -> tuple[Finding, ...]:
+    """A finding that names cameras whose lenses by target and by board contradict each other; none if all agree."""
     off = [id_ for id_, chi2 in zip(fit.cameras, fit.lens_chi2, strict=True) if chi2 > _LENS_CHI2]
     if not off:
         return ()
     worst = math.sqrt(float(np.nanmax(fit.lens_chi2)))
-    return (
+    sentence = (
         f"camera {', '.join(off)}: the lens that fits the target is up to {worst:.0f} standard errors from the one "
         "that fits the checkerboard, so the board counted less; check that the board is flat and its squares true, "
-        "that rig.toml describes the target, and that no lens was touched in between",
+        "that rig.toml describes the target, and that no lens was touched in between"
     )
+    limit = math.sqrt(_LENS_CHI2)
+    return (Finding("lens-contradicts-target", sentence, tuple(off), value=worst, limit=limit, unit="σ"),)
 
 
 def _stored(path: Path) -> dict[str, Any] | None:

@@ -16,6 +16,7 @@ import numpy as np
 from ringdic.arrays import Pixels
 from ringdic.calibration.pose_refinement import PoseRefinement, refine_poses
 from ringdic.errors import ComputationError
+from ringdic.findings import Finding
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.triangulation import reprojection_residuals, triangulate
 
@@ -71,14 +72,16 @@ class RefinedCameras:
             )
         return rows
 
-    def sentences(self, steps: Sequence[str]) -> list[str]:
-        """A sentence for the operator that names the steps at which cameras had moved; empty where none moved."""
+    def findings(self, steps: Sequence[str]) -> list[Finding]:
+        """A finding that names the steps at which cameras had moved; empty where none moved."""
         rows = self.figures(steps)
         if not rows:
             return []
         worst = max(rows, key=lambda row: row["before_px"])
-        return [
+        sentence = (
             f"cameras moved since the reference in {', '.join(row['step'] for row in rows)}: lines of sight missed one "
             f"another by up to {worst['before_px']:.2f} px ({worst['step']}), {worst['after_px']:.2f} px after the "
             "poses were refined there; fix the cameras"
-        ]
+        )
+        ids = tuple(camera.id for camera in self.cameras)
+        return [Finding("camera-moved", sentence, ids, worst["step"], worst["before_px"], LIMIT, "px")]

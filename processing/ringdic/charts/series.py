@@ -22,6 +22,7 @@ from ringdic.charts.tracking import CameraMatches, interpolate_matches
 from ringdic.charts.views import facing_pairs
 from ringdic.charts.weights import CELL_STEPS, smooth_sigma
 from ringdic.correlation import Status
+from ringdic.findings import Finding
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.outliers import LostPoint, surface_outliers
 from ringdic.mesh.mesh import Mesh
@@ -180,14 +181,15 @@ class SurfaceSeries:
         }
 
     @property
-    def warnings(self) -> list[str]:
-        """Sentences for the operator: cameras that share no measured point with another, and cameras that moved."""
+    def findings(self) -> list[Finding]:
+        """Cameras that share no measured point with another, and cameras that moved."""
+        alone = "camera {} shares no measured point of the surface with another, though it has depths"
         idle = [
-            why or f"camera {camera.id} shares no measured point of the surface with another, though it has depths"
+            Finding("camera-unmatched", why or alone.format(camera.id), (camera.id,), self.names[0])
             for camera, view, why in zip(self._cameras, self._views, self._unmatched, strict=True)
             if why or not len(view.vertex)
         ]
-        return idle + self.poses.sentences(self.names)
+        return idle + self.poses.findings(self.names)
 
     def _measure(self, k: int, matches: MatchesOfStep, refine: RefinedCameras | None) -> SurfaceStep:
         """Triangulate the points of step k from all cameras."""

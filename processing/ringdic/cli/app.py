@@ -19,6 +19,7 @@ from ringdic.cli.console import print_json, say, show_table
 from ringdic.cli.measuring import measure_app, strain_command
 from ringdic.cli.options import AsJson, FamilyChoice, Session, spread_options
 from ringdic.cli.reporting import animate_command, overlay_command, report_command
+from ringdic.findings import DO_NOT_USE_EXIT, Verdict
 
 PLUGINS = "ringdic.commands"
 
@@ -88,14 +89,20 @@ def process_command(
     settings: SettingsFile = None,
     set_: Overrides = None,
     cluster: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a dask cluster.")] = None,
+    accept: Annotated[list[str] | None, typer.Option(metavar="CODE", help="A finding to accept. Repeatable.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Calibrate, correlate, triangulate and compute strain, with nothing to click."""
-    finished = ringdic.process(session, settings, set=set_ or (), cluster=cluster)
+    """Calibrate, correlate, triangulate and compute strain, with nothing to click.
+
+    Ends with exit code 4 where the verdict is "do not use".
+    """
+    finished = ringdic.process(session, settings, set=set_ or (), cluster=cluster, accept=accept or ())
     if as_json:
         print_json({"run": str(finished.path), **finished.summary})
     else:
         show_table(f"{session}: results in {finished.path}", finished.summary["table"])
+    if finished.verdict is Verdict.DO_NOT_USE:
+        raise typer.Exit(DO_NOT_USE_EXIT)
 
 
 def correlate_command(

@@ -2,7 +2,7 @@
 
 The controller runs it as a child process. Every line is one object: ``{"stage", "done", "rate", "left_s", "message"}``
 during the work, ``{"state": "done", "run", "summary"}`` or ``{"state": "failed", "error"}`` at the end. Exit codes: 0
-done, 2 bad input, 3 could not be computed, 1 a bug.
+done, 2 bad input, 3 could not be computed, 4 done, but the results are not to be used, 1 a bug.
 
 ``python -m ringdic.jobs --serve`` keeps running and takes one order after the other from standard input, as described
 in `ringdic.jobs.serving`.
@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from ringdic.errors import RingdicError
+from ringdic.findings import DO_NOT_USE_EXIT, Verdict
 from ringdic.jobs.allocation import keep_freed_memory
 from ringdic.jobs.serving import carry_out, serve
 from ringdic.settings import load_settings
@@ -40,11 +41,12 @@ def main() -> int:
         return _serve_to_the_end()
     try:
         settings = load_settings(arguments.settings, arguments.overrides)
-        _line(carry_out(arguments.session, settings, lambda at: _line(asdict(at))))
+        outcome = carry_out(arguments.session, settings, lambda at: _line(asdict(at)))
+        _line(outcome)
     except RingdicError as error:
         _line({"state": "failed", "error": str(error)})
         return error.exit_code
-    return 0
+    return DO_NOT_USE_EXIT if outcome["summary"]["verdict"] == Verdict.DO_NOT_USE else 0
 
 
 def _serve_to_the_end() -> int:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from ringdic.calibration.calibrated_rig import CalibratedRig, calibrate_rig
 from ringdic.errors import InputError
+from ringdic.findings import verdict_figures
 from ringdic.jobs.pipeline import match_session
 from ringdic.progress import Report, Stages, silent
 from ringdic.results.writer import write_steps
@@ -42,7 +43,7 @@ def process_step(
     steps = _with_reference(session, capture_id)
 
     matches = match_session(session, settings, steps, stages, executor, _calibrated)
-    summary = {"warnings": list(matches.warnings), "seconds": round(time.monotonic() - began, 2)}
+    summary = {**verdict_figures(matches.findings, settings.accept), "seconds": round(time.monotonic() - began, 2)}
     stages.at("deform", 0.0)
     with new_live(path, capture_id) as folder:
         write_steps(

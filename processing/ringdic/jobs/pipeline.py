@@ -22,6 +22,7 @@ from ringdic.charts.tasks import charts_job
 from ringdic.charts.unmeasured import places_of_arrays
 from ringdic.correlation.correlate import load_kernels
 from ringdic.errors import ComputationError, InputError
+from ringdic.findings import Finding
 from ringdic.jobs import summary
 from ringdic.jobs.compiling import compile_once
 from ringdic.progress import COMPILING, Report, Stages, silent
@@ -49,7 +50,7 @@ class SessionMatches:
     errors : reconstruction errors of the control points, by pair.
     drift : (F,) px by camera, mean vertical reprojection residual at each step.
     agreement : figures of how well the cameras' views of a point, and the charts, agree, as JSON values.
-    warnings : sentences for the operator.
+    findings : of calibration and matching.
     """
 
     series: SurfaceSeries
@@ -57,7 +58,7 @@ class SessionMatches:
     errors: dict[tuple[str, str], ReconstructionError]
     drift: dict[str, Floats]
     agreement: dict[str, Any]
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
     @property
     def calibration(self) -> dict[str, Any]:
@@ -91,11 +92,11 @@ def process_session(path: Path, settings: Settings, report: Report = silent, exe
     with new_run(session.path) as run:
         (run.folder / "settings.toml").write_text(settings.to_toml(), encoding="utf-8")
         (run.folder / "calibration.json").write_text(json.dumps(matches.calibration), encoding="utf-8")
-        figures = _deform(matches, steps, run.folder / "results.h5", stages, began)
+        figures = _deform(matches, steps, settings, run.folder / "results.h5", stages, began)
         (run.folder / "summary.json").write_text(json.dumps(figures, indent=1), encoding="utf-8")
     assert run.final is not None
-    for warning in figures["warnings"]:
-        log.warning("%s", warning)
+    for finding in figures["findings"]:
+        log.warning("%s: %s", finding["verdict"], finding["sentence"])
     return run.final
 
 
@@ -118,7 +119,7 @@ def match_session(
     load_kernels()
     stages.at("calibrate", 0.0)
     rig = calibrate(session, settings.calibration, lambda done, who: stages.at("calibrate", done, who))
-    errors, warnings = _usable_pairs(session, rig, steps)
+    errors, left_out = _usable_pairs(session, rig, steps)
     cameras = [each.camera for id_, each in rig.cameras.items() if id_ in steps[0].images]
     job, work = charts_job(session, cameras, tuple(errors), steps, settings), work_folder(session.path)
     _run_tasks(job.tasks, work, stages, executor or LocalExecutor())
@@ -129,12 +130,12 @@ def match_session(
         ReferenceSurface.from_arrays(found), job.matches, settings, StepCache(work),
         places_of_arrays(cameras, found), found["unmatched"].tolist(),
     )  # fmt: skip
-    warnings = (*rig.warnings, *warnings, *series.warnings)
-    return SessionMatches(series, rig, errors, series.drift, series.agreement, warnings)
+    findings = (*rig.findings, *left_out, *series.findings)
+    return SessionMatches(series, rig, errors, series.drift, series.agreement, findings)
 
 
 def _deform(
-    matches: SessionMatches, steps: tuple[Capture, ...], path: Path, stages: Stages, began: float
+    matches: SessionMatches, steps: tuple[Capture, ...], settings: Settings, path: Path, stages: Stages, began: float
 ) -> dict[str, Any]:
     """Compute deformation and uncertainty of every step and write each to the results file; returns the summary.
 
@@ -171,8 +172,9 @@ def _deform(
             stages.at("deform", (k + 1) / len(steps))
         drift = {who: values[written] for who, values in matches.drift.items()}
         values = summary.summarise(
-            reference, figures, matches.rig, matches.errors, drift, matches.agreement, matches.warnings
-        )
+            reference, figures, matches.rig, matches.errors, drift, matches.agreement, matches.findings,
+            settings.accept,
+        )  # fmt: skip
         values["noise_floor"] = noise_floor.noise_floor(at_rest) if at_rest else None
         values["seconds"] = round(time.monotonic() - began, 2)
         file.finish(matches.calibration, values)
@@ -189,30 +191,34 @@ def _with_captures_at_rest(session: Session) -> tuple[Capture, ...]:
 
 def _usable_pairs(
     session: Session, rig: CalibratedRig, steps: tuple[Capture, ...]
-) -> tuple[dict[tuple[str, str], ReconstructionError], tuple[str, ...]]:
+) -> tuple[dict[tuple[str, str], ReconstructionError], tuple[Finding, ...]]:
     """Pairs of calibrated cameras with a reference image, with their errors at the control points.
 
-    The second value has a sentence for each pair that cannot be used. Raises InputError where no pair can.
+    The second value has a finding for each pair that cannot be used. Raises InputError where no pair can.
     """
     usable: dict[tuple[str, str], ReconstructionError] = {}
-    warnings: list[str] = []
+    findings: list[Finding] = []
+
+    def leave_out(sentence: str) -> None:
+        findings.append(Finding("pair-left-out", sentence, pair))
+
     for pair in session.rig.pairs:
         missing = [id_ for id_ in pair if id_ not in rig.cameras]
         blind = [id_ for id_ in pair if id_ not in steps[0].images]
         if missing:
-            warnings.append(f"pair {pair[0]}-{pair[1]} is left out: camera {' and '.join(missing)} is not calibrated")
+            leave_out(f"pair {pair[0]}-{pair[1]} is left out: camera {' and '.join(missing)} is not calibrated")
         elif blind:
-            warnings.append(
+            leave_out(
                 f"pair {pair[0]}-{pair[1]} is left out: camera {' and '.join(blind)} has no image in {steps[0].id}"
             )
         else:
             try:
                 usable[pair] = control_points(rig.cameras[pair[0]], rig.cameras[pair[1]])
             except ComputationError as error:
-                warnings.append(str(error))
+                leave_out(str(error))
     if not usable:
-        raise InputError(f"{session.path}: no camera pair can be used: {'; '.join(warnings)}")
-    return usable, tuple(warnings)
+        raise InputError(f"{session.path}: no camera pair can be used: {'; '.join(each.sentence for each in findings)}")
+    return usable, tuple(findings)
 
 
 def _run_tasks(tasks: Sequence[Task], folder: Path, stages: Stages, executor: Executor) -> None:

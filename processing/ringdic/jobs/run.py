@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
 
 from ringdic.arrays import Floats
 from ringdic.errors import InputError
+from ringdic.findings import Finding, Verdict
 from ringdic.geometry.camera import Camera
 from ringdic.measure.table import Table
 from ringdic.mesh.mesh import Mesh
@@ -87,9 +88,26 @@ class Run:
 
     @cached_property
     def summary(self) -> dict[str, Any]:
-        """Summary of the run as JSON values: cameras, agreement of the pairs, noise floor, warnings, table of steps."""
+        """Summary of the run as JSON values: verdict, findings, cameras, agreement, noise floor, table of steps."""
         summary: dict[str, Any] = json.loads((self.path / "summary.json").read_text(encoding="utf-8"))
         return summary
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the results can be used: sound, look at this (at the findings), or do not use.
+
+        Runs of versions that did not state it are to be looked at.
+        """
+        return Verdict(self.summary.get("verdict", Verdict.LOOK))
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What may make the results wrong or incomplete, the gravest first.
+
+        >>> [finding.code for finding in run.findings]
+        ['area-unmeasured']
+        """
+        return tuple(map(Finding.from_json, self.summary.get("findings", [])))
 
     @property
     def steps(self) -> tuple[str, ...]:

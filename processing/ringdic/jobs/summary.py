@@ -10,12 +10,13 @@ import numpy as np
 
 from ringdic.arrays import Floats
 from ringdic.calibration.calibrated_rig import CalibratedRig
-from ringdic.calibration.drift import drift_sentences
+from ringdic.calibration.drift import drift_findings
 from ringdic.calibration.quality import ReconstructionError
+from ringdic.findings import Finding, verdict_figures
 from ringdic.measure.window_study import gauge
 from ringdic.results.fields import available
 from ringdic.results.results import Results
-from ringdic.results.unmeasured import unmeasured_areas, unmeasured_rows, unmeasured_sentences
+from ringdic.results.unmeasured import unmeasured_areas, unmeasured_findings, unmeasured_rows
 from ringdic.session.json_values import json_value
 from ringdic.strain.deformation import Deformation
 from ringdic.strain.rigid_motion import RigidMotion
@@ -45,7 +46,8 @@ def summarise(
     errors: dict[tuple[str, str], ReconstructionError],
     drift: Mapping[str, Floats],
     agreement: Mapping[str, Any],
-    warnings: tuple[str, ...],
+    findings: tuple[Finding, ...],
+    accepted: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Summarise a run as JSON values; ``table`` holds the rows that the terminal shows.
 
@@ -58,7 +60,7 @@ def summarise(
     drift : (F,) px by camera, the mean vertical reprojection residual at each step, which shows cameras that
         moved between the steps.
     agreement : figures of how well the cameras' views of a point, and the charts where they overlap, agree.
-    warnings : sentences for the operator.
+    findings : of calibration and matching. accepted : codes of findings that the operator accepts.
     """
     control = {
         "mean_mm": float(np.mean([error.mean for error in errors.values()])),
@@ -82,8 +84,9 @@ def summarise(
         "strain": _strain(reference),
         "uncertainty": {**last.uncertainty, "why": None if rig.bundle is not None else ALONE},
         "steps": [step.row for step in steps],
-        "warnings": [*warnings, *unmeasured_sentences(unmeasured), *drift_sentences(drift, names)],
     }
+    findings = (*findings, *unmeasured_findings(unmeasured), *drift_findings(drift, names))
+    figures = {**verdict_figures(findings, accepted), **figures}
     return {**figures, "table": _table(figures)}
 
 
@@ -173,6 +176,8 @@ def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
     control, bundle = figures["control_points"], figures["calibration"]["bundle"]
     agreement, strain = figures["agreement"], figures["strain"]
     rows = [
+        ("verdict", figures["verdict"]),
+        *((each["verdict"], each["sentence"]) for each in figures["findings"]),
         ("camera pairs, points, triangles", f"{figures['pairs']}, {figures['points']:,}, {figures['faces']:,}"),
         ("measured area", f"{figures['area_mm2'] / 100:,.1f} cm²"),
         *unmeasured_rows(figures["unmeasured"]),
@@ -201,7 +206,6 @@ def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
         if step["measured"]:
             value = f"{step['displacement_mm']:.3f} mm, {step['lambda1_median']:.4f}, {step['lambda2_median']:.4f}"
             rows.append((f"{step['step']}: displacement, λ1, λ2 (medians), lost", f"{value}, {step['lost']:,}"))
-    rows += [("warning", sentence) for sentence in figures["warnings"]]
     return [{"figure": figure, "value": value} for figure, value in rows]
 
 

@@ -12,6 +12,7 @@ from jinja2 import Environment, PackageLoader
 from matplotlib.figure import Figure
 from PIL import Image
 
+from ringdic.findings import Finding, Verdict
 from ringdic.pictures.scale import Picture
 
 UNKNOWN = "not recorded"
@@ -41,9 +42,13 @@ class Document:
         """Add a paragraph."""
         self._add("text", text=sentence)
 
-    def sentences(self, sentences: Iterable[str], warnings: bool = False) -> None:
-        """Add a list with one item a sentence. warnings : whether to mark them as warnings."""
-        self._add("sentences", sentences=list(sentences), warnings=warnings)
+    def sentences(self, sentences: Iterable[str]) -> None:
+        """Add a list with one item a sentence."""
+        self._add("sentences", sentences=list(sentences))
+
+    def verdict(self, verdict: Verdict, findings: Iterable[Finding]) -> None:
+        """Add whether the results can be used, and the findings that say why not."""
+        self._add("verdict", verdict=verdict, findings=list(findings))
 
     def facts(self, key: str, rows: Mapping[str, Any]) -> None:
         """Add a table of names and values; None is shown as not recorded."""

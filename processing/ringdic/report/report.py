@@ -10,6 +10,7 @@ from uuid import uuid4
 import numpy as np
 
 from ringdic.errors import InputError
+from ringdic.findings import Finding, Verdict
 from ringdic.mesh.mesh import Mesh
 from ringdic.pictures.scale import Scale, palette
 from ringdic.pictures.views import View, from_side, mean_azimuth, unrolled
@@ -83,14 +84,14 @@ def write_report(
 
 def _summary(document: Document, results: Results) -> None:
     document.section("summary", "At a glance")
-    rows = [list(row.values()) for row in results.summary.get("table", []) if row.get("figure") != "warning"]
+    if "verdict" in results.summary:
+        findings = map(Finding.from_json, results.summary["findings"])
+        document.verdict(Verdict(results.summary["verdict"]), findings)
+    else:  # a run of version 0.1.0
+        document.sentences(results.summary.get("warnings", []))
+    own = {"verdict", "warning", *Verdict}
+    rows = [list(row.values()) for row in results.summary.get("table", []) if row.get("figure") not in own]
     document.facts("figures", {str(row[0]): row[1] for row in rows if len(row) > 1})
-    warnings = results.summary.get("warnings", [])
-    document.heading("Warnings")
-    if warnings:
-        document.sentences(warnings, warnings=True)
-    else:
-        document.text("None.")
 
 
 def _describe(document: Document, session: Session, results: Results, gathered: Gathered) -> None:

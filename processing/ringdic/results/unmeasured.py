@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Pixels
 from ringdic.correlation.status import Status
+from ringdic.findings import Finding
 from ringdic.geometry.outliers import LostPoint
 
-_WORTH_A_WARNING = 0.03  # of the textured area
+_WORTH_A_FINDING = 0.03  # of the textured area
 
 
 class UncountedPlace(IntEnum):
@@ -130,8 +131,8 @@ def unmeasured_rows(areas: dict[str, Any] | None) -> list[tuple[str, str]]:
     return [("texture that two cameras see and that was not measured", value)]
 
 
-def unmeasured_sentences(areas: dict[str, Any] | None) -> list[str]:
-    """A sentence for the operator where more than 3 % of the textured area is missing for other reasons than the view.
+def unmeasured_findings(areas: dict[str, Any] | None) -> list[Finding]:
+    """A finding where more than 3 % of the textured area is missing for other reasons than the view.
 
     What all cameras but one see too obliquely follows from where the cameras stand; it is listed, but no fault.
 
@@ -142,11 +143,13 @@ def unmeasured_sentences(areas: dict[str, Any] | None) -> list[str]:
     measured = areas["measured_cm2"]
     reasons = {name: area for name, area in areas["by_reason"].items() if name != LostPoint.OBLIQUE.name.lower()}
     missing = sum(reasons.values())
-    if not missing or missing <= _WORTH_A_WARNING * (missing + measured):
+    if not missing or missing <= _WORTH_A_FINDING * (missing + measured):
         return []
     name, largest = next(iter(reasons.items()))
     reason = _BY_NAME[name]
-    return [
+    sentence = (
         f"{missing:.1f} of {missing + measured:.1f} cm² of texture that two cameras see were not measured, "
         f"{largest:.1f} cm² of it because: {reason.sentence}; {reason.remedy}"
-    ]
+    )
+    share = missing / (missing + measured)
+    return [Finding("area-unmeasured", sentence, value=100 * share, limit=100 * _WORTH_A_FINDING, unit="%")]

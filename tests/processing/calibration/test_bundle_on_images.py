@@ -306,9 +306,9 @@ def test_a_session_whose_lenses_were_touched_is_told_so(session, folder) -> None
         for capture in session.captures
     ]
     ring = calibrate_rig(replace(session, captures=tuple(boards)), CalibrationGroup(method="bundle"))
-    assert len(ring.warnings) == 1
-    assert "cam_01" in ring.warnings[0]
-    assert "check that the board is flat" in ring.warnings[0]
+    assert [finding.code for finding in ring.findings] == ["lens-contradicts-target"]
+    assert ring.findings[0].cameras == ("cam_01",)
+    assert "check that the board is flat" in ring.findings[0].sentence
 
 
 def test_a_session_without_a_target_is_refused(session) -> None:

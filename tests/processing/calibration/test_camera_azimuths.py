@@ -69,7 +69,7 @@ def test_an_image_alone_tells_the_azimuth_but_for_the_column(rig, dots) -> None:
 def test_cameras_are_found_where_the_rig_has_them(rig, look) -> None:
     result = camera_azimuths(look(), rig.target)
     assert abs(result.turn_deg) < 1.0
-    assert result.warnings == ()
+    assert result.findings == ()
     assert np.abs(deviations(rig, result.azimuths)).max() < 1.5
 
 
@@ -78,7 +78,7 @@ def test_a_turned_target_is_followed_by_all_cameras(rig, look, turn) -> None:
     result = camera_azimuths(look(off=-turn), rig.target)
     assert result.turn_deg == pytest.approx(turn, abs=1.0)
     assert np.abs(deviations(rig, result.azimuths)).max() < 1.5
-    assert "target is turned by" in result.warnings[0]
+    assert "target is turned by" in result.findings[0].sentence
 
 
 def test_without_the_printed_numbers_those_that_see_the_seam_tell_the_others(rig, look) -> None:

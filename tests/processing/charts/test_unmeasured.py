@@ -11,7 +11,7 @@ from ringdic.charts.unmeasured import unmeasured_places
 from ringdic.correlation import Status
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.geometry.outliers import LostPoint
-from ringdic.results.unmeasured import UnmeasuredPlaces, unmeasured_areas, unmeasured_sentences
+from ringdic.results.unmeasured import UnmeasuredPlaces, unmeasured_areas, unmeasured_findings
 from ringdic_node.virtual_rig.rig import paper_rig
 
 MIDDLE = np.array([40.0, 0.0, 120.0])
@@ -101,7 +101,7 @@ def test_a_covered_plate_has_nothing_unmeasured_but_its_rim() -> None:
     found = areas(unmeasured([depth_map(camera) for camera in CAMERAS], surface(nowhere)))
     assert found["total_cm2"] == 0.0
     assert found["seen_by_one_cm2"] == 0.0
-    assert unmeasured_sentences(found) == []
+    assert unmeasured_findings(found) == []
 
 
 @pytest.mark.parametrize("hidden", [nowhere, window])
@@ -159,7 +159,8 @@ def test_a_surface_behind_a_hole_does_not_cover_it() -> None:
 def test_a_sentence_names_the_largest_reason_with_its_area_and_what_to_do() -> None:
     maps = [depth_map(camera, window) for camera in CAMERAS]
     found = areas(unmeasured(maps, surface(window)))
-    (sentence,) = unmeasured_sentences(found)
+    (finding,) = unmeasured_findings(found)
+    sentence = finding.sentence
     assert f"{found['total_cm2']:.1f} of " in sentence
     assert "no match in another camera; draw masks" in sentence
 

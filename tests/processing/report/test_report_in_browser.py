@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
 from ringdic.errors import InputError
+from ringdic.findings import Finding, verdict_figures
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic.measure.region import Everything, region_statistics
 from ringdic.pictures.unmeasured import COLOURS, unmeasured_legend, unmeasured_picture
@@ -22,6 +23,7 @@ RADIUS, AROUND, ALONG = 50.0, 60, 21
 STEPS = ("0001-specimen", "0002-specimen", "0003-specimen")
 LOST = (30, 31, 700)
 SIZE = (240, 320)
+MOVED = Finding("camera-moved-unknown", "camera 3 <b>moved</b> & was named", ("3",), "0002")
 BARE = UnmeasuredPlaces(
     "2", np.array([[60.0, 60.0], [75.0, 60.0], [90.0, 60.0]]), 15.0, np.array([3, 16, 33], np.int8),
     np.array([150.0, 320.0, 90.0]),
@@ -55,7 +57,7 @@ def twisted_tube() -> Results:
         correlation=np.where(known, 0.013, np.nan), sigma_xyz=np.where(known[..., None], [0.002, 0.001, 0.002], np.nan),
         status=status, settings='[correlation]\nradius_px = 17\nstep_px = 9\n[surface]\nmethod = "pairs"\n',
         summary={
-            "warnings": ["camera 3 <b>moved</b> & was told"], "table": [{"figure": "points", "value": "1,260"}],
+            **verdict_figures([MOVED]), "table": [{"figure": "points", "value": "1,260"}],
             "unmeasured": unmeasured_areas((BARE,), 14_500.0),
         },
         unmeasured=(BARE,),
@@ -186,7 +188,19 @@ def test_the_reporting_tables_tell_settings_and_what_the_cameras_were(page: Page
 
 @pytest.mark.browser
 def test_text_is_shown_as_text(page: Page) -> None:
-    assert page.locator(".warnings li").all_text_contents() == ["camera 3 <b>moved</b> & was told"]
+    assert page.locator("#verdict li").all_text_contents() == ["camera 3 · 0002 camera 3 <b>moved</b> & was named"]
+
+
+@pytest.mark.browser
+def test_the_verdict_stands_at_the_top_with_the_camera_and_the_step(page: Page) -> None:
+    verdict = page.locator("#verdict")
+    assert verdict.locator("strong").text_content() == "Do not use"
+    assert verdict.locator("li b").all_text_contents() == ["camera 3 · 0002"]
+    first = page.locator("table").first.bounding_box()
+    box = verdict.bounding_box()
+    assert box is not None
+    assert first is not None
+    assert box["y"] + box["height"] <= first["y"]
     assert "radius_px = 17" in page.locator("#settings-toml").text_content()
 
 

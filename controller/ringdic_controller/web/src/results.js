@@ -117,6 +117,7 @@ async function openChosen(followed = false) {
   surface.setFaces(new Uint32Array(faces));
   facesOf = opened;
   shownPoints = null;
+  showVerdict();
   showFigures();
   showUnmeasured();
   await show();
@@ -207,7 +208,7 @@ function showFigures() {
   const { points, faces, pairs, cameras } = header;
   byId("figures").textContent =
     [counted(points, "point"), counted(faces, "triangle"), counted(cameras.length, "camera"), counted(pairs.length, "pair")].join(", ");
-  const rows = header.summary?.table;
+  const rows = header.summary?.table?.filter((row) => !(row.figure in MARKS || row.figure === "verdict"));
   if (!Array.isArray(rows) || !rows.length) {
     byId("table").replaceChildren();
     return;
@@ -222,6 +223,35 @@ function showFigures() {
       { class: numeric ? "numbers" : null },
       element("thead", {}, element("tr", {}, ...names.map((name) => element("th", { scope: "col" }, name)))),
       element("tbody", {}, ...rows.map((row) => element("tr", {}, ...cells(row)))),
+    ),
+  );
+}
+
+const MARKS = { sound: "✓", "look at this": "!", "do not use": "✕" };
+
+/** Whether the results can be used, and the findings that say why not: which camera, at which step, what to do. */
+function showVerdict() {
+  const { verdict, findings = [] } = header.summary ?? {};
+  const part = byId("verdict");
+  part.hidden = !verdict;
+  part.dataset.verdict = verdict ?? "";
+  if (!verdict) return;
+  const where = ({ cameras, step }) =>
+    [cameras.length > 3 ? `${cameras.length} cameras` : cameras.map((id) => `camera ${id}`).join(", "), step].filter(Boolean).join(" · ");
+  part.replaceChildren(
+    element("strong", {}, `${MARKS[verdict]} ${verdict[0].toUpperCase()}${verdict.slice(1)}`),
+    element(
+      "ul",
+      {},
+      ...findings.map((finding) =>
+        element(
+          "li",
+          { "data-verdict": finding.verdict, "data-code": finding.code },
+          element("b", {}, where(finding)),
+          ` ${finding.sentence}`,
+          finding.accepted ? " (accepted)" : "",
+        ),
+      ),
     ),
   );
 }

@@ -1,0 +1,39 @@
+"""Codes of findings, which programs can rely on: for each the verdict that it leads to, and what it means."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class Verdict(StrEnum):
+    """What can be done with the results: use them, look at the findings first, or not use them at all."""
+
+    SOUND = "sound"
+    LOOK = "look at this"
+    DO_NOT_USE = "do not use"
+
+    @property
+    def severity(self) -> int:
+        """0 for sound, 1 for look at this, 2 for do not use."""
+        return list(Verdict).index(self)
+
+
+#: The exit code of a command whose results are not to be used.
+DO_NOT_USE_EXIT = 4
+
+_LOOK, _STOP = Verdict.LOOK, Verdict.DO_NOT_USE
+#: For each code of a finding the verdict that it leads to, and what it means.
+CODES: dict[str, tuple[Verdict, str]] = {
+    # calibration
+    "camera-not-calibrated": (_LOOK, "a camera has no image of the target, and takes no part"),
+    "target-turned": (_LOOK, "the target is turned against the azimuths in rig.toml"),
+    "lens-contradicts-target": (_STOP, "the lenses that fit the target are not those that fit the board"),
+    # cameras
+    "pair-left-out": (_LOOK, "two neighbouring cameras cannot be used together"),
+    "camera-unmatched": (_LOOK, "a camera shares hardly a point with another"),
+    "camera-moved": (_LOOK, "a camera moved after the calibration or between steps, and was followed"),
+    "camera-moved-unknown": (_STOP, "a camera moved, and how is not known well enough"),
+    # surface
+    "area-unmeasured": (_LOOK, "textured area that two cameras see was not measured"),
+    "step-unmeasured": (_LOOK, "hardly a point was measured at a step"),
+}
