@@ -98,8 +98,8 @@ class CalibrationGroup(_Group):
     print_error_mm, radius_error_mm, pitch_error_mm, tilt_error_deg : for method bundle; prior standard deviations of
         the dots' positions, the target's radius, the spacing of its columns and the rotation of the printed sheet about
         their values in rig.toml; 0 fixes a quantity at that value.
-    refine_poses : where cameras have moved between the steps, their poses are estimated again from the points that they
-        track.
+    refine_poses : where cameras have moved since the calibration or between the steps, their poses are estimated again
+        from the matches of the specimen; by the method paper never.
     """
 
     method: Literal["dlt", "bundle"] = "bundle"
@@ -113,7 +113,7 @@ class CalibrationGroup(_Group):
     radius_error_mm: float = Field(default=0.0, ge=0, le=5)
     pitch_error_mm: float = Field(default=0.0, ge=0, le=5)
     tilt_error_deg: float = Field(default=0.0, ge=0, le=5)
-    refine_poses: bool = False
+    refine_poses: bool = True
 
 
 class SurfaceGroup(_Group):
@@ -174,15 +174,6 @@ class Settings(_Group):
             if code not in CODES:
                 raise ValueError(f"{_nearest(code, list(CODES))} is no code of a finding; known are {', '.join(CODES)}")
         return codes
-
-    @model_validator(mode="after")
-    def _poses_need_many_views(self) -> Settings:
-        if self.calibration.refine_poses and self.method == "paper":
-            raise ValueError(
-                "calibration.refine_poses needs method=best: two cameras alone do not tell a camera's motion from the "
-                "surface's"
-            )
-        return self
 
     def at_scale(self, scale: float) -> Settings:
         """The settings for smaller images of the same scene.

@@ -141,8 +141,3 @@ def test_the_settings_of_a_run_of_another_version_can_be_read() -> None:
 def test_the_nearest_name_is_offered() -> None:
     with pytest.raises(InputError, match=r"did you mean 'correlation\.radius_px'"):
         load_settings(None, ["correlation.radius=20"])
-
-
-def test_two_cameras_cannot_refine_their_poses() -> None:
-    with pytest.raises(InputError, match=r"calibration\.refine_poses needs method=best"):
-        load_settings(None, ["method=paper", "calibration.refine_poses=true"])

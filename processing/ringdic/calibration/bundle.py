@@ -9,7 +9,7 @@ too large, and no residual would show it.)
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 from ringdic.arrays import Floats, Indices, Mask, Pixels, Vectors
 from ringdic.calibration.adjustment import Problem, Solution, State, adjust
 from ringdic.calibration.camera_calibration import CameraCalibration
-from ringdic.calibration.parameters import PER_CAMERA, CameraParameters
+from ringdic.calibration.parameters import LENS, PER_CAMERA, POSE, CameraParameters
 from ringdic.calibration.patch import (
     DotViews,
     PrintedSheet,
@@ -107,6 +107,11 @@ class BundleFit:
     def sheet_sigma(self) -> Floats:
         """Standard errors of radius (mm), pitch (mm) and tilt (rad) of the sheet, (3,)."""
         return np.sqrt(np.diag(self.covariance)[-3:])
+
+    def pose_covariance(self, ids: Sequence[str]) -> Floats:
+        """Covariance (C, 6, 6) of the pose of each of C cameras, rad and mm. ids : of the cameras."""
+        numbers = [PER_CAMERA * self.cameras.index(id_) + LENS for id_ in ids]
+        return np.stack([self.covariance[k : k + POSE, k : k + POSE] for k in numbers])
 
     def figures(self, target: Target) -> dict[str, Any]:
         """Figures for the operator, as JSON values: the adjusted target, and one row for each camera.

@@ -49,4 +49,4 @@ def drift_findings(drift: Mapping[str, Floats], steps: Sequence[str], limit: flo
 
 
 def _finding(sentence: str, cameras: Iterable[str], step: str, value: float, limit: float) -> Finding:
-    return Finding("camera-moved-unknown", sentence, tuple(cameras), step, value, limit, "px")
+    return Finding("camera-drift", sentence, tuple(cameras), step, value, limit, "px")

@@ -8,7 +8,7 @@ the share ``exp(-σ² ω²)`` of the pattern's power at ω radians a px: σ foll
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -47,7 +47,7 @@ class MatchEvidence:
     deviation by which its image is more blurred than the partner's, negative where less. matches : number of features
     matched, of which in_mask lie inside the mask and in_range at a depth that is searched. offset : px, their median
     distance from the epipolar lines; limit : px, that is allowed. near, far : mm, 5th and 95th percentile of their
-    depths; low, high : mm, range of depths searched.
+    depths; low, high : mm, range of depths searched. features : (2, n, 2) px, of the full images of both.
     """
 
     camera: str
@@ -68,6 +68,7 @@ class MatchEvidence:
     far: float
     low: float
     high: float
+    features: Pixels = field(repr=False)
 
     @property
     def sentence(self) -> str:
@@ -150,22 +151,26 @@ def match_evidence(
         patterns[0].contrast_inside(within), factor * patterns[0].blur_against(patterns[1]), len(first),
         int(within[row, column].sum()), int((space.holds(cameras[0], xyz) & space.holds(cameras[1], xyz)).sum()),
         factor * offset, factor * _OFF_LINE, float(near), float(far), low, high,
+        (np.stack([first, second]) + 0.5) * factor - 0.5,
     )  # fmt: skip
 
 
 def why_unmatched(
     images: DepthImages, depth_map: DepthMap, k: int, partner: int | None, space: DepthRange, mask: Mask | None
-) -> str:
-    """A sentence that says why a camera has hardly a depth, empty where it has enough.
+) -> tuple[str, Pixels]:
+    """A sentence that says why a camera has hardly a depth, and features (2, n, 2) px matched in it and its partner.
+
+    Both are empty where it has enough depths. The features do not depend on the calibration.
 
     partner : index of its nearest partner, None without. mask : (height, width) bool, of the full image, or None.
     """
+    none = np.zeros((2, 0, 2))
     evidence = None if partner is None else match_evidence(images, depth_map, k, partner, space, mask)
     if evidence is not None:
-        return evidence.sentence
+        return evidence.sentence, evidence.features
     if len(depth_map.patches.px):
-        return ""
-    return f"camera {images.cameras[k].id} does not match: no other camera's view is similar enough"
+        return "", none
+    return f"camera {images.cameras[k].id} does not match: no other camera's view is similar enough", none
 
 
 @dataclass(frozen=True)

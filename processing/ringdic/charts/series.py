@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels, Points
-from ringdic.calibration.refined_cameras import RefinedCameras
+from ringdic.calibration.drift import drift_findings
+from ringdic.calibration.motion_findings import motion_figures, motion_findings
+from ringdic.calibration.moved_cameras import CameraMotions, find_moved_cameras
 from ringdic.charts.agreement import triangulate_agreeing
 from ringdic.charts.chart import texture_of
 from ringdic.charts.surface import ReferenceSurface
@@ -22,6 +24,7 @@ from ringdic.charts.tracking import CameraMatches, interpolate_matches
 from ringdic.charts.views import facing_pairs
 from ringdic.charts.weights import CELL_STEPS, smooth_sigma
 from ringdic.correlation import Status
+from ringdic.errors import ComputationError
 from ringdic.findings import Finding
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.outliers import LostPoint, surface_outliers
@@ -110,7 +113,7 @@ class SurfaceSeries:
     Parameters
     ----------
     rig : its name.
-    cameras : the C cameras.
+    cameras : the C cameras as they stood at the reference.
     pairs : ids of neighbouring cameras.
     charts : names of the charts.
     names : (F,) of the steps, the reference first.
@@ -120,20 +123,21 @@ class SurfaceSeries:
     cache : for the points in space of every step.
     unmeasured : textured places that are not part of the surface.
     unmatched : for each camera why it has no depths, an empty sentence where it has.
+    moved : how the cameras moved between the calibration and the reference; None where that was not checked.
     """
 
     def __init__(
         self, rig: str, cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]], charts: Sequence[str],
         names: Sequence[str], surface: ReferenceSurface, matches: MatchesOfStep, settings: Settings, cache: StepCache,
         unmeasured: Sequence[UnmeasuredPlaces] = (), unmatched: Sequence[str] = (),
+        moved: CameraMotions | None = None,
     ) -> None:  # fmt: skip
         self._unmeasured, self._unmatched = tuple(unmeasured), list(unmatched) or [""] * len(cameras)
         self.names, self.surface, self._cameras, self._charts = tuple(names), surface, tuple(cameras), tuple(charts)
         self._settings, self._cache = settings, cache
         self._views = [camera_view(camera, c, surface) for c, camera in enumerate(cameras)]
         self._textures = [texture_of(surface.texture[k, view.vertex]) for k, view in enumerate(self._views)]
-        self.poses = RefinedCameras(cameras)
-        refine = self.poses if settings.calibration.refine_poses else None
+        self._motions: dict[int, CameraMotions] = {} if moved is None else {0: moved}
         self._drift = np.full((len(self.names), len(cameras)), np.nan)
         residuals = [surface.px[c, view.vertex] - view.px for c, view in enumerate(self._views)]
         self._drift[0] = [float(np.mean(one[:, 1])) if len(one) else np.nan for one in residuals]
@@ -144,7 +148,7 @@ class SurfaceSeries:
         self._residual = float(np.sqrt(np.mean(np.concatenate(others) ** 2)))
         c_ls: list[list[Floats]] = [[] for _ in cameras]
         steps = range(1, len(self.names))
-        for k, step in enumerate(map_in_order(lambda k: self._measure(k, matches, refine), steps), start=1):
+        for k, step in enumerate(map_in_order(lambda k: self._measure(k, matches), steps), start=1):
             cache.put(k, step)
             self._drift[k] = self._drift[0] + step.residual
             for samples, one in zip(c_ls, step.cameras, strict=True):
@@ -164,6 +168,11 @@ class SurfaceSeries:
         known = zip(self._cameras, self._drift.T, strict=True)
         return {camera.id: values for camera, values in known if np.isfinite(values[0])}
 
+    def motions_at(self, step: int) -> CameraMotions | None:
+        """How cameras moved since the reference, or for step 0 since the calibration; None where none moved."""
+        motions = self._motions.get(step)
+        return motions if motions is not None and motions.moved.any() else None
+
     @property
     def agreement(self) -> dict[str, Any]:
         """How well the cameras agree at the reference, as JSON values.
@@ -177,7 +186,7 @@ class SurfaceSeries:
             "residual_px": self._residual,
             "lost": {reasons[int(reason)]: int(number) for reason, number in self.surface.lost},
             **_distances(self.surface.mismatch, self._charts),
-            "moved_cameras": self.poses.figures(self.names),
+            "moved_cameras": motion_figures(self._motions, self.names),
         }
 
     @property
@@ -189,14 +198,16 @@ class SurfaceSeries:
             for camera, view, why in zip(self._cameras, self._views, self._unmatched, strict=True)
             if why or not len(view.vertex)
         ]
-        return idle + self.poses.findings(self.names)
+        if self._settings.method == "paper":
+            return [*idle, *drift_findings(self.drift, self.names)]
+        return idle + motion_findings(self._motions, self.names)
 
-    def _measure(self, k: int, matches: MatchesOfStep, refine: RefinedCameras | None) -> SurfaceStep:
+    def _measure(self, k: int, matches: MatchesOfStep) -> SurfaceStep:
         """Triangulate the points of step k from all cameras."""
         px, weight = (np.full(self.surface.px.shape, np.nan) for _ in range(2))
         status = np.full(px.shape[:2], Status.NOT_REACHED, np.int8)
         tracked = [self._track(c, matches(c, k), px[c], weight[c], status[c]) for c in range(len(px))]
-        cameras = self._cameras if refine is None else refine(k, px, weight)
+        cameras = self._placed(k, px, weight)
         points, used = triangulate_agreeing(cameras, px, weight)
         turned = self._oblique(cameras, points.xyz, px)
         again = np.flatnonzero(turned.any(axis=0))
@@ -225,6 +236,16 @@ class SurfaceSeries:
             xyz, tuple(steps), overall, np.where(measured, points.chi2, np.nan), np.where(measured, points.degrees, 0),
             residual,
         )  # fmt: skip
+
+    def _placed(self, k: int, px: Pixels, sigma: Pixels) -> tuple[Camera, ...]:
+        """The cameras at step k, from the points (C, N, 2) px tracked in them and their standard deviations."""
+        if not self._settings.calibration.refine_poses or self._settings.method == "paper":
+            return self._cameras
+        try:
+            self._motions[k] = find_moved_cameras(self._cameras, px, sigma)
+        except ComputationError:  # too few points to say
+            return self._cameras
+        return self._motions[k].moved_cameras
 
     def _track(
         self, c: int, matches: CameraMatches | None, px: Pixels, weight: Pixels, status: NDArray[np.int8]

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Image, Indices, Mask, Points
+from ringdic.arrays import Floats, Image, Indices, Mask, Points
+from ringdic.calibration.moved_cameras import CameraMotions, still_cameras
 from ringdic.charts.body_motion import SeenBody, SurfaceFrames
 from ringdic.charts.chart import Chart, chart_with_uncertainty
 from ringdic.charts.depth_map import DepthMap, depths_at_fitting_size
@@ -25,6 +26,7 @@ from ringdic.charts.images import ChartImages
 from ringdic.charts.matching import drop_masked, match_chart
 from ringdic.charts.patches import Patches
 from ringdic.charts.plane_sweep import DepthRange
+from ringdic.charts.poses import motions_as_arrays, motions_from_arrays, poses_of_charts
 from ringdic.charts.surface import reference_surface
 from ringdic.charts.tracked_points import TrackedPoints, tracked_points
 from ringdic.charts.tracking import CameraMatches, match_in_two_passes, surface_grid
@@ -77,13 +79,16 @@ class RigViews:
 class ChartsJob:
     """Tasks of a measurement by all cameras: depth maps, charts, the surface, and for each camera its later steps.
 
-    views : of the cameras. names : of the charts: of their camera, or of their pair of cameras.
+    cameras : as calibrated. views : of the cameras as they stood at the reference.
+    names : of the charts: of their camera, or of their pair of cameras.
     """
 
+    cameras: tuple[Camera, ...]
     views: RigViews
     names: tuple[str, ...]
     maps: tuple[Task, ...]
     charts: tuple[Task, ...]
+    poses: Task | None
     surface: Task
     steps: tuple[tuple[Task | None, ...], ...]
 
@@ -91,7 +96,19 @@ class ChartsJob:
     def tasks(self) -> list[Task]:
         """All tasks in order, camera by camera, so that a reference image is prepared once for all its steps."""
         later = [task for row in self.steps for task in row if task is not None]
-        return [*self.maps, *self.charts, self.surface, *later]
+        return [*self.at_reference, self.surface, *later]
+
+    @property
+    def at_reference(self) -> list[Task]:
+        """The tasks before the surface: depth maps, charts, and the check of the poses."""
+        return [*self.maps, *self.charts, *([] if self.poses is None else [self.poses])]
+
+    @property
+    def motions(self) -> CameraMotions:
+        """How the cameras moved between the calibration and the reference, once this is computed."""
+        if self.poses is None:
+            return still_cameras(self.cameras)
+        return motions_from_arrays(self.cameras, read_output(self.poses.output))
 
     def matches(self, camera: int, step: int) -> CameraMatches | None:
         """Matches of a camera at a step from 1 on; None where it has no image or no part in the surface."""
@@ -107,23 +124,27 @@ class ChartsJob:
 
 def charts_job(
     session: Session, cameras: Sequence[Camera], pairs: Sequence[tuple[str, str]], steps: Sequence[Capture],
-    settings: Settings,
+    settings: Settings, covariance: Floats | None = None, assumed: Sequence[Camera] | None = None,
+    placed: Sequence[Camera] | None = None,
 ) -> ChartsJob:  # fmt: skip
     """Create the tasks of a session's measurement by all cameras that have a reference image.
 
     By the best method every camera has a chart, of what it faces most squarely; by the paper's method every pair has
     one, of all that its two cameras share.
 
-    cameras : all with a reference image. pairs : ids of neighbouring cameras. steps : captures, the reference first.
+    cameras : the C with a reference image, as calibrated. pairs : ids of neighbouring cameras. steps : captures, the
+    reference first. covariance : (C, 6, 6) of the cameras' poses, rad and mm, None where unknown. assumed : the cameras
+    with which the reference is matched, placed : those with which the surface and all steps are measured, where cameras
+    are known to have moved since the calibration; None for the calibrated ones.
     """
-    views = RigViews.of(cameras)
+    views = RigViews.of(assumed or cameras)
     digests, folder = Digests(session), work_folder(session.path)
     correlation = CorrelationSettings(**settings.correlation.keywords)
     masks = tuple(session.mask(camera.id) for camera in cameras)
     images = tuple(steps[0].images[camera.id] for camera in cameras)
     marks = [(digests.image(steps[0], camera.id), digests.mask(camera.id)) for camera in cameras]
     reference = _ReferenceFiles(views, images, masks, correlation)
-    stamp = digest(source_digest(), list(cameras))  # another version computes all outputs again
+    stamp = digest(source_digest(), list(views.cameras))  # another version computes all outputs again
     maps, charts = [], []
     for k, camera in enumerate(cameras):
         used = [marks[c] for c in (k, *views.partners[k])]
@@ -135,8 +156,14 @@ def charts_job(
         key = digest(stamp, "chart", plan, needs)
         charts.append(Task(key, f"chart of {plan.name}", chart_task, (reference, plan), folder, needs, _CHART_COST))
     needs = (*needs, *(task.key for task in charts))
+    poses = None
+    if settings.method == "best" and settings.calibration.refine_poses:
+        key = digest(stamp, "poses", needs, list(cameras), [] if covariance is None else covariance)
+        poses = Task(key, "poses of the cameras", poses_task, (tuple(cameras), covariance), folder, needs)
+    views = replace(views, cameras=tuple(placed or views.cameras))
     joining = (correlation.step, settings.surface)
-    surface = Task(digest(stamp, "surface", needs, joining), "surface", surface_task, (views, *joining), folder, needs)
+    key = digest(stamp, "surface", needs, joining, list(views.cameras))
+    surface = Task(key, "surface", surface_task, (views, *joining), folder, needs)
     curved = settings.method == "best"
     rows = []
     for k, camera in enumerate(cameras):
@@ -151,7 +178,7 @@ def charts_job(
             row.append(Task(key, f"camera {camera.id}, {step.id}", tracking_task, arguments, folder, (surface.key,)))
         rows.append(tuple(row))
     names = tuple(plan.name for plan in plans)
-    return ChartsJob(views, names, tuple(maps), tuple(charts), surface, tuple(rows))
+    return ChartsJob(tuple(cameras), views, names, tuple(maps), tuple(charts), poses, surface, tuple(rows))
 
 
 @dataclass(frozen=True)
@@ -208,13 +235,15 @@ def depth_task(files: _ReferenceFiles, k: int, *, inputs: tuple[Path, ...]) -> A
     images, depth_map = depths_at_fitting_size(
         files.views.cameras, files.image, files.correlation, k, partners[:_MOST], space, mask
     )
-    why = why_unmatched(images, depth_map, k, partners[0] if partners else None, space, mask)
+    nearest = partners[0] if partners else None
+    why, features = why_unmatched(images, depth_map, k, nearest, space, mask)
     patches = depth_map.patches
     return {
         "px": patches.px, "inverse_depth": patches.inverse_depth, "gradient": patches.gradient,
         "sigma": depth_map.sigma, "textured": depth_map.textured, "patterned": depth_map.patterned,
         "spacing": np.array(depth_map.spacing), "grey_noise": np.array(depth_map.grey_noise),
         "points": np.array(len(patches.px)), "why": np.array(why),
+        "features": features, "between": np.array([k, k if nearest is None else nearest]),
     }  # fmt: skip
 
 
@@ -249,6 +278,16 @@ def chart_task(files: _ReferenceFiles, planned: _PlannedChart, *, inputs: tuple[
     noise = np.array([surfaces[c].map.grey_noise for c in matches.cameras])
     chart = chart_with_uncertainty(images, matches, noise)
     return {**chart.arrays(), "points": np.array(int(np.isfinite(chart.px[..., 0]).sum()))}
+
+
+def poses_task(cameras: tuple[Camera, ...], covariance: Floats | None, *, inputs: tuple[Path, ...]) -> Arrays:
+    """Find which cameras moved since the calibration, see `CameraMotions`: px, rad, mm.
+
+    covariance : (C, 6, 6) of the cameras' poses, rad and mm. inputs : outputs of the depth maps, then of the charts.
+    """
+    depths, charts = ([read_output(path) for path in part] for part in np.split(np.array(inputs), [len(cameras)]))
+    features = [(one["between"], one["features"]) for one in depths if one["features"].size]
+    return motions_as_arrays(poses_of_charts(cameras, list(map(Chart.from_arrays, charts)), features, covariance))
 
 
 def surface_task(views: RigViews, step: int, settings: SurfaceGroup, *, inputs: tuple[Path, ...]) -> Arrays:

@@ -32,6 +32,7 @@ CODES: dict[str, tuple[Verdict, str]] = {
     "pair-left-out": (_LOOK, "two neighbouring cameras cannot be used together"),
     "camera-unmatched": (_LOOK, "a camera shares hardly a point with another"),
     "camera-moved": (_LOOK, "a camera moved after the calibration or between steps, and was followed"),
+    "camera-drift": (_LOOK, "by the method paper: matches lie off the epipolar lines in the mean; a camera moved"),
     "camera-moved-unknown": (_STOP, "a camera moved, and how is not known well enough"),
     # surface
     "area-unmeasured": (_LOOK, "textured area that two cameras see was not measured"),

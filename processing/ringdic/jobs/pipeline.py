@@ -13,16 +13,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ringdic.arrays import Floats
+import numpy as np
+
+from ringdic.arrays import Floats, Vectors
 from ringdic.calibration.calibrated_rig import CalibratedRig, calibrate_rig, control_points
 from ringdic.calibration.quality import ReconstructionError
 from ringdic.charts.series import SurfaceSeries
 from ringdic.charts.surface import ReferenceSurface
-from ringdic.charts.tasks import charts_job
+from ringdic.charts.tasks import ChartsJob, charts_job
 from ringdic.charts.unmeasured import places_of_arrays
 from ringdic.correlation.correlate import load_kernels
 from ringdic.errors import ComputationError, InputError
 from ringdic.findings import Finding
+from ringdic.geometry.camera import Camera
 from ringdic.jobs import summary
 from ringdic.jobs.compiling import compile_once
 from ringdic.progress import COMPILING, Report, Stages, silent
@@ -38,6 +41,10 @@ from ringdic.tasks import Executor, LocalExecutor, Task, TaskReport, process_mem
 Calibrate = Callable[[Session, CalibrationGroup, Callable[[float, str], None]], CalibratedRig]
 
 log = logging.getLogger(__name__)
+
+#: Times that the reference is matched where cameras moved so far, in px of the image, that matches were lost by it.
+_MOST_LOOKS, _LOOK_AGAIN_PX = 3, 0.3
+_ABOUT_MM = 50.0  # about the middle of the rig, of points that the shift of images is told by
 
 _WEIGHTS = {"prepare": 0.03, "calibrate": 0.25, "correlate": 0.62, "triangulate": 0.04, "deform": 0.06}
 
@@ -121,14 +128,28 @@ def match_session(
     rig = calibrate(session, settings.calibration, lambda done, who: stages.at("calibrate", done, who))
     errors, left_out = _usable_pairs(session, rig, steps)
     cameras = [each.camera for id_, each in rig.cameras.items() if id_ in steps[0].images]
-    job, work = charts_job(session, cameras, tuple(errors), steps, settings), work_folder(session.path)
-    _run_tasks(job.tasks, work, stages, executor or LocalExecutor())
+    covariance = None if rig.bundle is None else rig.bundle.pose_covariance([camera.id for camera in cameras])
+    work, executor = work_folder(session.path), executor or LocalExecutor()
+
+    def job_with(assumed: Sequence[Camera], placed: Sequence[Camera]) -> ChartsJob:
+        return charts_job(session, cameras, tuple(errors), steps, settings, covariance, assumed, placed)
+
+    placed = tuple(cameras)
+    for _ in range(_MOST_LOOKS):
+        assumed = placed
+        job = job_with(assumed, placed)
+        _run_tasks(job.at_reference, job.tasks, work, stages, executor)
+        placed = job.motions.moved_cameras
+        if _image_shift(assumed, placed, job.views.space.centre) < _LOOK_AGAIN_PX:
+            break
+    job = job_with(assumed, placed)
+    _run_tasks(job.tasks, job.tasks, work, stages, executor)
     stages.at("triangulate", 0.0)
     found = read_output(job.surface.output)
     series = SurfaceSeries(
-        session.rig.name, cameras, tuple(errors), job.names, [step.id for step in steps],
+        session.rig.name, placed, tuple(errors), job.names, [step.id for step in steps],
         ReferenceSurface.from_arrays(found), job.matches, settings, StepCache(work),
-        places_of_arrays(cameras, found), found["unmatched"].tolist(),
+        places_of_arrays(cameras, found), found["unmatched"].tolist(), job.motions,
     )  # fmt: skip
     findings = (*rig.findings, *left_out, *series.findings)
     return SessionMatches(series, rig, errors, series.drift, series.agreement, findings)
@@ -143,7 +164,7 @@ def _deform(
     path : of the results file. began : start of the run on the monotonic clock, seconds.
     """
     series = matches.series
-    known = camera_covariance(matches.rig.bundle)
+    known = camera_covariance(matches.rig.bundle, series.motions_at(0))
     uncertainty = None if known is None else StepUncertainty(series.reference, known)
     written = [k for k, step in enumerate(steps) if step.kind != "static"]
     reference = series.reference
@@ -160,7 +181,7 @@ def _deform(
             last = len(results.steps) - 1
             motion, deformation = results.motion(last), results.deformation(last)
             if k and uncertainty is not None:
-                results = uncertainty.complete(results, deformation)
+                results = uncertainty.complete(results, deformation, series.motions_at(k))
             return file.record(results, motion, deformation), summary.step_figures(results, motion, deformation)
 
         for k, one in enumerate(map_in_order(compute, range(len(steps)))):
@@ -221,9 +242,19 @@ def _usable_pairs(
     return usable, tuple(findings)
 
 
-def _run_tasks(tasks: Sequence[Task], folder: Path, stages: Stages, executor: Executor) -> None:
-    """Run tasks and report their progress, then remove old outputs beyond the size limit of the work folder."""
-    total_cost = sum(task.cost for task in tasks)
+def _image_shift(before: Sequence[Camera], after: Sequence[Camera], centre: Vectors) -> float:
+    """Greatest distance, px, by which points about a centre (3,) mm move in the images with the cameras."""
+    xyz = centre + _ABOUT_MM * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    shifts = [new.project(xyz) - old.project(xyz) for old, new in zip(before, after, strict=True)]
+    return float(np.linalg.norm(shifts, axis=2).max())
+
+
+def _run_tasks(tasks: Sequence[Task], whole: Sequence[Task], folder: Path, stages: Stages, executor: Executor) -> None:
+    """Run tasks and report their progress, then remove old outputs beyond the size limit of the work folder.
+
+    whole : all tasks of the job, of which these may be a part.
+    """
+    total_cost = sum(task.cost for task in whole)
     began, cost, points = time.monotonic(), 0.0, 0
 
     def report(task: Task, outcome: TaskReport, count: int, total: int) -> None:
@@ -231,8 +262,8 @@ def _run_tasks(tasks: Sequence[Task], folder: Path, stages: Stages, executor: Ex
         cost += task.cost
         points += outcome.points
         rate = f"{points / max(time.monotonic() - began, 1e-3):,.0f} points/s" if points else ""
-        stages.at("correlate", cost / total_cost, f"{task.name} ({count} of {total})", rate)
+        stages.at("correlate", cost / total_cost, f"{task.name} ({count} of {len(whole)})", rate)
 
     stages.at("correlate", 0.0)
     executor.run(tasks, report)
-    tidy(folder, tasks)
+    tidy(folder, whole)

@@ -10,7 +10,6 @@ import numpy as np
 
 from ringdic.arrays import Floats
 from ringdic.calibration.calibrated_rig import CalibratedRig
-from ringdic.calibration.drift import drift_findings
 from ringdic.calibration.quality import ReconstructionError
 from ringdic.findings import Finding, verdict_figures
 from ringdic.measure.window_study import gauge
@@ -66,7 +65,6 @@ def summarise(
         "mean_mm": float(np.mean([error.mean for error in errors.values()])),
         "rms_mm": float(np.mean([error.rms for error in errors.values()])),
     }
-    names = tuple(step.row["step"] for step in steps)
     last = [step for step in steps if step.row["measured"]][-1]
     area_mm2 = float(reference.mesh.areas.sum())
     unmeasured = unmeasured_areas(reference.unmeasured, area_mm2) if reference.unmeasured else None
@@ -85,7 +83,7 @@ def summarise(
         "uncertainty": {**last.uncertainty, "why": None if rig.bundle is not None else ALONE},
         "steps": [step.row for step in steps],
     }
-    findings = (*findings, *unmeasured_findings(unmeasured), *drift_findings(drift, names))
+    findings = (*findings, *unmeasured_findings(unmeasured))
     figures = {**verdict_figures(findings, accepted), **figures}
     return {**figures, "table": _table(figures)}
 

@@ -6,6 +6,7 @@ and the calibration, whose error all points and steps share.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +15,8 @@ from scipy.spatial import cKDTree
 
 from ringdic.arrays import Floats, Indices, Mask, Points
 from ringdic.calibration.bundle import BundleFit
-from ringdic.calibration.parameters import PER_CAMERA
+from ringdic.calibration.moved_cameras import CameraMotions
+from ringdic.calibration.parameters import LENS, PER_CAMERA, POSE
 from ringdic.results.results import Results
 from ringdic.strain.deformation import Deformation, deformation
 from ringdic.uncertainty.calibration import (
@@ -30,12 +32,33 @@ from ringdic.uncertainty.position import Gain, position_gain
 _SAMPLE = 3000
 
 
-def camera_covariance(fit: BundleFit | None) -> CameraCovariance | None:
-    """Covariance of the camera parameters after a bundle adjustment; None where each camera was calibrated alone."""
+def camera_covariance(fit: BundleFit | None, motions: CameraMotions | None = None) -> CameraCovariance | None:
+    """Covariance of the camera parameters after a bundle adjustment; None where each camera was calibrated alone.
+
+    motions : how the cameras moved between the calibration and the reference, None where they did not; what is not
+    known of it is added.
+    """
     if fit is None:
         return None
     size = PER_CAMERA * len(fit.cameras)
-    return CameraCovariance(fit.cameras, fit.covariance[:size, :size])
+    parameters = fit.covariance[:size, :size]
+    if motions is not None:
+        parameters = parameters + _of_motions(motions, fit.cameras)
+    return CameraCovariance(fit.cameras, parameters)
+
+
+def motion_covariance(motions: CameraMotions) -> CameraCovariance:
+    """Covariance of the camera parameters due to what is not known of the cameras' motions."""
+    ids = tuple(camera.id for camera in motions.cameras)
+    return CameraCovariance(ids, _of_motions(motions, ids))
+
+
+def _of_motions(motions: CameraMotions, ids: Sequence[str]) -> Floats:
+    """Covariance (16 C, 16 C) of the parameters of C cameras, by id, that is due to their motions."""
+    at = [PER_CAMERA * ids.index(camera.id) + LENS + k for camera in motions.cameras for k in range(POSE)]
+    out = np.zeros((PER_CAMERA * len(ids),) * 2)
+    out[np.ix_(at, at)] = motions.covariance
+    return out
 
 
 class StepUncertainty:
@@ -62,22 +85,26 @@ class StepUncertainty:
         )
         self._position = self._points.spread(sensitivity_sigma(self._at_reference))
 
-    def complete(self, results: Results, deformed: Deformation) -> Results:
+    def complete(self, results: Results, deformed: Deformation, motions: CameraMotions | None = None) -> Results:
         """Complete the results of one step with its standard deviations.
 
         results : of the reference and this step, or of the reference alone. deformed : from the reference to the step.
+        motions : how the cameras moved since the reference, None where they did not; what is not known of it is part of
+        the calibration's.
         """
         N, M = len(results.vertices_ref), len(results.faces)
         rows = [(self._position, np.zeros((N, 3)), np.zeros((M, 2)))]
         if len(results.steps) > 1:
             reference, current = results.vertices_ref[self._vertex], results.vertices[1, self._vertex]
-            at_step = position_sensitivity(
-                results.cameras, current, _gain(results, 1, self._vertex), self._known,
-                (reference, self._at_reference),
-            )  # fmt: skip
+            gain, at_reference = _gain(results, 1, self._vertex), self._at_reference
+            at_step = position_sensitivity(results.cameras, current, gain, self._known, (reference, self._at_reference))
+            if motions is not None:
+                more = position_sensitivity(results.cameras, current, gain, motion_covariance(motions))
+                at_step = np.concatenate([at_step, more], axis=2)
+                at_reference = np.concatenate([at_reference, np.zeros_like(more)], axis=2)
             sample = deformation(reference, current, self._faces)
-            stretches = stretch_sigma_by_cameras(sample, reference, self._faces, self._at_reference, at_step)
-            both = np.concatenate([sensitivity_sigma(at_step), sensitivity_sigma(at_step - self._at_reference)], axis=1)
+            stretches = stretch_sigma_by_cameras(sample, reference, self._faces, at_reference, at_step)
+            both = np.concatenate([sensitivity_sigma(at_step), sensitivity_sigma(at_step - at_reference)], axis=1)
             of_points, of_triangles = self._points.spread(both), self._triangles.spread(stretches)
             of_points[~np.isfinite(results.vertices[1]).all(axis=1)] = np.nan
             of_triangles[~np.isfinite(deformed.J)] = np.nan

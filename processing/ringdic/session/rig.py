@@ -196,11 +196,14 @@ _RIG_FILE = TypeAdapter(_RigFile)
 def adjacent_pairs(cameras: tuple[RigCamera, ...]) -> Pairs:
     """Every pair of neighbouring cameras, in the order in which they are listed.
 
-    The last camera and the first are a pair too where they are at most 90° apart: the ring is closed.
+    The last camera and the first are a pair too where the ring is closed: they are at most 90° apart, and the cameras
+    stand once around.
     """
     ids = [camera.id for camera in cameras]
     pairs = list(itertools.pairwise(ids))
-    if len(ids) > 2 and abs(_wrapped(cameras[0].azimuth_deg - cameras[-1].azimuth_deg)) <= 90.0:
+    azimuths = [camera.azimuth_deg for camera in cameras]
+    steps = [_wrapped(b - a) for a, b in itertools.pairwise([*azimuths, azimuths[0]])]
+    if len(ids) > 2 and abs(steps[-1]) <= 90.0 and abs(sum(steps)) > 180.0:
         pairs.append((ids[-1], ids[0]))
     return tuple(pairs)
 

@@ -1,4 +1,4 @@
-"""The verdict of a run is that of its worst finding; what was accepted is still shown, and no longer forbids the use."""
+"""The verdict of a run is that of its worst finding; what was accepted is still shown but no longer forbids use."""
 
 import pytest
 from ringdic.errors import InputError

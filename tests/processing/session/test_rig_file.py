@@ -1,5 +1,6 @@
 """rig.toml: what is accepted, what is derived, and what the operator reads when something is wrong."""
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -20,6 +21,14 @@ def ring(rig_toml: Callable[[str, Sequence[str]], str]) -> Ring:
 def test_adjacent_pairs_close_when_the_ring_does(ring: Ring) -> None:
     assert parse_rig(ring(12)).pairs[-1] == ("c11", "c0")
     assert len(parse_rig(ring(12)).pairs) == 12
+
+
+@pytest.mark.parametrize(("azimuths", "count"), [((0, 30, 60, 90), 3), ((0, 90, 180, 270), 4), ((90, 60, 30), 2)])
+def test_an_arc_is_not_closed_however_near_its_ends_are(ring: Ring, azimuths: Sequence[int], count: int) -> None:
+    text = ring(len(azimuths))
+    for i, azimuth in enumerate(azimuths):
+        text = re.sub(rf'(id = "c{i}"\nazimuth_deg = )[\d.]+', rf"\g<1>{azimuth}.0", text)
+    assert len(parse_rig(text).pairs) == count
 
 
 def test_two_cameras_are_one_pair() -> None:

@@ -1,0 +1,265 @@
+"""Cameras that moved, found and followed by matched points of a specimen, while all others hold the world where it is.
+
+The cost ``Σ ρ(r / σ) + Σ_c ρ_c(p_cᵀ Σ_c⁻¹ p_c)`` is minimised over the points and a small motion p_c = (ω, τ) of each
+camera, with the lenses fixed. r are the reprojection residuals with Huber's ρ; Σ_c is the covariance of the pose of a
+camera that stands still. ρ_c is the cost of Geman and McClure: a camera's prior counts the less the more the points
+contradict it (iteratively reweighted least squares), so that the motion of one camera is not spread over all. At last
+the cameras that moved are free, and the others stand still; where most have moved, all are free, and the smallest
+motion that fits is taken. The points are eliminated from the normal equations (Schur complement).
+
+Two cameras that see a point each along one line tell all of their motion against each other but its scale. What moves
+all cameras alike cannot be told from a rigid motion of the body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from ringdic.arrays import Floats, Mask, Pixels
+from ringdic.calibration.adjustment import HUBER, huber_weights
+from ringdic.calibration.parameters import LENS, POSE, CameraParameters, projection_jacobians
+from ringdic.errors import ComputationError
+from ringdic.geometry.camera import Camera
+from ringdic.geometry.triangulation import reprojection_residuals, triangulate
+
+#: Shift of a camera's image beyond which it has moved, px.
+MOVED_PX = 0.06
+#: Most points that are used, and fewest that are needed.
+_MOST, _FEWEST = 3000, 50
+_STILL_PX, _UNKNOWN_PX = 0.02, 0.3  # px, motion in the image of a camera that stands still, and of one that may move
+_TAIL = 3.0  # squares of σ, for each of the six parameters, at which a motion's weight is a quarter
+_FREE = 3.0  # standard deviation of the motion of cameras that moved, in units of their root mean square
+_GAIN = 0.5  # squares of σ an observation, least gain by a motion; noise gives 0.3 on a patch of a hundred points
+_LOOSE_STEPS, _STEPS = 2, 20
+_SETTLED = 1e-3  # px, greatest motion in the image in the last step
+
+
+@dataclass(frozen=True)
+class CameraMotions:
+    """Small motions of C cameras since they were calibrated, or since the reference.
+
+    cameras : before the motion.
+    motion : (C, 6) ω (rad) and τ (mm), by which ``R ← exp([ω]×) R``, ``t ← t + τ``. covariance : (6 C, 6 C) of it.
+    shift : (C, 2) px, median shift of the points' images by the motion, and effect : (C,) px, RMS of its length; NaN
+        for a camera without points.
+    before, after : (C,) px, RMS reprojection error of each camera's points without the motion and with it, else NaN.
+    scale : factor, 1 or more, by which the standard deviations of the pixels must be multiplied to fit the residuals.
+    gain : decrease of the residuals' robust cost, in squares of σ, for each observation that the moved cameras concern.
+    used : number of points that were used.
+    """
+
+    cameras: tuple[Camera, ...]
+    motion: Floats
+    covariance: Floats
+    shift: Pixels
+    effect: Floats
+    before: Floats
+    after: Floats
+    scale: float
+    gain: float
+    used: int
+
+    @property
+    def moved(self) -> Mask:
+        """Which of the cameras, (C,) bool, moved by more than `MOVED_PX` in their images, as the residuals bear out."""
+        return np.asarray((np.nan_to_num(self.effect) > MOVED_PX) & (self.gain > _GAIN))
+
+    @property
+    def moved_cameras(self) -> tuple[Camera, ...]:
+        """The cameras after the motion where any of them moved, else as they were."""
+        if not self.moved.any():
+            return self.cameras
+        return tuple(
+            _after(CameraParameters.of(camera), each).camera(camera)
+            for camera, each in zip(self.cameras, self.motion, strict=True)
+        )
+
+
+def still_cameras(cameras: Sequence[Camera]) -> CameraMotions:
+    """No motion of C cameras, where too few points tell of one."""
+    count = len(cameras)
+    nothing = np.full(count, np.nan)
+    return CameraMotions(
+        tuple(cameras), np.zeros((count, POSE)), np.zeros((POSE * count,) * 2), np.full((count, 2), np.nan), nothing,
+        nothing, nothing, 1.0, 0.0, 0,
+    )  # fmt: skip
+
+
+def find_moved_cameras(
+    cameras: Sequence[Camera], px: Pixels, sigma: Pixels | float, covariance: Floats | None = None, *, most: int = _MOST
+) -> CameraMotions:
+    """Find which cameras moved, and how, from matched points of a specimen.
+
+    Parameters
+    ----------
+    cameras : the C cameras, with the poses that they had.
+    px : (C, n, 2) image px, NaN where a camera does not see the point.
+    sigma : (C, n, 2) px, standard deviations of the pixels, or one number.
+    covariance : (C, 6, 6) of the poses, rad and mm, to which the motion of a camera that stands still, 0.02 px in its
+        image, is added; None for that alone.
+    most : number of points that are used.
+
+    Raises
+    ------
+    ComputationError : fewer than 50 points are seen by two cameras.
+    """
+    fit = _Fit(cameras, px, sigma, most)
+    known = np.zeros((len(cameras), POSE, POSE)) if covariance is None else covariance
+    still = _inverses(known + fit.standing(_STILL_PX))
+    for _ in range(_LOOSE_STEPS):
+        fit.step(_inverses(known + fit.standing(_UNKNOWN_PX)))
+    fit.settle(lambda: still / (1.0 + fit.squares(still) / (_TAIL * POSE))[:, None, None] ** 2, still)
+    motions = fit.motions()
+    if motions.moved.any():
+        largest = float(np.sqrt(np.mean(motions.effect[motions.moved] ** 2)))
+        free = _inverses(known + fit.standing(_FREE * largest))
+        few: bool = 2 * int(motions.moved.sum()) <= len(cameras) != 2
+        prior = np.where(motions.moved[:, None, None], free, still) if few else free
+        fit.settle(lambda: prior, still)
+        motions = fit.motions()
+    return motions
+
+
+class _Fit:
+    """Least-squares fit of the motions of C cameras and of the points that they see, step by step."""
+
+    def __init__(self, cameras: Sequence[Camera], px: Pixels, sigma: Pixels | float, most: int) -> None:
+        px = np.asarray(px, dtype=np.float64)
+        sigma = np.broadcast_to(np.asarray(sigma, dtype=np.float64), px.shape)
+        shared = np.flatnonzero((np.isfinite(px).all(axis=2) & np.isfinite(sigma).all(axis=2)).sum(axis=0) >= 2)
+        if len(shared) < _FEWEST:
+            raise ComputationError(
+                f"{len(shared)} points are seen by two cameras; finding cameras that moved needs at least {_FEWEST}"
+            )
+        chosen = shared[np.linspace(0, len(shared) - 1, min(len(shared), most)).astype(int)]
+        px, sigma = px[:, chosen], sigma[:, chosen]
+        xyz = triangulate(cameras, px)
+        whole = np.isfinite(xyz).all(axis=1)
+        self.cameras, self.px, self.sigma, self.xyz = tuple(cameras), px[:, whole], sigma[:, whole], xyz[whole]
+        self.seen: Mask = np.asarray(np.isfinite(self.px + self.sigma).all(axis=2))
+        self.start = [CameraParameters.of(camera) for camera in cameras]
+        self.motion, self.covariance = np.zeros((len(cameras), POSE)), np.zeros((POSE * len(cameras),) * 2)
+        self.scale = 1.0
+        self.before = _reprojection_rms(cameras, self.px)
+        self.residuals = reprojection_residuals(cameras, self.xyz, self.px)
+
+    def standing(self, px: float) -> Floats:
+        """Covariances (C, 6, 6), rad and mm, of motions by which the points move by some px in the images."""
+        focal = np.array([first.inner[0] for first in self.start])
+        far = np.array([np.median((self.xyz @ one.rotation.T + one.translation)[:, 2]) for one in self.start])
+        deviations = np.stack([px / focal] * 3 + [px * far / focal] * 3, axis=1)
+        return np.asarray(np.eye(POSE) * (deviations**2)[:, None, :])
+
+    def squares(self, information: Floats, motion: Floats | None = None) -> Floats:
+        """Squared Mahalanobis length (C,) of the motions, or of others (C, 6), by information matrices (C, 6, 6)."""
+        p = self.motion if motion is None else motion
+        return np.asarray(np.einsum("ci,cij,cj->c", p, information, p))
+
+    def settle(self, prior: Callable[[], Floats], still: Floats) -> None:
+        """Take steps until they are negligible.
+
+        prior : function that gives the information matrices (C, 6, 6) of the motions. still : those of cameras that
+        stand still.
+        """
+        for _ in range(_STEPS):
+            if self.squares(still, self.step(prior())).max() < (_SETTLED / _STILL_PX) ** 2:
+                break
+
+    def step(self, prior: Floats) -> Floats:
+        """Take one Gauss-Newton step of motions and points; returns that of the motions, (C, 6) rad and mm.
+
+        prior : (C, 6, 6) information matrices of the motions.
+        """
+        count, n = len(self.cameras), len(self.xyz)
+        poses = [_after(first, each) for first, each in zip(self.start, self.motion, strict=True)]
+        rows = [
+            (np.flatnonzero(seen), *projection_jacobians(pose, self.xyz[seen]))
+            for seen, pose in zip(self.seen, poses, strict=True)
+        ]
+        residuals = [self.px[c, at] - expected for c, (at, expected, _, _) in enumerate(rows)]
+        self.scale = self._robust_scale(residuals)
+        N, right = scipy.linalg.block_diag(*prior), -np.einsum("cij,cj->ci", prior, self.motion)
+        H, h, B = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3, count, POSE))
+        for c, ((at, _, by_parameters, by_point), r) in enumerate(zip(rows, residuals, strict=True)):
+            w = huber_weights(r, self.scale * self.sigma[c, at])
+            A = by_parameters[:, :, LENS:]
+            weighted, across = A * w[..., None], by_point * w[..., None]
+            N[POSE * c : POSE * (c + 1), POSE * c : POSE * (c + 1)] += np.tensordot(A, weighted, ((0, 1), (0, 1)))
+            right[c] += np.tensordot(weighted, r, ((0, 1), (0, 1)))
+            H[at] += across.transpose(0, 2, 1) @ by_point
+            h[at] += np.einsum("nri,nr->ni", across, r)
+            B[at, :, c] = across.transpose(0, 2, 1) @ A
+        H += 1e-12 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        solved = np.linalg.solve(H, np.concatenate([B.reshape(n, 3, -1), h[..., None]], axis=2))
+        flat = B.reshape(3 * n, -1).T
+        N -= flat @ solved[..., :-1].reshape(3 * n, -1)
+        size = 1 / np.sqrt(np.diag(N))
+        self.covariance = np.linalg.inv(N * np.outer(size, size)) * np.outer(size, size)
+        step = self.covariance @ (right.ravel() - flat @ solved[..., -1].ravel())
+        self.xyz = self.xyz + solved[..., -1] - solved[..., :-1] @ step
+        self.motion = self.motion + step.reshape(count, POSE)
+        return step.reshape(count, POSE)
+
+    def _gain(self, moved: Sequence[Camera], which: Mask) -> float:
+        """Decrease of the residuals' robust cost by the motions, for each observation of the points that they concern.
+
+        moved : the cameras after their motions. which : (C,) bool, those whose points count.
+        """
+        concerned = self.seen & self.seen[which].any(axis=0)
+        if not concerned.any():
+            return 0.0
+        after = reprojection_residuals(moved, triangulate(moved, self.px), self.px)
+        ratios = (np.abs(r[concerned]) / (self.scale * self.sigma[concerned]) for r in (self.residuals, after))
+        before, now = (np.sum(np.where(r < HUBER, r**2, 2 * HUBER * r - HUBER**2)) for r in ratios)
+        return float((before - now) / concerned.sum())
+
+    def motions(self) -> CameraMotions:
+        """The motions so far, and measures of the fit."""
+        moved = [
+            _after(first, each).camera(camera)
+            for first, each, camera in zip(self.start, self.motion, self.cameras, strict=True)
+        ]
+        shift, effect = np.full((len(moved), 2), np.nan), np.full(len(moved), np.nan)
+        for c, (before, after, seen) in enumerate(zip(self.cameras, moved, self.seen, strict=True)):
+            if seen.any():
+                shifts = after.project(self.xyz[seen]) - before.project(self.xyz[seen])
+                shift[c], effect[c] = np.median(shifts, axis=0), np.sqrt(np.mean(np.sum(shifts**2, axis=1)))
+        return CameraMotions(
+            self.cameras, self.motion, self.covariance, shift, effect, self.before,
+            _reprojection_rms(moved, self.px), self.scale, self._gain(moved, np.nan_to_num(effect) > MOVED_PX),
+            len(self.xyz),
+        )  # fmt: skip
+
+    def _robust_scale(self, residuals: Sequence[Floats]) -> float:
+        """Robust ratio, 1 or more, of the residuals, (k, 2) px of each camera, to their standard deviations.
+
+        It is the square root of the median, over the points, of χ² in units of its expected median; a point seen by m
+        cameras has 2 m − 3 degrees of freedom.
+        """
+        square, views = np.zeros(len(self.xyz)), self.seen.sum(axis=0)
+        for r, sigma, seen in zip(residuals, self.sigma, self.seen, strict=True):
+            square[seen] += np.sum((r / sigma[seen]) ** 2, axis=1)
+        median = 2.0 * scipy.special.gammaincinv(0.5 * np.maximum(2 * views - 3, 1), 0.5)  # of the χ² distribution
+        return max(1.0, float(np.sqrt(np.median((square / median)[views >= 2]))))
+
+
+def _inverses(matrices: Floats) -> Floats:
+    """Inverses (n, k, k) of matrices (n, k, k)."""
+    return np.asarray(np.linalg.inv(matrices), dtype=float)
+
+
+def _after(start: CameraParameters, motion: Floats) -> CameraParameters:
+    """The parameters of a camera after a motion (6,) of its pose, ω (rad) and τ (mm)."""
+    return start.plus(np.concatenate([np.zeros(LENS), motion]))
+
+
+def _reprojection_rms(cameras: Sequence[Camera], px: Pixels) -> Floats:
+    """RMS reprojection error of each camera's points, (C,) px, after their triangulation. px : (C, n, 2)."""
+    residuals = reprojection_residuals(cameras, triangulate(cameras, px), px)
+    squares = np.sum(residuals**2, axis=2)
+    count = np.isfinite(squares).sum(axis=1)
+    return np.sqrt(np.where(count > 0, np.nansum(squares, axis=1) / np.maximum(count, 1), np.nan))
