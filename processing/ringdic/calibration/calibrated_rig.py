@@ -17,13 +17,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.calibration.advice import camera_advice, pair_advice
 from ringdic.calibration.azimuths import AzimuthCandidates, azimuth_candidates, camera_azimuths
 from ringdic.calibration.bundle import BundleFit, TargetPrior, bundle_adjustment
 from ringdic.calibration.camera_calibration import CameraCalibration, calibrate_camera
+from ringdic.calibration.contradictions import ExpectedErrors, contradictions
 from ringdic.calibration.dots import find_dots
 from ringdic.calibration.intrinsics import read_intrinsics
 from ringdic.calibration.quality import (
@@ -41,9 +41,7 @@ from ringdic.session.rig import Rig, Target
 from ringdic.settings import CalibrationGroup
 from ringdic.tasks.step_images import Digests
 
-_VERSION = 4  # of the method; raise it when stored calibrations are no longer what a new run would give
-#: Squared Mahalanobis distance per parameter between the lenses by board and by target that shows a fault of one.
-_LENS_CHI2 = 25.0
+_VERSION = 5  # of the method; raise it when stored calibrations are no longer what a new run would give
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,8 @@ class CalibratedRig:
 
     target : as the rig describes it.
     cameras : calibrations by camera id.
-    findings : cameras without an image of the target, a rotated target, and lenses that do not agree with the board.
+    findings : cameras without an image of the target, a rotated target, and what contradicts: measures of the target,
+        lenses of the boards, places of the dots.
     bundle : fit of the bundle adjustment, None where each camera was calibrated alone.
     quality, pairs : figures of each camera, and of the rig's pairs that see dots in common.
     advice : sentences on what would improve the calibration.
@@ -105,11 +104,11 @@ def calibrate_rig(
             keys.append(key)
             done += 1
             progress(done / len(taking_part), f"camera {id_}")
+    findings = (*findings, *contradictions(calibrated, session.rig.target, _expected(settings)))
     if settings.method == "dlt":
         return _with_quality(session.rig, CalibratedRig(session.rig.target, calibrated, findings))
     progress(1.0, "all cameras together")
     adjusted, fit = _bundle(session, calibrated, keys, settings)
-    findings = (*findings, *_contradictions(fit))
     return _with_quality(session.rig, CalibratedRig(session.rig.target, adjusted, findings, fit))
 
 
@@ -217,19 +216,11 @@ def _bundle(
     return adjusted, fit
 
 
-def _contradictions(fit: BundleFit) -> tuple[Finding, ...]:
-    """A finding that names cameras whose lenses by target and by board contradict each other; none if all agree."""
-    off = [id_ for id_, chi2 in zip(fit.cameras, fit.lens_chi2, strict=True) if chi2 > _LENS_CHI2]
-    if not off:
-        return ()
-    worst = math.sqrt(float(np.nanmax(fit.lens_chi2)))
-    sentence = (
-        f"camera {', '.join(off)}: the lens that fits the target is up to {worst:.0f} standard errors from the one "
-        "that fits the checkerboard, so the board counted less; check that the board is flat and its squares true, "
-        "that rig.toml describes the target, and that no lens was touched in between"
-    )
-    limit = math.sqrt(_LENS_CHI2)
-    return (Finding("lens-contradicts-target", sentence, tuple(off), value=worst, limit=limit, unit="σ"),)
+def _expected(settings: CalibrationGroup) -> ExpectedErrors:
+    """How far the target may be from its measures: more, where the adjustment releases them."""
+    if settings.method == "dlt":
+        return ExpectedErrors(settings.print_error_mm)
+    return ExpectedErrors(settings.print_error_mm, settings.radius_error_mm, settings.pitch_error_mm)
 
 
 def _stored(path: Path) -> dict[str, Any] | None:

@@ -58,6 +58,8 @@ class IntrinsicsFit:
     coverage : part of the image that the board covers in these views together, 0 to 1.
     residual_distortion : px, RMS over cells of the image of the mean residual in a cell, less what noise explains; it
         shows a lens or a board that differs from the model.
+    redundancy_factor : 1 or more, coordinates of corners per independent one: what the bend of a board displaces, it
+        displaces together, so that the true covariance is larger than ``covariance`` by about this factor.
     """
 
     intrinsics: Intrinsics
@@ -70,6 +72,7 @@ class IntrinsicsFit:
     reason: str = ""
     coverage: float = float("nan")
     residual_distortion: float = float("nan")
+    redundancy_factor: float = 1.0
 
     def to_dict(self) -> dict[str, Any]:
         """The fit as JSON values."""
@@ -156,6 +159,7 @@ def calibrate_intrinsics(
         choice.reason,
         coverage(px[inliers], size),
         residual_distortion(px[inliers], residuals, size),
+        max(1.0, residuals.size / independent_observations(residuals, board[:, :2])),
     )
 
 

@@ -27,7 +27,13 @@ CODES: dict[str, tuple[Verdict, str]] = {
     # calibration
     "camera-not-calibrated": (_LOOK, "a camera has no image of the target, and takes no part"),
     "target-turned": (_LOOK, "the target is turned against the azimuths in rig.toml"),
+    "target-measures": (_STOP, "the target does not have the measures of rig.toml"),
+    "print-errors": (_LOOK, "dots of the target are printed off their places"),
+    "print-errors-large": (_STOP, "dots of the target are far from where the target should have them"),
     "lens-contradicts-target": (_STOP, "the lenses that fit the target are not those that fit the board"),
+    "camera-refocused": (_STOP, "a camera's focal length changed between board and target"),
+    "wrong-board": (_STOP, "the board images of a camera are those of another camera"),
+    "images-mirrored": (_STOP, "board and target images of a camera are not turned over alike"),
     # cameras
     "pair-left-out": (_LOOK, "two neighbouring cameras cannot be used together"),
     "camera-unmatched": (_LOOK, "a camera shares hardly a point with another"),
