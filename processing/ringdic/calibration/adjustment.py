@@ -143,6 +143,8 @@ class Solution:
     covariance : (16 C + 3, 16 C + 3) of cameras and sheet, px, mm and rad; zero for fixed parameters.
     dots_covariance : (m, 2, 2) mm², of the print errors.
     chi2 : (C,) sum of squared residuals of each camera's centroids in units of their variance, per degree of freedom.
+    held_out : (n, 2) px, centroids minus those that the adjustment without their dot predicts, for a dot without print
+        error.
     iterations : number of steps.
     """
 
@@ -151,6 +153,7 @@ class Solution:
     covariance: Floats
     dots_covariance: Floats
     chi2: Floats
+    held_out: Pixels
     iterations: int
 
 
@@ -190,7 +193,9 @@ def adjust(problem: Problem, start: State, print_sigma: float) -> Solution:
     redundancy = 1 - _leverage(problem, normal, covariance, crossed, dots_covariance)
     whole = np.zeros((len(problem.free),) * 2)
     whole[np.ix_(problem.free, problem.free)] = covariance
-    return Solution(state, scales, whole, dots_covariance, _chi2(problem, normal, redundancy), iterations)
+    chi2 = _chi2(problem, normal, redundancy)
+    held_out = _held_out(problem, state, normal, covariance)
+    return Solution(state, scales, whole, dots_covariance, chi2, held_out, iterations)
 
 
 @dataclass(frozen=True)
@@ -366,6 +371,36 @@ def _leverage(problem: Problem, normal: _Normal, covariance: Floats, crossed: Fl
         leverage += 2 * np.einsum("nri,nri->nr", both, by_dot)
         leverage += np.einsum("nri,nij,nrj->nr", by_dot, dots[problem.dot], by_dot)
     return np.asarray(leverage * normal.weights, dtype=np.float64)
+
+
+def _held_out(problem: Problem, state: State, normal: _Normal, covariance: Floats) -> Pixels:
+    """Residuals (n, 2) px that the views of each dot would have had, had the dot taken no part in the adjustment.
+
+    With the print errors eliminated, the views of a dot have the covariance ``V = W⁻¹ + σ_d² D Dᵀ``, D their
+    derivatives by its place, and the residuals ``(I − J N⁻¹ Jᵀ V⁻¹)⁻¹ r`` when they are left out. covariance : (k, k),
+    N⁻¹ of cameras and sheet.
+    """
+    n, m = len(problem.px), len(problem.rows)
+    order = np.argsort(problem.dot, kind="stable")
+    count = np.bincount(problem.dot, minlength=m)
+    place = np.arange(n) - np.repeat(np.cumsum(count) - count, count)
+    views = np.full((m, int(count.max())), n)  # the observations of each dot; n, a row of zeros, where there are fewer
+    views[problem.dot[order], place] = order
+
+    def of_dots(values: Floats) -> Floats:
+        """Values of observations (n, 2, j) as (m, 2 v, j) of the views of each dot."""
+        padded = np.concatenate([values, np.zeros((1, *values.shape[1:]))])
+        return np.asarray(padded[views].reshape(m, 2 * views.shape[1], values.shape[2]))
+
+    r = normal.residuals + np.einsum("nij,nj->ni", normal.by_dot, state.offsets[problem.dot])
+    J, D = of_dots(normal.by_rest.toarray().reshape(n, 2, -1)), of_dots(normal.by_dot)
+    variance = 1 / of_dots(normal.weights[..., None])[..., 0].clip(1e-300)
+    V = normal.scales.print**2 * D @ np.swapaxes(D, 1, 2) + variance[..., None] * np.eye(J.shape[1])
+    H = np.swapaxes(np.linalg.solve(V, J @ covariance @ np.swapaxes(J, 1, 2)), 1, 2)
+    left_out = np.linalg.solve(np.eye(J.shape[1]) - H, of_dots(r[..., None]))
+    result = np.empty((n + 1, 2))
+    result[views.ravel()] = left_out.reshape(-1, 2)
+    return result[:n]
 
 
 def _robust_sigma(residuals: Floats) -> float:

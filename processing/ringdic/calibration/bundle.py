@@ -203,7 +203,7 @@ def bundle_adjustment(
         solution.iterations,
     )
     adjusted = {
-        id_: _adjusted_calibration(calibrations[id_], number, problem, inliers, solution.state)
+        id_: _adjusted_calibration(calibrations[id_], number, problem, inliers, solution)
         for number, id_ in enumerate(ids)
     }
     return adjusted, _fit(ids, part, solution)
@@ -304,9 +304,10 @@ def _require_dots(ids: tuple[str, ...], part: Problem) -> None:
 
 
 def _adjusted_calibration(
-    given: CameraCalibration, number: int, problem: Problem, inliers: Mask, state: State
+    given: CameraCalibration, number: int, problem: Problem, inliers: Mask, solution: Solution
 ) -> CameraCalibration:
     """The calibration of camera ``number`` after the adjustment. inliers : (n,) observations without gross errors."""
+    state = solution.state
     parameters = CameraParameters(state.inner[number], state.rotation[number], state.translation[number])
     camera = parameters.camera(given.camera)
     own = problem.camera == number
@@ -323,6 +324,7 @@ def _adjusted_calibration(
         residuals=camera.undistort(dots.px) - camera.undistort(centroid),
         left_out=given.left_out + int((~inliers[own]).sum()),
         centroid_shift=centroid - problem.project_centres(state)[own & inliers],
+        held_out=solution.held_out[own[inliers]],
     )
 
 

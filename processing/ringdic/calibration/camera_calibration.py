@@ -24,6 +24,8 @@ from ringdic.session.rig import Rig
 _FOCAL_UNCERTAINTY = 0.03
 #: Least residual of a dot that is a gross error, px.
 _OUTLIER_FLOOR = 0.3
+#: Parts of the dots that are held out in turn.
+_FOLDS = 5
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,8 @@ class CameraCalibration:
         after the direct linear transformation, which neglects the difference.
     views : names of the board images in which the board was detected, in the order of the fit's views.
     blank : names of the board images in which it was not.
+    held_out : (n, 2) px, measured minus predicted positions of the dots in the image, each predicted from the target's
+        nominal geometry by a calibration in which the dot took no part; None where this was not tried.
     """
 
     camera: Camera
@@ -49,6 +53,7 @@ class CameraCalibration:
     centroid_shift: Pixels
     views: tuple[str, ...] = ()
     blank: tuple[str, ...] = ()
+    held_out: Pixels | None = None
 
     def __post_init__(self) -> None:
         if self.residuals.shape != (len(self.dots), 2) or self.centroid_shift.shape != (len(self.dots), 2):
@@ -60,6 +65,14 @@ class CameraCalibration:
         return self.dots.px - self.centroid_shift
 
     @property
+    def control_points(self) -> Pixels:
+        """Image positions of the dots as control points, with the errors that they have when held out, (n, 2) px.
+
+        Triangulated, they come back at `dots.xyz` but for these errors. Without ``held_out``, the measured centres.
+        """
+        return self.dot_centres if self.held_out is None else self.camera.project(self.dots.xyz) + self.held_out
+
+    @property
     def residual_rms(self) -> float:
         """RMS length of the dots' residuals, undistorted px."""
         return float(np.sqrt(np.mean(np.sum(self.residuals**2, axis=1))))
@@ -68,7 +81,7 @@ class CameraCalibration:
         """The calibration as JSON values."""
         own = {
             name: json_value(getattr(self, name))
-            for name in ("residuals", "left_out", "centroid_shift", "views", "blank")
+            for name in ("residuals", "left_out", "centroid_shift", "views", "blank", "held_out")
         }
         camera = {name: json_value(getattr(self.camera, name)) for name in ("size", "P", "intrinsics")}
         fit = None if self.fit is None else self.fit.to_dict()
@@ -89,6 +102,7 @@ class CameraCalibration:
             np.array(values["centroid_shift"], dtype=float).reshape(-1, 2),
             tuple(values["views"]),
             tuple(values["blank"]),
+            None if values["held_out"] is None else np.array(values["held_out"], dtype=float).reshape(-1, 2),
         )
 
 
@@ -186,11 +200,27 @@ def _dlt_calibration(
     undistorted = dots.px if lens is None else lens.to_undistorted(dots.px)
     L, inliers = dlt.solve_dlt_robust(dots.xyz, undistorted, sigmas=5.0, floor=_OUTLIER_FLOOR)
     used = dots.subset(inliers)
+    camera = Camera(camera_id, dlt.to_projection(L), size, lens)
     return CameraCalibration(
-        camera=Camera(camera_id, dlt.to_projection(L), size, lens),
+        camera=camera,
         dots=used,
         residuals=dlt.residuals(L, used.xyz, undistorted[inliers]),
         left_out=int((~inliers).sum()),
         fit=fit,
         centroid_shift=np.zeros((len(used), 2)),
+        held_out=_held_out(camera, used, undistorted[inliers]),
     )
+
+
+def _held_out(camera: Camera, dots: DotObservations, undistorted: Pixels) -> Pixels:
+    """Measured minus predicted positions of the dots in the image, each fold predicted by the DLT of the others.
+
+    undistorted : (n, 2) px, of the dots. Returns (n, 2) px.
+    """
+    residuals = np.empty((len(dots), 2))
+    fold = (dots.rows + 2 * dots.columns) % _FOLDS
+    for each in range(_FOLDS):
+        out = fold == each
+        P = dlt.to_projection(dlt.solve_dlt(dots.xyz[~out], undistorted[~out]))
+        residuals[out] = dots.px[out] - replace(camera, P=P).project(dots.xyz[out])
+    return residuals

@@ -139,8 +139,8 @@ class PairQuality:
 def pair_quality(first: CameraCalibration, second: CameraCalibration) -> tuple[ReconstructionError, PairQuality]:
     """Reconstruction error of the dots that two cameras both see, and quality measures of the pair.
 
-    The true positions are those of the calibrations' dots: after a bundle adjustment they contain the estimated print
-    errors. Raises ComputationError where no dot is seen by both.
+    Every dot is judged by a calibration in which it took no part, against where the target has it without print error:
+    so the error contains the print's. Raises ComputationError where no dot is seen by both.
     """
     indices = [
         {(int(row), int(column)): i for i, (row, column) in enumerate(zip(dots.rows, dots.columns, strict=True))}
@@ -153,7 +153,7 @@ def pair_quality(first: CameraCalibration, second: CameraCalibration) -> tuple[R
             "check that nothing hides the target, and their azimuths in rig.toml"
         )
     chosen = [[index[dot] for dot in common] for index in indices]
-    px = np.stack([first.dot_centres[chosen[0]], second.dot_centres[chosen[1]]])
+    px = np.stack([first.control_points[chosen[0]], second.control_points[chosen[1]]])
     cameras = [first.camera, second.camera]
     xyz = triangulate(cameras, px)
     error = reconstruction_error(first.dots.xyz[chosen[0]], xyz)

@@ -22,6 +22,7 @@ from ringdic.calibration.bundle import BundleFit, TargetPrior, bundle_adjustment
 from ringdic.calibration.camera_calibration import CameraCalibration
 from ringdic.calibration.intrinsics import IntrinsicsFit
 from ringdic.calibration.patch import DotViews, PrintedSheet, patch_jacobians, project_patches, quadrature, sheet_points
+from ringdic.calibration.quality import pair_quality
 from ringdic.calibration.target import dot_points
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera, Intrinsics
@@ -305,3 +306,40 @@ def test_the_adjustment_survives_json(true_cameras, fits) -> None:
     stored = CameraCalibration.from_dict(json.loads(json.dumps(cameras["c01"].to_dict())))
     assert stored.to_dict() == cameras["c01"].to_dict()
     assert np.array_equal(stored.dot_centres, cameras["c01"].dot_centres)
+
+
+def without_a_dot(each: CameraCalibration, row: int, column: int) -> CameraCalibration:
+    kept = (each.dots.rows != row) | (each.dots.columns != column)
+    shift = each.centroid_shift[kept]
+    return replace(each, dots=each.dots.subset(kept), residuals=each.residuals[kept], centroid_shift=shift)
+
+
+@pytest.mark.parametrize("print_error", [0.0, 0.03])
+def test_held_out_dots_are_those_of_an_adjustment_without_them(true_cameras, fits, print_error) -> None:
+    some = {name: true_cameras[name] for name in NAMES[:3]}
+    start = seen_by_all(some, fits, 15, print_error=print_error)
+    cameras, _ = bundle_adjustment(start, TARGET)
+    for row, column in [(10, 3), (1, 1), (20, 5)]:  # inside, in a corner, at the upper edge
+        without, _ = bundle_adjustment({id_: without_a_dot(each, row, column) for id_, each in start.items()}, TARGET)
+        for id_, each in cameras.items():
+            place = np.flatnonzero((each.dots.rows == row) & (each.dots.columns == column))
+            if not len(place):
+                continue
+            camera, at = without[id_].camera, (np.array([row]), np.array([column]))
+            predicted = camera.project(dot_points(TARGET, *at)) + centroid_shift(camera, TARGET, *at)
+            # To the first order of what one dot changes, a tenth of a pixel at most.
+            assert np.allclose(each.held_out[place], each.dots.px[place] - predicted, rtol=0, atol=1e-3)
+            assert print_error == 0 or np.linalg.norm(each.held_out[place]) > 2 * np.linalg.norm(each.residuals[place])
+
+
+def test_control_points_do_not_judge_themselves(true_cameras, fits) -> None:
+    # A print 0.5 % too large: the adjustment fits its own dots, and those that it did not see tell the truth.
+    some = {name: true_cameras[name] for name in NAMES[:3]}
+    scaled = replace(TARGET, row_spacing_mm=12.06, column_spacing_mm=12.06)
+    cameras, _ = bundle_adjustment(seen_by_all(some, fits, 16, target=scaled), TARGET)
+    pair = [cameras["c01"], cameras["c02"]]
+    own = [replace(each, held_out=None) for each in pair]
+    assert pair_quality(*own)[0].rms < 0.02
+    assert pair_quality(*pair)[0].rms > 0.1
+    calm, _ = bundle_adjustment(seen_by_all(some, fits, 16), TARGET)
+    assert pair_quality(calm["c01"], calm["c02"])[0].rms < 0.006

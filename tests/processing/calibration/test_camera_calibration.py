@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from ringdic.calibration import dlt
 from ringdic.calibration.camera_calibration import CameraCalibration, calibrate_camera
 from ringdic.calibration.quality import camera_quality, reconstruction_error
 from ringdic.errors import ComputationError, InputError
@@ -168,3 +169,15 @@ def test_reconstruction_error_follows_its_definition():
     assert error.mean == pytest.approx(np.hypot(0.4, 0.2) / 3)
     assert error.rms == pytest.approx(np.sqrt((0.09 + 0.01 + 0.04) / 3))
     assert reconstruction_error(true, np.full((4, 3), np.nan)).points == 0
+
+
+def test_held_out_dots_are_predicted_by_the_others(ring) -> None:
+    each = ring[0]
+    fold = (each.dots.rows + 2 * each.dots.columns) % 5
+    out = fold == fold[0]
+    L = dlt.solve_dlt(each.dots.xyz[~out], each.camera.undistort(each.dots.px[~out]))
+    others = replace(each.camera, P=dlt.to_projection(L))
+    assert np.allclose(each.held_out[out], each.dots.px[out] - others.project(each.dots.xyz[out]), rtol=0, atol=1e-9)
+    # A dot that took part pulls the camera to itself.
+    own = each.dots.px - each.camera.project(each.dots.xyz)
+    assert 1.0 < np.linalg.norm(each.held_out) / np.linalg.norm(own) < 1.2
