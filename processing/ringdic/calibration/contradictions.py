@@ -16,6 +16,8 @@ from ringdic.session.rig import Target
 #: Least deviation of a measure of the target that is a finding, as a part of it, and in units of what is expected; its
 #: least ratio to the standard error; and least error that the model itself may have, as a part.
 _MEASURE, _USUAL, _SURE, _MODEL = 0.002, 4.0, 5.0, 1e-4
+#: Least bend of a checkerboard that is a finding, mm.
+_BEND = 0.1
 #: Least rotation of the printed sheet on its cylinder that is a finding, rad.
 _TILT = 0.005
 #: Least deviation of a focal length that is a finding, as a part of it.
@@ -60,14 +62,30 @@ def contradictions(
     ordinary print.
     """
     expected = expected or ExpectedErrors()
+    bent = _of_boards(calibrations)
     measures = target_measures(calibrations, target, expected.tolerance(target))
     if measures is None:
-        return ()
+        return bent
     return (
+        *bent,
         *_of_target(measures, target, expected),
         *_of_lenses(measures, calibrations),
         *_of_dots(measures.evidence, expected.print_error),
     )
+
+
+def _of_boards(calibrations: Mapping[str, CameraCalibration]) -> tuple[Finding, ...]:
+    """A finding that names the cameras whose board was bent; none where it was flat."""
+    bends = {id_: each.fit.bend for id_, each in calibrations.items() if each.fit is not None}
+    ids = tuple(id_ for id_, bend in bends.items() if bend > _BEND)
+    if not ids:
+        return ()
+    worst = max(bends.values())
+    sentence = (
+        f"camera {', '.join(ids)}: the checkerboard was bent by up to {worst:.2f} mm between its middle and its edges; "
+        "the lens was fitted to the bent board, but use a stiff flat board, as another bend in each view cannot be seen"
+    )
+    return (Finding("board-not-flat", sentence, ids, value=worst, limit=_BEND, unit="mm"),)
 
 
 def _of_target(measures: TargetMeasures, target: Target, expected: ExpectedErrors) -> list[Finding]:

@@ -40,6 +40,9 @@ VIEWS_FOR_DROPPING = 10
 _ALWAYS = np.array([True, True, False, True, True, True, True, False, False, False])
 #: Least standard deviation of a corner that is supposed, px.
 _CORNER_FLOOR = 1e-6
+#: Squared Mahalanobis distance from a flat board, of three numbers, that shows a bend for certain; and how often it is
+#: followed.
+_BENT, _MOST_BENDS = 50.0, 4
 #: Fewest views that determine a camera with free skew, focal lengths and principal point.
 VIEWS_NEEDED = 3
 
@@ -60,6 +63,8 @@ class IntrinsicsFit:
         shows a lens or a board that differs from the model.
     redundancy_factor : 1 or more, coordinates of corners per independent one: what the bend of a board displaces, it
         displaces together, so that the true covariance is larger than ``covariance`` by about this factor.
+    bend, bend_sigma : mm, height of the board's surface over its corners, highest minus lowest, and its standard error.
+        Where the views show a bend for certain, the lens is fitted to the bent board; 0 for a flat one.
     """
 
     intrinsics: Intrinsics
@@ -73,6 +78,8 @@ class IntrinsicsFit:
     coverage: float = float("nan")
     residual_distortion: float = float("nan")
     redundancy_factor: float = 1.0
+    bend: float = 0.0
+    bend_sigma: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
         """The fit as JSON values."""
@@ -139,9 +146,17 @@ def calibrate_intrinsics(
     px = np.stack([np.asarray(view, dtype=float).reshape(-1, 2) for view in views])
     board = np.column_stack([np.asarray(board_xy, dtype=float), np.zeros(len(board_xy))])
     models = candidate_models(radial, tangential, skew, fewest_terms)
-    state, _ = _refine(_start(px, board, size), px, board, models[0].free)
-    inliers = _inlier_views(_view_errors(state, px, board), drop_percentile)
-    choice, state, covariance = _fit_of_chosen_model(models, state, px, board, inliers, fewest_terms)
+    state = _start(px, board, size)
+    for _ in range(_MOST_BENDS):
+        state, _ = _refine(state, px, board, models[0].free)
+        inliers = _inlier_views(_view_errors(state, px, board), drop_percentile)
+        choice, state, covariance = _fit_of_chosen_model(models, state, px, board, inliers, fewest_terms)
+        bend = _board_bend(_of_views(state, inliers), px[inliers], board, choice.model.free)
+        if bend.chi2 < _BENT:
+            break
+        board = board + bend.heights[:, None] * np.array([0.0, 0.0, 1.0])
+    bent = float(np.ptp(board[:, 2]))
+    covariance = bend.lens_covariance if bent else covariance
     state, _ = _refine(state, px, board, np.zeros(10, dtype=bool))  # poses of all views, with the intrinsics fixed
     errors = _view_errors(state, px, board)
     residuals = (px - _project(state, board))[inliers]
@@ -160,10 +175,64 @@ def calibrate_intrinsics(
         coverage(px[inliers], size),
         residual_distortion(px[inliers], residuals, size),
         max(1.0, residuals.size / independent_observations(residuals, board[:, :2])),
+        bent,
+        bend.sigma,
     )
 
 
 _State = tuple[Floats, Floats, Floats]  # inner (10,), rotations (views, 3, 3), translations (views, 3) mm
+
+
+def _of_views(state: _State, which: Mask) -> _State:
+    """The state with the poses of some views only. which : (v,) bool."""
+    return state[0], state[1][which], state[2][which]
+
+
+@dataclass(frozen=True)
+class _Bend:
+    """Quadratic bend of a board, beside the shape that its corners have already.
+
+    heights : (n,) mm, of the corners. sigma : mm, standard error of the height of the board's edge over its middle.
+    chi2 : squared Mahalanobis distance from no bend, about 3 without one. lens_covariance : (10, 10), with a free bend.
+    """
+
+    heights: Floats
+    sigma: float
+    chi2: float
+    lens_covariance: Floats
+
+
+def _board_bend(state: _State, px: Pixels, board: Points, free: Mask) -> _Bend:
+    """Bend that lowers the residuals of all v views most, with the lens and the poses free to follow, to first order.
+
+    px : (v, n, 2). board : (n, 3) mm. free : (10,) parameters of the lens. Standard errors are for as many residuals as
+    are independent without the bend.
+    """
+    centred = board[:, :2] - board[:, :2].mean(axis=0)
+    x, y = (centred / np.abs(centred).max()).T
+    modes = np.column_stack([x * x, x * y, y * y])
+    projected, by_inner, by_pose, by_point = pose_jacobians(lens_of(state[0]), *_in_cameras(state, board))
+    by_height = (by_point @ state[1][:, None])[..., 2:]
+    J, r = np.concatenate([by_inner[..., free], by_height * modes[:, None]], axis=-1), px - projected
+    A, B, C, a, c = _normal_equations(r, J, by_pose)
+    change, pose = _solve(A, B, C, a, c, 0.0)
+    left = r - J @ change - np.einsum("vnij,vj->vni", by_pose, pose)
+    degrees = max(r.size - len(change) - 6 * len(px), 1)
+    variance = max(float(np.sum(left**2)) / degrees, _CORNER_FLOOR**2)
+    covariance = variance * _inner_inverse(A, B, C)
+    redundancy = max(1.0, left.size / independent_observations(left, board[:, :2]))
+    q, of_bend = change[-3:], redundancy * covariance[-3:, -3:]
+    lens = np.zeros((10, 10))
+    lens[np.ix_(free, free)] = covariance[:-3, :-3]
+    sigma = float(np.sqrt(np.max(np.einsum("ni,ij,nj->n", modes, of_bend, modes))))
+    return _Bend(modes @ q, sigma, float(q @ np.linalg.pinv(of_bend) @ q), lens)
+
+
+def _inner_inverse(A: Floats, B: Floats, C: Floats) -> Floats:
+    """Inverse (p, p) of the normal equations of the inner parameters after elimination of the poses."""
+    S = A - np.einsum("vij,vjk,vlk->il", B, np.linalg.inv(C), B)
+    scale = np.sqrt(np.diag(A))
+    return np.asarray(np.linalg.pinv(S / np.outer(scale, scale)) / np.outer(scale, scale))
 
 
 def _fit_of_chosen_model(
@@ -295,11 +364,8 @@ def _refine(state: _State, px: Pixels, board: Points, free: Mask) -> tuple[_Stat
         return state, covariance
     A, B, C, _, _ = _normal_equations(px - projected, by_inner[..., free], by_pose)
     degrees = max(px.size - int(free.sum()) - 6 * len(px), 1)
-    S = A - np.einsum("vij,vjk,vlk->il", B, np.linalg.inv(C), B)
-    scale = np.sqrt(np.diag(A))
-    inverse = np.linalg.pinv(S / np.outer(scale, scale)) / np.outer(scale, scale)
     # Without a least error of corners, exact data would give an infinite weight.
-    covariance[np.ix_(free, free)] = inverse * max(cost / degrees, _CORNER_FLOOR**2)
+    covariance[np.ix_(free, free)] = _inner_inverse(A, B, C) * max(cost / degrees, _CORNER_FLOOR**2)
     return state, covariance
 
 

@@ -31,6 +31,7 @@ CODES: dict[str, tuple[Verdict, str]] = {
     "print-errors": (_LOOK, "dots of the target are printed off their places"),
     "print-errors-large": (_STOP, "dots of the target are far from where the target should have them"),
     "lens-contradicts-target": (_STOP, "the lenses that fit the target are not those that fit the board"),
+    "board-not-flat": (_LOOK, "the checkerboard was bent"),
     "camera-refocused": (_STOP, "a camera's focal length changed between board and target"),
     "wrong-board": (_STOP, "the board images of a camera are those of another camera"),
     "images-mirrored": (_STOP, "board and target images of a camera are not turned over alike"),

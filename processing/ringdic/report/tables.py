@@ -145,7 +145,7 @@ def calibration(document: Document, session: Session, results: Results) -> None:
         "pair-calibration",
         ("pair", "dots in common", "mean vector, mm", "RMS, mm", "angle, °", "epipolar residual, px"),
         rows,
-        "Control points reconstructed by each pair, each held out of the calibration, against their places on the target.",
+        "Control points reconstructed by each pair, held out of the calibration in turn, against their places.",
     )
     if figures.get("advice"):
         document.heading("What would make it better")

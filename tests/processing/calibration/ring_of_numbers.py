@@ -38,8 +38,11 @@ def camera_on_the_ring(name: str, azimuth_deg: float, rng: np.random.Generator) 
     return Camera(name, P / P[2, 3], SIZE, lens)
 
 
-def lens_from_boards(lens: Intrinsics, noise: float, rng: np.random.Generator) -> IntrinsicsFit:
-    board = np.column_stack([BOARD - BOARD.mean(axis=0), np.zeros(len(BOARD))])
+def lens_from_boards(
+    lens: Intrinsics, noise: float, rng: np.random.Generator, heights: np.ndarray | float = 0.0
+) -> IntrinsicsFit:
+    """A lens fitted to ten views of a board. noise : of the corners, px. heights : of the corners, mm."""
+    board = np.column_stack([BOARD - BOARD.mean(axis=0), heights * np.ones(len(BOARD))])
     views = []
     for _ in range(10):
         R = turned(rng.uniform(-1, 1, 3) * [0.6, 0.6, 0.3])

@@ -208,6 +208,20 @@ def test_boards_that_are_turned_over_are_named(flip, words) -> None:
     assert words in finding.sentence
 
 
+def test_a_bent_board_is_named_and_does_not_contradict() -> None:
+    calibrations = session(3, 11)
+    x = (BOARD - BOARD.mean(axis=0))[:, 0]
+    heights = 0.4 * (x * x - np.min(x * x)) / np.ptp(x * x)
+    fit = lens_from_boards(true_camera("c03").intrinsics, 0.03, np.random.default_rng(12), heights)
+    each = calibrations["c03"]
+    calibrations["c03"] = replace(each, fit=fit, camera=replace(each.camera, intrinsics=fit.intrinsics))
+    finding = only(contradictions(calibrations, TARGET))
+    assert finding.code == "board-not-flat"
+    assert finding.verdict is Verdict.LOOK
+    assert finding.cameras == ("c03",)
+    assert finding.value == pytest.approx(0.4, abs=0.01)
+
+
 @pytest.mark.parametrize(("print_error", "code"), [(0.15, "print-errors"), (0.4, "print-errors-large")])
 def test_a_bad_print_is_told_by_its_size(print_error, code) -> None:
     finding = only(contradictions(session(2, 9, print_error=print_error), TARGET))
