@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels
 from ringdic.errors import InputError, missing_extra
+from ringdic.findings import Finding, Verdict, overall_verdict
 from ringdic.progress import Progress, Report, progress_bar, silent
 
 if TYPE_CHECKING:
@@ -71,14 +72,22 @@ class Correlation:
     seconds : time spent by stage: prepare, start, refine.
     image : (height, width), grey levels of the reference image, over which fields are drawn.
     matches : all results of the correlation at the points, see :class:`ringdic.correlation.PointMatches`.
+    findings : what may make the matches wrong, see :class:`ringdic.findings.Finding`.
     """
 
     matches: PointMatches
     faces: NDArray[np.int32]
     image: NDArray = field(repr=False)
+    findings: tuple[Finding, ...] = ()
 
     def __repr__(self) -> str:
-        return f"<Correlation: {int(self.good.sum())} of {len(self.xy)} points matched>"
+        verdict = f"; {self.verdict}: {self.findings[0].sentence}" if self.findings else ""
+        return f"<Correlation: {int(self.good.sum())} of {len(self.xy)} points matched{verdict}>"
+
+    @property
+    def verdict(self) -> Verdict:
+        """What can be done with the matches, by the worst of the findings; see :class:`ringdic.findings.Verdict`."""
+        return overall_verdict(self.findings)
 
     @property
     def xy(self) -> Pixels:
@@ -223,6 +232,7 @@ def correlate(
     subset: Literal["circle", "square"] = "circle",
     interpolation: Literal["quintic", "cubic"] = "quintic",
     threads: int | None = None,
+    accept: Sequence[str] = (),
     progress: ProgressChoice = None,
 ) -> Correlation:
     """Digital image correlation of two images: where each point of the reference lies in the current image.
@@ -238,6 +248,8 @@ def correlate(
     subset : "circle" or "square".
     interpolation : B-spline of the current image, "quintic" or "cubic".
     threads : processor cores to use; all unless given.
+    accept : codes of findings that do not forbid to use the matches; with "repeating-pattern" those of a pattern that
+        repeats itself are kept, which are lost otherwise.
     progress : None shows a bar, False nothing; a function is called with each :class:`ringdic.progress.Progress`.
 
     Raises
@@ -272,11 +284,12 @@ def correlate(
         region = None if mask is None else _region(mask, images[0])
         names = _name(reference, "the reference image"), _name(current, "the current image"), _name(mask, "the mask")
         with compiling_reported(report) as report:
-            matches, faces = correlate_images(
-                *images, region, settings, threads=threads, names=names,
+            matches, faces, findings = correlate_images(
+                *images, region, settings, threads=threads, names=names, accept=accept,
                 progress=lambda done, total: report(Progress("correlate", done / total, f"{done} of {total} points")),
             )  # fmt: skip
-    return Correlation(matches, faces, images[0])
+    marked = tuple(replace(finding, accepted=finding.code in accept) for finding in findings)
+    return Correlation(matches, faces, images[0], marked)
 
 
 def import_folder(source: str | Path, session: str | Path) -> Session:

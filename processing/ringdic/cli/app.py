@@ -17,7 +17,7 @@ import typer
 import ringdic
 from ringdic.cli.console import print_json, say, show_table
 from ringdic.cli.measuring import measure_app, strain_command
-from ringdic.cli.options import AsJson, FamilyChoice, Session, spread_options
+from ringdic.cli.options import Accepted, AsJson, FamilyChoice, Session, spread_options
 from ringdic.cli.reporting import animate_command, overlay_command, report_command
 from ringdic.findings import DO_NOT_USE_EXIT, Verdict
 
@@ -89,7 +89,7 @@ def process_command(
     settings: SettingsFile = None,
     set_: Overrides = None,
     cluster: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a dask cluster.")] = None,
-    accept: Annotated[list[str] | None, typer.Option(metavar="CODE", help="A finding to accept. Repeatable.")] = None,
+    accept: Accepted = None,
     as_json: AsJson = False,
 ) -> None:
     """Calibrate, correlate, triangulate and compute strain, with nothing to click.
@@ -115,18 +115,26 @@ def correlate_command(
     order: Annotated[int, typer.Option(min=1, max=2, help="Order of the shape function.")] = 1,
     subset: Annotated[str, typer.Option(help="circle or square.")] = "circle",
     threads: Annotated[int | None, typer.Option(min=1, help="Threads; all cores unless given.")] = None,
+    accept: Accepted = None,
     as_json: AsJson = False,
 ) -> None:
-    """2D digital image correlation of one pair of images."""
+    """2D digital image correlation of one pair of images.
+
+    Ends with exit code 4 where the verdict is "do not use".
+    """
     from ringdic.correlation.command import correlate_files
     from ringdic.correlation.settings import CorrelationSettings
 
     settings = CorrelationSettings(radius=radius, step=step, order=order, subset=subset)
-    summary = correlate_files(ref, cur, out, settings, mask=mask, threads=threads)
+    summary = correlate_files(ref, cur, out, settings, mask=mask, threads=threads, accept=accept or ())
     if as_json:
         print_json(summary)
     else:
+        for finding in summary["findings"]:
+            say(f"{finding['verdict']}: {finding['sentence']}")
         say(f"{summary['good']} of {summary['points']} points matched, written to {out}")
+    if summary["verdict"] == Verdict.DO_NOT_USE:
+        raise typer.Exit(DO_NOT_USE_EXIT)
 
 
 @spread_options

@@ -20,6 +20,7 @@ Reference = Annotated[str, typer.Option(help="What a step is compared with: firs
 WithoutRigidMotion = Annotated[bool, typer.Option("--without-rigid-motion", help="Move each step back first.")]
 Window = Annotated[float | None, typer.Option(metavar="MM", help="Strain window; the run's own unless given.")]
 SethHill = Annotated[float | None, typer.Option(metavar="M", help="Strains of this exponent as well.")]
+Accepted = Annotated[list[str] | None, typer.Option(metavar="CODE", help="A finding to accept. Repeatable.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 
 

@@ -13,6 +13,7 @@ matches them. The room knows images, masks and points only: no camera, no calibr
 ``quadratic``      least-squares quadratics of any field over the neighbours of each point
 ``refinement``     inverse-compositional Gauss-Newton of many points, by the compiled ``kernels``
 ``kernels``        the iteration of one subset, on ``subset``, ``level_sums``, ``interpolation``, ``warps``, ``lanes``
+``repetition``     search for a pattern that repeats itself, whose matches can be wrong by its period
 ``parallel``       kernels on several threads
 ``spline``         B-spline coefficients and gradients of an image, by the compiled ``filters``
 ``bench``          speed of the correlation on this machine, against the limits of its processor by ``machine``

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +17,13 @@ from ringdic.correlation.correlate import PointMatches, correlate_points, load_k
 from ringdic.correlation.grid import grid
 from ringdic.correlation.prepared import prepare_current, prepare_reference
 from ringdic.correlation.propagation import Progress
+from ringdic.correlation.repetition import find_repetition
 from ringdic.correlation.settings import CorrelationSettings
+from ringdic.correlation.status import Status
 from ringdic.errors import ComputationError, InputError
+from ringdic.findings import Finding, verdict_figures
 from ringdic.session.images import read_gray, read_mask
+from ringdic.settings import load_settings
 
 
 def correlate_files(
@@ -28,6 +34,7 @@ def correlate_files(
     *,
     mask: Path | None = None,
     threads: int | None = None,
+    accept: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Match one image file in another and write ``points.npz``; returns the summary of ``ringdic correlate --json``.
 
@@ -38,18 +45,21 @@ def correlate_files(
     settings : subset, grid and tolerances; the defaults unless given.
     mask : an image file of the reference's size; its pixels above 0 are the region of interest.
     threads : cores to use; all unless given.
+    accept : codes of findings that do not forbid to use the matches.
 
     Returns
     -------
-    Numbers of points and of good points, seconds by stage (prepare, start, refine), points_per_second of the refine
-    stage, and threads.
+    The verdict, the findings and their sentences as warnings, numbers of points and of good points, seconds by stage
+    (prepare, start, refine), points_per_second of the refine stage, and threads.
 
     Raises
     ------
-    InputError : an unreadable file, images of different size, a mask without points, no folder to write into.
+    InputError : an unreadable file, images of different size, a mask without points, no folder to write into, a code
+        that does not exist.
     ComputationError : no point could be matched.
     """
     settings = settings or CorrelationSettings()
+    accept = load_settings(None, [f"accept={json.dumps(list(accept))}"]).accept  # known codes only
     out = Path(out)
     if not out.resolve().parent.is_dir():
         raise InputError(f"{out}: the folder does not exist; make it first")
@@ -61,10 +71,11 @@ def correlate_files(
     region = None if mask is None else read_mask(mask, (images[0].shape[0], images[0].shape[1]))
     reading = time.perf_counter() - began
     names = str(reference), str(current), str(mask)
-    matches, faces = correlate_images(*images, region, settings, threads=threads, names=names)
+    matches, faces, findings = correlate_images(*images, region, settings, threads=threads, names=names, accept=accept)
     write_points(out, matches, faces)
     seconds = {**matches.seconds, "prepare": reading + matches.seconds["prepare"]}
     return {
+        **verdict_figures(findings, accept),
         "points": len(matches.xy),
         "good": int(matches.good.sum()),
         "seconds": seconds,
@@ -82,8 +93,11 @@ def correlate_images(
     threads: int | None = None,
     progress: Progress | None = None,
     names: tuple[str, str, str] = ("the reference image", "the current image", "the mask"),
-) -> tuple[PointMatches, NDArray[np.int32]]:
+    accept: Sequence[str] = (),
+) -> tuple[PointMatches, NDArray[np.int32], list[Finding]]:
     """Match a grid of points of one image in another.
+
+    Points where the pattern repeats itself are lost, since their matches may be wrong by its period.
 
     Parameters
     ----------
@@ -94,10 +108,11 @@ def correlate_images(
     threads : cores to use; all unless given.
     progress : is called with the points matched so far and their whole number.
     names : of the reference, the current image and the region, for sentences about them.
+    accept : codes of findings that are accepted; with "repeating-pattern" the matches of a repeating pattern are kept.
 
     Returns
     -------
-    The matches of the n points, and faces (m, 3) int32, indices of the points of each triangle of the grid.
+    The matches of the n points, faces (m, 3) int32, indices of the points of each triangle of the grid, and findings.
 
     Raises
     ------
@@ -113,22 +128,33 @@ def correlate_images(
         )
     xy, faces = grid(_inner(reference.shape, settings.radius) if region is None else region, settings.step)
     if not len(xy):
-        raise InputError(
-            f"{names[2]}: the mask contains no point of the {settings.step} px grid; mark more or choose a smaller step"
-            if region is not None
-            else f"{names[0]}: {reference.shape[1]} x {reference.shape[0]} px leave no point of the {settings.step} px "
-            f"grid whose subset of radius {settings.radius} px lies inside; choose a smaller radius or step"
-        )
+        raise InputError(_no_point(reference.shape, settings, names, masked=region is not None))
     prepared = prepare_reference(reference, region, settings), prepare_current(current, None, settings)
     preparing = time.perf_counter() - began
     matches = correlate_points(*prepared, xy, settings, threads=threads, progress=progress)
+    began = time.perf_counter()
+    textured = xy[matches.status != Status.NO_TEXTURE]
+    repetition = find_repetition(reference, textured if len(textured) else xy, settings.radius, region)
+    findings = repetition.findings(names[0])
     if not matches.good.any():
-        raise ComputationError(
-            f"{names[1]}: none of the {len(xy)} points of {names[0]} was found in it; "
-            "check that both images show the same surface in focus"
+        why = findings[0].sentence if findings else "check that both images show the same surface in focus"
+        raise ComputationError(f"{names[1]}: none of the {len(xy)} points of {names[0]} was found in it; {why}")
+    if findings and findings[0].code not in accept:
+        matches = matches.without(repetition.ambiguous(xy), Status.AMBIGUOUS)
+    matches.seconds["prepare"] += preparing + time.perf_counter() - began
+    return matches, faces, findings
+
+
+def _no_point(shape: tuple[int, ...], settings: CorrelationSettings, names: tuple[str, str, str], masked: bool) -> str:
+    """The sentence about an image of some shape, or where it is masked its mask, that has no point of the grid."""
+    if masked:
+        return (
+            f"{names[2]}: the mask contains no point of the {settings.step} px grid; mark more or choose a smaller step"
         )
-    matches.seconds["prepare"] += preparing
-    return matches, faces
+    return (
+        f"{names[0]}: {shape[1]} x {shape[0]} px leave no point of the {settings.step} px "
+        f"grid whose subset of radius {settings.radius} px lies inside; choose a smaller radius or step"
+    )
 
 
 def write_points(path: Path, matches: PointMatches, faces: NDArray[np.int32]) -> None:

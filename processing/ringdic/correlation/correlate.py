@@ -82,6 +82,15 @@ class PointMatches:
         arrays = {each.name: getattr(self, each.name)[index] for each in fields(self) if each.name != "seconds"}
         return PointMatches(**arrays, seconds=dict(self.seconds))
 
+    def without(self, lost: Mask, status: Status) -> PointMatches:
+        """The matches with some of the good ones lost. lost : (n,) bool. status : that they get."""
+        gone = lost & self.good
+        matches = self.part(np.arange(len(self.xy)))  # a copy
+        for values in (matches.uv, matches.gradient, matches.curvature, matches.zncc, matches.c_ls, matches.sigma):
+            values[gone] = np.nan
+        matches.status[gone] = status
+        return matches
+
 
 def correlate_points(
     reference: Reference,

@@ -15,3 +15,4 @@ class Status(IntEnum):
     INCONSISTENT = 4  # the match contradicts those of its neighbours, or is far from its start value
     OUTSIDE = 5  # the subset leaves the current image
     NO_TEXTURE = 6  # too little contrast, or too few pixels inside the mask
+    AMBIGUOUS = 7  # the pattern repeats itself there, so the match may be wrong by its period

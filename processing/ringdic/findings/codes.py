@@ -41,6 +41,8 @@ CODES: dict[str, tuple[Verdict, str]] = {
     "camera-moved": (_LOOK, "a camera moved after the calibration or between steps, and was followed"),
     "camera-drift": (_LOOK, "by the method paper: matches lie off the epipolar lines in the mean; a camera moved"),
     "camera-moved-unknown": (_STOP, "a camera moved, and how is not known well enough"),
+    # images
+    "repeating-pattern": (_STOP, "the pattern repeats itself, so matches can be wrong by its period"),
     # surface
     "area-unmeasured": (_LOOK, "textured area that two cameras see was not measured"),
     "step-unmeasured": (_LOOK, "hardly a point was measured at a step"),

@@ -24,6 +24,7 @@ _REASONS: dict[int, str] = {
     Status.INCONSISTENT: "it contradicts its neighbours",
     Status.OUTSIDE: "it left the image",
     Status.NO_TEXTURE: "too little pattern, or too few pixels inside the mask",
+    Status.AMBIGUOUS: "the pattern repeats itself there",
     LostPoint.RESIDUAL: "its cameras contradict one another, or too few see it",
     LostPoint.UNCERTAIN: "its match is too uncertain",
     LostPoint.SURFACE: "it stands out of the surface",
