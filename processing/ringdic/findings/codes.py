@@ -41,6 +41,9 @@ CODES: dict[str, tuple[Verdict, str]] = {
     "camera-moved": (_LOOK, "a camera moved after the calibration or between steps, and was followed"),
     "camera-drift": (_LOOK, "by the method paper: matches lie off the epipolar lines in the mean; a camera moved"),
     "camera-moved-unknown": (_STOP, "a camera moved, and how is not known well enough"),
+    # captures
+    "skew-exceeded": (_LOOK, "the cameras of a capture were exposed at different times"),
+    "file-numbers-shifted": (_LOOK, "the file numbers of a camera differ from those that they are paired with"),
     # images
     "repeating-pattern": (_STOP, "the pattern repeats itself, so matches can be wrong by its period"),
     # surface

@@ -35,6 +35,7 @@ from ringdic.results.series import StepCache
 from ringdic.results.uncertainty import StepUncertainty, camera_covariance
 from ringdic.results.writer import ResultsWriter, StepRecord, map_in_order
 from ringdic.session.folder import Capture, Session, new_run, open_session
+from ringdic.session.moments import moment_findings
 from ringdic.settings import CalibrationGroup, Settings
 from ringdic.tasks import Executor, LocalExecutor, Task, TaskReport, process_memory, read_output, tidy, work_folder
 
@@ -151,7 +152,12 @@ def match_session(
         ReferenceSurface.from_arrays(found), job.matches, settings, StepCache(work),
         places_of_arrays(cameras, found), found["unmatched"].tolist(), job.motions,
     )  # fmt: skip
-    findings = (*rig.findings, *left_out, *series.findings)
+    findings = (
+        *rig.findings,
+        *left_out,
+        *moment_findings([step for step in steps if step.kind == "specimen"]),
+        *series.findings,
+    )
     return SessionMatches(series, rig, errors, series.drift, series.agreement, findings)
 
 

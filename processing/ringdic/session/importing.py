@@ -27,6 +27,7 @@ from ringdic.errors import InputError
 from ringdic.session.files import PARTIAL, place
 from ringdic.session.images import read_gray, read_mask
 from ringdic.session.names import CAPTURE_KINDS, CaptureKind
+from ringdic.session.numbering import number_conflict, shifted_numbers
 from ringdic.session.rig import Rig, read_rig
 from ringdic.session.writer import SessionExistsError, SessionWriter
 
@@ -71,7 +72,7 @@ def import_images(
     ------
     InputError
         A missing folder or image, an unreadable or truncated image, images of one camera that differ in size, an
-        empty mask, unequal numbers of steps, or a session that exists already.
+        empty mask, unequal numbers of steps, file numbers that do not agree, or a session that exists already.
     """
     src, session = Path(src), Path(session)
     if session.exists():
@@ -113,11 +114,12 @@ def _views(src: Path, rig: Rig) -> list[_View]:
 def _views_of_kind(src: Path, rig: Rig, kind: CaptureKind) -> list[_View]:
     views: list[_View] = []
     counts: dict[str, int] = {}
+    names: dict[str, list[str]] = {}
     for camera in rig.cameras:
         if kind == "board" and camera.intrinsics is not None and not (src / kind / camera.id).is_dir():
             continue  # its lens is given
         images = _images(src / kind / camera.id, kind, camera.id)
-        counts[camera.id] = len(images)
+        counts[camera.id], names[camera.id] = len(images), [path.name for path in images]
         views += [_View(kind, index, camera.id, path) for index, path in enumerate(images)]
     if kind in _COMPLETE and len(set(counts.values())) > 1:
         listed = ", ".join(f"{camera} {count}" for camera, count in counts.items())
@@ -125,7 +127,33 @@ def _views_of_kind(src: Path, rig: Rig, kind: CaptureKind) -> list[_View]:
             f"{src / kind}: the cameras have different numbers of {_COMPLETE[kind]}s ({listed}); "
             f"every {_COMPLETE[kind]} needs all cameras"
         )
+    if kind in _COMPLETE:
+        _check_numbers(src / kind, names)
     return views
+
+
+def _check_numbers(folder: Path, names: dict[str, list[str]]) -> None:
+    """Warn where the file numbers of a camera are shifted. InputError where cameras lack different frames.
+
+    names : of the files of each camera of a folder, in natural order.
+    """
+    conflict = number_conflict(names)
+    if conflict is None:
+        return
+    (one, other), (first, second) = conflict.cameras, conflict.only
+    if conflict.shift:
+        log.warning("%s", shifted_numbers(conflict))
+        return
+    raise InputError(
+        f"{folder}: the file numbers do not agree, so images of different moments would be paired: camera '{one}' has "
+        f"{_listed(first)}, which '{other}' lacks, and '{other}' has {_listed(second)}, which '{one}' lacks; remove "
+        "the frames that a camera lacks from all cameras"
+    )
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    """Numbers as text, at most five of them."""
+    return ", ".join(map(str, numbers[:5])) + (f" and {len(numbers) - 5} more" if len(numbers) > 5 else "")
 
 
 def _images(folder: Path, kind: str, camera: str) -> list[Path]:
