@@ -58,7 +58,9 @@ def controller_command(
 def validate_command(
     scale: Annotated[
         float | None,
-        typer.Option(min=0.1, max=1.0, help="Size of the images, 1 is 2464 x 3280 px; by default 1, for bodies 0.3."),
+        typer.Option(
+            min=0.1, max=1.0, help="Size of the images, 1 is 2464 x 3280 px; by default 1, for bodies and mishaps 0.3."
+        ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for images, sessions and tables; kept for the next run.")] = Path(
         "ringdic-validate"
@@ -66,27 +68,36 @@ def validate_command(
     bodies: Annotated[
         bool, typer.Option("--bodies", help="A gallery of bodies on different rigs, instead of the experiments.")
     ] = False,
+    mishaps: Annotated[
+        bool,
+        typer.Option("--mishaps", help="What goes wrong in a laboratory, and what the program says, instead of those."),
+    ] = False,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer board views and steps of the experiments.")] = False,
     only: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME", help="One experiment; or bodies, rigs and rows of the gallery, by commas; repeatable."
+            metavar="NAME",
+            help="One experiment; or bodies, rigs and rows of the gallery, or mishaps, their groups "
+            "and rigs, by commas; repeatable.",
         ),
     ] = None,
     overrides: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="A setting other than the default, for bodies; repeatable."),
+        typer.Option(
+            "--set", metavar="NAME=VALUE", help="A setting other than the default, for bodies and mishaps; repeatable."
+        ),
     ] = None,
     images_only: Annotated[bool, typer.Option("--images-only", help="Render the images and stop.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Repeat the paper's experiments on the virtual rig and compare with the paper's figures."""
-    if bodies:
+    if bodies or mishaps:
         from ringdic_controller.studies.gallery import run_gallery
+        from ringdic_controller.studies.mishaps import run_mishaps
 
         names = [name for each in only or () for name in each.split(",")]
-        size = 0.3 if scale is None else scale
-        findings = run_gallery(out, scale=size, only=names, overrides=overrides or (), images_only=images_only)
+        size, study = 0.3 if scale is None else scale, run_mishaps if mishaps else run_gallery
+        findings = study(out, scale=size, only=names, overrides=overrides or (), images_only=images_only)
     else:
         from ringdic_controller.studies.validate import run_validation
 

@@ -9,6 +9,7 @@ same: mm, z up the axis of the target, pixel (0, 0) at the centre of the top-lef
 ``solid``     solid bodies of any form as implicit functions, with their motion; ``bodies`` names some
 ``texture``   speckles, dots and digits as distances in surface coordinates, averaged over a pixel's footprint
 ``render``    rays from pixels to surfaces; ``solid_render`` to solid bodies, ``room`` what is behind them
+``disturbance``  cameras that were knocked or refocused, images taken otherwise
 ``sensor``    point spread, vignetting, noise, gamma, 8 bits
 ``folder``    a whole measurement rendered into a folder of images: ``python -m ringdic_node.virtual_rig FOLDER``
 """

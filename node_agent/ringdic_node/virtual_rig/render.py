@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ringdic_node.virtual_rig.arrays import Radiance
 from ringdic_node.virtual_rig.body import CYLINDER, approach, body_point
+from ringdic_node.virtual_rig.disturbance import CALM, ShotCondition, smeared
 from ringdic_node.virtual_rig.lens import VirtualCamera, ideal_of_pixel
 from ringdic_node.virtual_rig.rig import paper_rig
 from ringdic_node.virtual_rig.room import BLACK, SKIN, STAMP, WHITE, brightness, room_radiance, to_world
@@ -36,9 +37,14 @@ _FAR = 400.0  # mm, further than any camera is from the body
 _GRAZING = 0.02  # mm, by which the estimated clearance of a ray that meets the limb may be wrong
 
 
-def render(camera: VirtualCamera, scene: Scene, seed: int = 0) -> NDArray[np.uint8]:
-    """The image of a scene as a camera delivers it: (height, width) grey levels. seed : of the sensor's noise."""
-    return expose(radiance(camera, scene), seed)
+def render(camera: VirtualCamera, scene: Scene, seed: int = 0, condition: ShotCondition = CALM) -> NDArray[np.uint8]:
+    """The image of a scene as a camera delivers it: (height, width) grey levels.
+
+    seed : of the sensor's noise. condition : exposure, noise and motion of the image.
+    """
+    light = smeared(radiance(camera, scene), condition.smear)
+    image = expose(light, seed, condition.light, condition.noise)
+    return np.ascontiguousarray(image[:, ::-1]) if condition.mirrored else image
 
 
 def load_renderer(specimen: str = "limb") -> None:

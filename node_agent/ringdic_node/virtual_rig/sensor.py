@@ -14,13 +14,14 @@ POINT_SPREAD = 0.6  # px, standard deviation of the Gaussian point spread
 _VIGNETTING = 0.18  # loss in the corners
 
 
-def expose(radiance: Radiance, seed: int) -> Image:
+def expose(radiance: Radiance, seed: int, exposure: float = 1.0, noisiness: float = 1.0) -> Image:
     """Grey levels (height, width) that the sensor gives for the light on it: vignetting, noise, sRGB coding, 8 bits.
 
-    radiance : (height, width), linear, 1 saturates. seed : of the noise; equal seeds give equal images.
+    radiance : (height, width), linear, 1 saturates. seed : of the noise; equal seeds give equal images. exposure :
+    factor of the light. noisiness : factor of the noise.
     """
-    light = _vignetted(radiance)
-    noise = np.random.default_rng([seed, 4500]).standard_normal(light.shape, dtype=np.float32)
+    light = _vignetted(radiance) * np.float32(exposure)
+    noise = np.float32(noisiness) * np.random.default_rng([seed, 4500]).standard_normal(light.shape, dtype=np.float32)
     electrons = np.minimum(light, 1.0) * np.float32(FULL_WELL)
     electrons += noise * np.sqrt(np.maximum(electrons, 0.0) + np.float32(READ_NOISE**2))
     return np.rint(255.0 * srgb_coded(np.clip(electrons / np.float32(FULL_WELL), 0.0, 1.0))).astype(np.uint8)

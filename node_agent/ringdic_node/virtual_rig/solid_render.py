@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numba as nb
 import numpy as np
@@ -16,27 +17,49 @@ import numpy as np
 from ringdic_node.virtual_rig.arrays import Radiance
 from ringdic_node.virtual_rig.lens import VirtualCamera, ideal_of_pixel
 from ringdic_node.virtual_rig.room import BLACK, SKIN, STAMP, WHITE, brightness, room_radiance, to_world
+from ringdic_node.virtual_rig.scenes.damage import Damage
 from ringdic_node.virtual_rig.scenes.solid import SolidSpecimen
 from ringdic_node.virtual_rig.sensor import POINT_SPREAD, blurred
 from ringdic_node.virtual_rig.solid import box_span, clear_distance, first_hit, shape_gradient, undeformed
+from ringdic_node.virtual_rig.solid_damage import with_damage
 from ringdic_node.virtual_rig.texture import solid_speckle
 
 # mm along the body: a pixel with a longer footprint takes four samples.
 LONG = 0.8
 _TILE = 8  # px
 _STEEP = 5.0  # depths of neighbouring pixels that differ by more pixels than this lie on both sides of an edge
+_FINE_SPECKLE, _SUBPIXELS = 0.7, 3  # size of speckles below which the image has this many pixels for one, both ways
 _DELTA = 1e-3  # mm, of the central differences
 
 
 def solid_radiance(camera: VirtualCamera, scene: SolidSpecimen) -> Radiance:
     """Noise-free image (height, width) of a solid body, in linear light without unit; 1 saturates."""
+    out = _of_fine_speckles(camera, scene) if scene.speckle < _FINE_SPECKLE else _sampled(camera, scene)
+    out = with_damage(camera, scene, out) if scene.damage != Damage() else out
+    return blurred(out, scene.defocus) if scene.defocus > 0.0 else out
+
+
+def _sampled(camera: VirtualCamera, scene: SolidSpecimen) -> Radiance:
     out = np.zeros((camera.height, camera.width), np.float32)
     shape, motion = scene.solid.parameters, scene.motion.parameters(scene.solid)
     R, t = motion[10:19].reshape(3, 3), motion[19:22]
-    look = np.array([*scene.solid.band, float(scene.motion.is_rigid)])
+    look = np.array([*scene.solid.band, float(scene.motion.is_rigid), scene.speckle])
     pose = (camera.R, camera.centre, R.T @ camera.R.T, R.T @ (camera.centre - t))
     _solid_kernel(camera.lens, pose, look, scene.deformed_box(), shape, motion, scene.seed, out)
-    return blurred(out, scene.defocus) if scene.defocus > 0.0 else out
+    return out
+
+
+def _of_fine_speckles(camera: VirtualCamera, scene: SolidSpecimen) -> Radiance:
+    """Image (height, width) of speckles about as small as a pixel, in linear light, averaged from smaller pixels.
+
+    The formula of a speckle holds where its radius is larger than the blur through which it is seen.
+    """
+    n = _SUBPIXELS
+    K = np.diag([n, n, 1.0]) @ camera.K
+    K[:2, 2] += 0.5 * (n - 1)
+    finer = replace(camera, K=K, width=n * camera.width, height=n * camera.height)
+    image = _sampled(finer, scene).reshape(camera.height, n, camera.width, n).mean(axis=(1, 3))
+    return blurred(image, POINT_SPREAD * math.sqrt(1.0 - 1.0 / n**2))
 
 
 @nb.njit(nogil=True)
@@ -166,7 +189,7 @@ def _body_radiance(o, d, s, wide, samples, height, look, shape, m, seed, scratch
     """Brightness of the body where a ray meets it, and the sample's largest width on it, mm.
 
     wide : width of a sample across the ray, mm; samples : of a pixel, in samples. height : of the point in the world,
-    mm. look : lowest and highest z of the speckles, and whether the motion is rigid.
+    mm. look : lowest and highest z of the speckles, whether the motion is rigid, and the size of the speckles.
     """
     point, normal, blur, slopes = scratch[0], scratch[1], scratch[2:4], scratch[4:8]
     cosine = max(0.02, _surface(o, d, s, look[2] > 0.0, shape, m, point, normal, slopes))
@@ -176,9 +199,10 @@ def _body_radiance(o, d, s, wide, samples, height, look, shape, m, seed, scratch
         if look[0] - 3.0 < z < look[1] + 3.0:
             return light * WHITE, wide
         return light * SKIN * (1.0 + 0.03 * math.sin(0.8 * z)), wide
-    deviation = math.sqrt((POINT_SPREAD * samples) ** 2 + 1.0 / 12.0) * wide
+    size = look[3]
+    deviation = math.sqrt((POINT_SPREAD * samples) ** 2 + 1.0 / 12.0) * wide / size
     _footprint(d, slopes[3], cosine, deviation, slopes, blur)
-    dark = solid_speckle(point[0], point[1], z, normal, blur, seed)
+    dark = solid_speckle(point[0] / size, point[1] / size, z / size, normal, blur, seed)
     return light * (WHITE + dark * (BLACK - WHITE)), wide / cosine
 
 

@@ -288,7 +288,9 @@ class CaptureWriter:
         )
         return self._store(camera, entry, image)
 
-    def store_file(self, camera: str, source: Path, width: int, height: int, *, link: bool = False) -> ArchivedImage:
+    def store_file(
+        self, camera: str, source: Path, width: int, height: int, *, time_ns: int | None = None, link: bool = False
+    ) -> ArchivedImage:
         """Archive an image file byte for byte, with its extension.
 
         Parameters
@@ -296,6 +298,7 @@ class CaptureWriter:
         camera : one of those that the capture expects.
         source : the image file.
         width, height : of the image, px.
+        time_ns : of the exposure, ns since the Unix epoch; None where nobody measured it.
         link : share the file on the disk instead of copying it, where the file system can; for a source that nobody
             writes to any more.
         """
@@ -306,6 +309,7 @@ class CaptureWriter:
             bytes=len(image),
             width=width,
             height=height,
+            time_ns=time_ns,
             original=str(source),
         )
         return self._store(camera, entry, image, source if link else None)

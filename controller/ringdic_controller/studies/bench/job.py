@@ -141,7 +141,7 @@ def _shots(scenery: Scenery, session_images: ImageCache, count: int, say: Say) -
     for k in range(len(steps), count):
         turn, which = divmod(k - 1, _RENDERED)
         shots = rendered[1 + which].items()
-        steps.append({id_: _NoisyCopy(shot.camera, shot.scene, shot.seed, shot.jpeg, turn) for id_, shot in shots})
+        steps.append({id_: _NoisyCopy(shot.camera, shot.scene, shot.seed, shot.jpeg, turn=turn) for id_, shot in shots})
     for shot in [shot for shots in steps for shot in shots.values()]:
         if not session_images.path(shot).is_file():
             _deliver(shot, rendered_images, session_images.path(shot))

@@ -105,10 +105,12 @@ def judged(results: Results, before: SolidSpecimen, after: SolidSpecimen, sample
     stretch[wrong[faces].any(axis=1)] = np.nan
     covered = sample.covered(xyz, faces)
     followed = sample.covered(xyz, faces[np.isfinite(length)[faces].all(axis=1)])
-    sigma_xyz = _total(results.sigma_xyz[0], _at(results.sigma_calibration, 0))
-    sigma_moved = _total(_at(results.sigma_displacement, _STEP), _at(results.sigma_displacement_calibration, _STEP))
-    sigma_lambda = _total(_at(results.sigma_lambda, _STEP), _at(results.sigma_lambda_calibration, _STEP))
-    towards = _viewing_directions(results, normals)
+    sigma_xyz = total_sigma(results.sigma_xyz[0], _at(results.sigma_calibration, 0))
+    sigma_moved = total_sigma(
+        _at(results.sigma_displacement, _STEP), _at(results.sigma_displacement_calibration, _STEP)
+    )
+    sigma_lambda = total_sigma(_at(results.sigma_lambda, _STEP), _at(results.sigma_lambda_calibration, _STEP))
+    towards = viewing_directions(results, normals)
     figures = RowFigures(
         seen_cm2=len(sample.points) * sample.area / 100.0,
         covered=_share(covered),
@@ -143,8 +145,11 @@ def normal_sigma(sigma: Floats, normals: Vectors, towards: Vectors) -> Floats:
     return np.asarray(np.sqrt(np.minimum(a + b * along**2, np.sum(np.abs(normals) * sigma, axis=1) ** 2)))
 
 
-def _viewing_directions(results: Results, normals: Vectors) -> Points:
-    """Mean direction (N, 3) from each vertex to the cameras that see its front below 65°, of unit length."""
+def viewing_directions(results: Results, normals: Vectors) -> Points:
+    """Mean direction (N, 3) from each vertex to the cameras that see its front below 65°, of unit length.
+
+    normals : (N, 3) unit vectors at the vertices.
+    """
     total = 1e-3 * normals
     for camera in results.cameras:
         towards = camera.centre - results.vertices_ref
@@ -153,8 +158,11 @@ def _viewing_directions(results: Results, normals: Vectors) -> Points:
     return np.asarray(total / np.linalg.norm(total, axis=1, keepdims=True))
 
 
-def _total(noise: Floats | None, calibration: Floats | None) -> Floats:
-    """Standard deviations of both causes together, in the unit of either; NaN where the noise's are unknown."""
+def total_sigma(noise: Floats | None, calibration: Floats | None) -> Floats:
+    """Standard deviations (..., ) of both causes together, in the unit of either; NaN where the noise's are unknown.
+
+    noise, calibration : (..., ) due to each; None where unknown.
+    """
     if noise is None:
         return np.array(np.nan)
     return noise if calibration is None else np.hypot(noise, calibration)

@@ -35,8 +35,8 @@ from ringdic_controller.studies.gallery.tables import AIMS, GalleryEntry, write_
 from ringdic_controller.studies.validate.folders import make_session
 from ringdic_controller.studies.validate.image_cache import ImageCache, RenderedShot
 
-#: What faults of the program raise: they end a row of the gallery, and the others are still measured.
-_FAULTS = (cv2.error, ValueError, IndexError, ArithmeticError)
+#: What faults of the program raise: they end a row of a study, and the others are still measured.
+FAULTS = (cv2.error, ValueError, IndexError, ArithmeticError)
 Captures = list[tuple[str, dict[str, RenderedShot]]]
 
 
@@ -120,7 +120,7 @@ class _Gallery:
             run = process_session(session, self.settings, self._renamed(row.name))
         except RingdicError as error:
             return GalleryEntry(row.name, time.monotonic() - began, refusal=str(error))
-        except _FAULTS as error:
+        except FAULTS as error:
             sentence = f"a fault of the program: {type(error).__name__}: {' '.join(str(error).split())}"
             return GalleryEntry(row.name, time.monotonic() - began, refusal=sentence)
         seconds = time.monotonic() - began

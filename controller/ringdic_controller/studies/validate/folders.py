@@ -35,7 +35,7 @@ def make_session(
             capture = writer.begin_capture(kind, list(shots))
             for id_, shot in shots.items():
                 size = shot.camera.width, shot.camera.height
-                capture.store_file(id_, cache.path(shot), *size, link=True)
+                capture.store_file(id_, cache.path(shot), *size, time_ns=shot.time_ns, link=True)
             capture.close()
         aside.rename(path)
     if calibration is not None and (calibration / "calibration").is_dir():

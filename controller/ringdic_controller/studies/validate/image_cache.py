@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+from ringdic_node.virtual_rig.disturbance import CALM, ShotCondition
 from ringdic_node.virtual_rig.lens import VirtualCamera
 from ringdic_node.virtual_rig.render import STAMP, render
 from ringdic_node.virtual_rig.scenes import Scene
@@ -19,12 +20,18 @@ PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 @dataclass(frozen=True)
 class RenderedShot:
-    """Description of an image to render. seed : of the sensor's noise. jpeg : quality, or None for a lossless image."""
+    """Description of an image to render.
+
+    seed : of the sensor's noise. jpeg : quality, or None for a lossless image. condition : exposure, noise and motion
+    of the image. time_ns : of the exposure as the record of the capture states it, which changes no image.
+    """
 
     camera: VirtualCamera
     scene: Scene
     seed: int
     jpeg: int | None = None
+    condition: ShotCondition = CALM
+    time_ns: int | None = None
 
     @property
     def key(self) -> str:
@@ -32,7 +39,7 @@ class RenderedShot:
         camera = self.camera
         view = (camera.id, camera.width, camera.height)
         exact = [values.tobytes() for values in (camera.lens, camera.R, camera.t)]
-        described = f"{STAMP} {view} {exact} {self.scene!r} {self.seed} {self.jpeg}"
+        described = f"{STAMP} {view} {exact} {self.scene!r} {self.seed} {self.jpeg} {self.condition!r}"
         return hashlib.sha256(described.encode()).hexdigest()[:16]
 
 
@@ -63,7 +70,7 @@ class ImageCache:
         if path.is_file():  # another process was faster
             return
         coding = PNG if shot.jpeg is None else [cv2.IMWRITE_JPEG_QUALITY, shot.jpeg]
-        _, coded = cv2.imencode(path.suffix, render(shot.camera, shot.scene, shot.seed), coding)
+        _, coded = cv2.imencode(path.suffix, render(shot.camera, shot.scene, shot.seed, shot.condition), coding)
         aside = path.with_name(f".{path.stem}-{os.getpid()}.partial")
         aside.write_bytes(coded.tobytes())
         aside.replace(path)

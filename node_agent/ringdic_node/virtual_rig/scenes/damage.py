@@ -5,6 +5,7 @@ Positions are in the world, mm; worn patches lie on the body, in its material co
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,12 +39,29 @@ class Bar:
 
 
 @dataclass(frozen=True)
+class Shadow:
+    """A shadow on everything on one side of a plane: the points x with direction · x < edge, in the world, mm.
+
+    direction : unit vector. depth : share of the light that is missing. width : of the half-shadow, mm.
+    """
+
+    direction: tuple[float, float, float]
+    edge: float
+    depth: float = 0.5
+    width: float = 10.0
+
+
+@dataclass(frozen=True)
 class Damage:
-    """Disturbances of a specimen's images at one step. lamps : positions, mm, reflected by the glossy body."""
+    """Disturbances of a specimen's images at one step. lamps : positions, mm, reflected by the glossy body.
+
+    Shadows fall on solid bodies only, worn patches are on the others only.
+    """
 
     patches: tuple[SpoiltPatch, ...] = ()
     lamps: tuple[tuple[float, float, float], ...] = ()
     bars: tuple[Bar, ...] = ()
+    shadows: tuple[Shadow, ...] = ()
 
     def arrays(self) -> tuple[Floats, Floats, Floats]:
         """Arrays for the renderer, mm.
@@ -73,9 +91,18 @@ class Damage:
 
         centre : (3,) of the camera; xyz : (n, 3) points of the surface, mm; normals : (n, 3) of unit length, outwards.
         """
-        towards = centre - xyz
-        distance = np.linalg.norm(towards, axis=1)
-        view = towards / distance[:, None]
+        hidden = np.zeros(len(xyz), dtype=bool)
+        for bar in self.bars:
+            hidden |= _gap(centre, xyz, np.array(bar.start), np.array(bar.end)) < bar.radius
+        return np.asarray(hidden | (self.reflections(centre, xyz, normals) > _GLARING))
+
+    def reflections(self, centre: Floats, xyz: Floats, normals: Floats) -> Floats:
+        """Radiance (n,), without unit, of the lamps' reflections that a camera sees in points of the surface.
+
+        centre : (3,) of the camera; xyz : (n, 3) points, mm; normals : (n, 3) of unit length, outwards.
+        """
+        view = centre - xyz
+        view /= np.linalg.norm(view, axis=1, keepdims=True)
         glare = np.zeros(len(xyz))
         for lamp in self.lamps:
             light = np.array(lamp) - xyz
@@ -85,10 +112,25 @@ class Damage:
             facing = np.sum(light * normals, axis=1) > 0
             angle_squared = 2.0 * (1.0 - np.sum(half * normals, axis=1))
             glare += np.where(facing, GLARE_PEAK * np.exp(-0.5 * angle_squared / GLARE_WIDTH**2), 0.0)
-        hidden = np.zeros(len(xyz), dtype=bool)
+        return glare
+
+    def lit(self, xyz: Floats) -> Floats:
+        """Share (n,) of the light, without unit, that the shadows leave at points xyz (n, 3) mm."""
+        light = np.ones(len(xyz))
+        for shadow in self.shadows:
+            beyond = xyz @ np.array(shadow.direction) - shadow.edge
+            light *= 1.0 - shadow.depth * np.clip(0.5 - beyond / shadow.width, 0.0, 1.0)
+        return light
+
+    def bar_shares(self, centre: Floats, xyz: Floats, per: float) -> Iterator[Floats]:
+        """For each bar the share (n,), without unit, of each line of sight's pixel that it covers.
+
+        centre : (3,) mm, of the camera. xyz : (n, 3) mm, where the lines end. per : width of a pixel at distance 1.
+        """
         for bar in self.bars:
-            hidden |= _gap(centre, xyz, np.array(bar.start), np.array(bar.end)) < bar.radius
-        return np.asarray(hidden | (glare > _GLARING))
+            start, end = np.array(bar.start), np.array(bar.end)
+            wide = per * float(np.linalg.norm(0.5 * (start + end) - centre))
+            yield np.clip(0.5 - (_gap(centre, xyz, start, end) - bar.radius) / wide, 0.0, 1.0)
 
 
 def _gap(centre: Floats, xyz: Floats, start: Floats, end: Floats) -> Floats:

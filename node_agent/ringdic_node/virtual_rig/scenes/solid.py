@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from ringdic_node.virtual_rig import solid
 from ringdic_node.virtual_rig.arrays import Floats, Mask
 from ringdic_node.virtual_rig.lens import VirtualCamera
 from ringdic_node.virtual_rig.rotation import rotation
+from ringdic_node.virtual_rig.scenes.damage import Damage
 
 MIDDLE = (0.0, 0.0, 125.0)  # mm, of the place where target and bodies stand
 _EVERYWHERE = (-1e6, 1e6)
@@ -141,13 +142,16 @@ class SolidSpecimen:
     """A solid body after a motion: the scene that cameras see, and the truth of its material points.
 
     seed : of the speckles. defocus : standard deviation of the Gaussian by which its images are blurred in addition to
-    the lens's point spread, px.
+    the lens's point spread, px. speckle : size of the speckles, 1 is balls of 1.4 to 2 mm. damage : shadows,
+    reflections and bars.
     """
 
     solid: Solid
     motion: SolidMotion = SolidMotion()
     seed: int = 0
     defocus: float = 0.0
+    speckle: float = 1.0
+    damage: Damage = field(default_factory=Damage)
 
     def moved(self, xyz: Floats) -> Floats:
         """Positions (n, 3) mm after the motion of material points xyz (n, 3) mm."""

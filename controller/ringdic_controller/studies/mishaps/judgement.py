@@ -1,0 +1,157 @@
+"""MishapJudgement of a run with a mishap: how wrong its results are, and whether the program said what is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from ringdic_controller.studies.mishaps.errors import RunErrors
+from ringdic_controller.studies.mishaps.rows import Expectation, MishapRow
+
+FOLLOWED = 3.0  # times the errors of the calm row
+WRONG_SHARE, BEYOND_SHARE = 1e-3, 1e-3  # of the values: wrong by more than 1 mm, beyond 5 σ
+COVERED = 0.9  # of the points that the calm row measures
+
+
+class Outcome(StrEnum):
+    """How the program fared with a mishap; capitals stand for what must not happen."""
+
+    CALM = "calm"
+    FOLLOWED = "followed"
+    STATED = "within σ"
+    NAMED = "named"
+    REFUSED = "refused"
+    LESS = "measured less"
+    SILENT = "SILENT"
+    MISNAMED = "MISNAMED"
+    WRONG_REASON = "REFUSED, WRONG REASON"
+    ALARM = "FALSE ALARM"
+    FAULT = "FAULT"
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the operator is served: results are right, or he knows what to mend."""
+        return not self.value.isupper()
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """What a run of a row gave.
+
+    errors : against the truth, None where nothing was measured. findings : as JSON objects. steps : names of the
+    captures of the specimen. refusal : the sentence by which it was refused. fault : whether the program failed.
+    """
+
+    steps: tuple[str, ...]
+    errors: RunErrors | None = None
+    findings: tuple[dict[str, Any], ...] = ()
+    refusal: str = ""
+    fault: bool = False
+    verdict: str = ""
+
+
+@dataclass(frozen=True)
+class MishapJudgement:
+    """The outcome of a row and why. naming : codes of the findings that name the mishap; others : of the other ones."""
+
+    outcome: Outcome
+    reason: str
+    naming: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()
+
+
+def judged_mishap(row: MishapRow, run: RunRecord, calm: RunRecord | None) -> MishapJudgement:
+    """Judge a run. calm : of the same rig without a mishap; None where that could not be measured."""
+    if run.fault:
+        return MishapJudgement(Outcome.FAULT, run.refusal)
+    if run.errors is None:
+        return _judged_refusal(row, run)
+    faults = wrong_figures(run.errors, None if calm is None else calm.errors)
+    if row.expected is None:
+        return _judged_calm(row, run, faults)
+    usual = () if calm is None else calm.findings
+    news = [each for each in run.findings if not _among(each, usual)]
+    naming = [each for each in news if names(row.expected, each, run.steps)]
+    others = [each for each in news if each not in naming]
+    codes = _codes(naming), _codes(others)
+    reason = "; ".join(faults)
+    if naming:
+        return MishapJudgement(Outcome.FOLLOWED if not faults else Outcome.NAMED, reason, *codes)
+    blaming = [each for each in others if each["cameras"]]
+    if not faults:
+        outcome = Outcome.MISNAMED if blaming else Outcome.FOLLOWED
+        return MishapJudgement(outcome, "another is blamed" if blaming else "", *codes)
+    if run.errors.holds_in_sigma and not any(fault.startswith("lost") for fault in faults):
+        return MishapJudgement(Outcome.MISNAMED if blaming else Outcome.STATED, reason, *codes)
+    if others and all(fault.startswith("lost") for fault in faults):
+        return MishapJudgement(Outcome.MISNAMED if blaming else Outcome.LESS, reason, *codes)
+    return MishapJudgement(Outcome.MISNAMED if blaming else Outcome.SILENT, reason, *codes)
+
+
+def wrong_figures(errors: RunErrors, calm: RunErrors | None) -> list[str]:
+    """What is wrong in a run: errors larger than three times those of the calm row, and points lost, each in words."""
+    if calm is None:
+        return ["there is no calm run to compare with"]
+    faults = []
+    if errors.wrong > calm.wrong + WRONG_SHARE:
+        faults.append(f"{100 * errors.wrong:.1f} % of the points are off by more than 1 mm")
+    for name, value, usual, unit in (
+        ("shape", errors.shape_mm, calm.shape_mm, "mm"),
+        ("displacement", errors.displacement_mm, calm.displacement_mm, "mm"),
+        ("stretch", errors.stretch, calm.stretch, ""),
+    ):
+        if value > FOLLOWED * usual:
+            faults.append(f"{name} is off by {value:.4f} {unit}".rstrip() + f", calm {usual:.4f}")
+    for step, (count, usual_count) in enumerate(zip(errors.measured, calm.measured, strict=False)):
+        if count < COVERED * usual_count:
+            faults.append(f"lost {100 * (1 - count / usual_count):.0f} % of the points at step {step}")
+    return faults
+
+
+def names(expected: Expectation, finding: dict[str, Any], steps: Sequence[str]) -> bool:
+    """Whether a finding names what is to be mended: cameras, step and thing. steps : names of the captures."""
+    cameras = not expected.cameras or set(finding["cameras"]) == set(expected.cameras)
+    allowed = [None if number is None else steps[number] for number in expected.steps if (number or 0) < len(steps)]
+    step = not allowed or finding["step"] in allowed
+    return cameras and step and _has_word(expected.words, (finding["code"], finding["sentence"]))
+
+
+def _judged_refusal(row: MishapRow, run: RunRecord) -> MishapJudgement:
+    """A refusal is right where its sentence names cameras and thing; a calm row is never to be refused."""
+    if row.expected is None:
+        return MishapJudgement(Outcome.ALARM, f"refused: {run.refusal}")
+    named = all(camera in run.refusal for camera in row.expected.cameras)
+    blamed = named and _has_word(row.expected.words, (run.refusal,))
+    return MishapJudgement(Outcome.REFUSED if blamed else Outcome.WRONG_REASON, run.refusal)
+
+
+def _judged_calm(row: MishapRow, run: RunRecord, faults: Sequence[str]) -> MishapJudgement:
+    """A calm row is measured without a word, as well as the calmest or within the stated σ."""
+    assert run.errors is not None
+    alarms = [
+        each
+        for each in run.findings
+        if not (row.tolerated and _has_word(row.tolerated, (each["code"], each["sentence"])))
+    ]
+    if alarms:
+        return MishapJudgement(Outcome.ALARM, "; ".join(each["sentence"] for each in alarms), others=_codes(alarms))
+    lost = any(fault.startswith("lost") for fault in faults)
+    if faults and (lost or not run.errors.holds_in_sigma):
+        return MishapJudgement(Outcome.SILENT, "; ".join(faults))
+    return MishapJudgement(Outcome.CALM, "; ".join(faults))
+
+
+def _has_word(words: Sequence[str], texts: Iterable[str]) -> bool:
+    joined = " ".join(texts).lower()
+    return not words or any(word in joined for word in words)
+
+
+def _among(finding: dict[str, Any], usual: Sequence[dict[str, Any]]) -> bool:
+    """Whether the calm run has a finding of this code about these cameras too."""
+    return any(each["code"] == finding["code"] and each["cameras"] == finding["cameras"] for each in usual)
+
+
+def _codes(findings: Iterable[dict[str, Any]]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(f"{each['code']}({' '.join(each['cameras'])})" for each in findings))
