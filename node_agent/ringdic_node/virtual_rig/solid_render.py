@@ -43,7 +43,7 @@ def _sampled(camera: VirtualCamera, scene: SolidSpecimen) -> Radiance:
     out = np.zeros((camera.height, camera.width), np.float32)
     shape, motion = scene.solid.parameters, scene.motion.parameters(scene.solid)
     R, t = motion[10:19].reshape(3, 3), motion[19:22]
-    look = np.array([*scene.solid.band, float(scene.motion.is_rigid), scene.speckle])
+    look = np.array([*scene.solid.band, float(scene.motion.is_rigid), scene.speckle, scene.period])
     pose = (camera.R, camera.centre, R.T @ camera.R.T, R.T @ (camera.centre - t))
     _solid_kernel(camera.lens, pose, look, scene.deformed_box(), shape, motion, scene.seed, out)
     return out
@@ -189,7 +189,8 @@ def _body_radiance(o, d, s, wide, samples, height, look, shape, m, seed, scratch
     """Brightness of the body where a ray meets it, and the sample's largest width on it, mm.
 
     wide : width of a sample across the ray, mm; samples : of a pixel, in samples. height : of the point in the world,
-    mm. look : lowest and highest z of the speckles, whether the motion is rigid, and the size of the speckles.
+    mm. look : lowest and highest z of the speckles, whether the motion is rigid, the size of the speckles, and the
+    mm after which they repeat.
     """
     point, normal, blur, slopes = scratch[0], scratch[1], scratch[2:4], scratch[4:8]
     cosine = max(0.02, _surface(o, d, s, look[2] > 0.0, shape, m, point, normal, slopes))
@@ -202,7 +203,10 @@ def _body_radiance(o, d, s, wide, samples, height, look, shape, m, seed, scratch
     size = look[3]
     deviation = math.sqrt((POINT_SPREAD * samples) ** 2 + 1.0 / 12.0) * wide / size
     _footprint(d, slopes[3], cosine, deviation, slopes, blur)
-    dark = solid_speckle(point[0] / size, point[1] / size, z / size, normal, blur, seed)
+    if look[4] > 0.0:
+        for i in range(3):
+            point[i] -= look[4] * math.floor(point[i] / look[4])
+    dark = solid_speckle(point[0] / size, point[1] / size, point[2] / size, normal, blur, seed)
     return light * (WHITE + dark * (BLACK - WHITE)), wide / cosine
 
 

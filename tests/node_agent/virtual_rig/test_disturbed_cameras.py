@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ringdic_node.virtual_rig.bodies import upright_column
+from ringdic_node.virtual_rig.bodies import rounded_box, upright_column
 from ringdic_node.virtual_rig.disturbance import (
     ShotCondition,
     refocused_camera,
@@ -96,6 +96,24 @@ def test_larger_speckles_are_the_same_pattern_on_a_larger_body() -> None:
     # The light falls off with height in the world; the pattern is the same.
     assert np.corrcoef(first[seen], second[seen])[0, 1] > 0.995
     assert np.abs(difference).max() < 0.2
+
+
+def test_a_repeating_pattern_comes_again_after_its_period() -> None:
+    """A plate shifted by a period in its plane shows the same speckles, and by half a period others."""
+    plate = rounded_box((1.5, 150.0, 210.0), 0.5, 30.0)
+    window = np.s_[200:290, 150:220]
+
+    def seen(period: float, up: float) -> np.ndarray:
+        motion = SolidMotion(shift=(0.0, 0.0, up))
+        return radiance(CAMERA, SolidSpecimen(plate, motion, 4, period=period))[window]
+
+    again, between, never = (
+        np.corrcoef(seen(period, 0.0).ravel(), seen(period, up).ravel())[0, 1]
+        for period, up in ((9.0, 9.0), (9.0, 4.5), (0.0, 9.0))
+    )
+    assert again > 0.999
+    assert abs(between) < 0.5
+    assert abs(never) < 0.3
 
 
 def test_fine_speckles_have_little_contrast_and_the_light_of_others() -> None:

@@ -9,10 +9,10 @@ from ringdic_node.virtual_rig.scenes import Bar, Damage, Shadow, SolidMotion
 
 from ringdic_controller.studies.mishaps import changes
 from ringdic_controller.studies.mishaps.changes import Change
-from ringdic_controller.studies.mishaps.rows import Expectation, MishapRow, calm_row
+from ringdic_controller.studies.mishaps.rows import Expectation, MishapRow, calm_row, usual_motion
 
 _MIDDLE, _END = "cam_02", "cam_01"
-_NEIGHBOUR = "cam_03"
+_NEIGHBOUR, _PLATE = "cam_03", "plate-tangent"
 # Words of which one must occur in what is said about a mishap of the rig, of time, or of all images.
 _TARGET = ("target", "dot", "print", "rig.toml", "radius", "spacing", "scale", "unit")
 _BOARD = ("board", "square", "checker")
@@ -20,6 +20,7 @@ _INSTANT = ("instant", "time", "moment", "order", "frame", "synchron", "same ste
 _BLUR = ("blur", "smear", "focus", "sharp")
 _LIGHT = ("clip", "overexpos", "saturat", "bright", "exposure", "glare", "reflect", "shadow", "light")
 _PATTERN = ("speckle", "pattern", "texture")
+_REPEATS = ("repeat", "period")
 _HIDDEN = ("hidden", "hides", "in front", "cable", "cover", "contradict")
 
 # Seen by all cameras of an arc about 45°; it moves from step to step.
@@ -32,20 +33,17 @@ def all_rows() -> list[MishapRow]:
     """The rows of the study, those without a mishap first."""
     return [
         *_calm(), *_knocked_before(), *_knocked_between(), *_moved_rest(), *_lenses(), *_orders(), *_targets(),
-        *_images(), *_times(),
+        *_images(), *_patterns(), *_times(), *_other_rigs(),
     ]  # fmt: skip
 
 
 def _calm() -> Iterator[MishapRow]:
     for rig in ("arc4", "ring6", "arc2"):
         yield calm_row(rig)
+    yield calm_row("arc4", _PLATE)
     held: list[tuple[str, Change, tuple[str, ...]]] = [
         ("exposure-half", changes.taken_otherwise(ShotCondition(light=0.5)), ()),
-        (
-            "exposure-double",
-            changes.taken_otherwise(ShotCondition(light=2.0)),
-            _LIGHT,
-        ),
+        ("exposure-double", changes.taken_otherwise(ShotCondition(light=2.0)), _LIGHT),
         ("flicker", changes.flickering, ()),
         ("noise-threefold", changes.taken_otherwise(ShotCondition(noise=3.0)), ()),
         ("jpeg-60", changes.coded_as_jpeg(60), ()),
@@ -57,14 +55,15 @@ def _calm() -> Iterator[MishapRow]:
     yield MishapRow("calm", "stretch-50pct", "arc4", changes.unchanged, None, motion=SolidMotion(stretch=0.5))
 
 
-def _knocked(when: str, how: str, px: float, rig: str, camera: str, step: int | None) -> MishapRow:
+def _knocked(when: str, how: str, px: float, rig: str, camera: str, step: int | None, body: str = "limb") -> MishapRow:
     """A camera knocked after the calibration (step None), or before a step."""
     place = "" if camera == _MIDDLE else "-end"
     steps = None if step is None else range(step, 3)
     allowed: tuple[int | None, ...] = (None, 0) if step is None else (step,)
     return MishapRow(
         "moved", f"bumped-{when}-{px:g}px-{how}{place}", rig,
-        changes.knocked(how, px, [camera], steps and list(steps)), Expectation((camera,), allowed),
+        changes.knocked(how, px, [camera], steps and list(steps)),
+        Expectation((camera,), allowed, in_doubt=rig == "arc2"), motion=usual_motion(body), body=body,
     )  # fmt: skip
 
 
@@ -81,6 +80,8 @@ def _knocked_before() -> Iterator[MishapRow]:
     for rig in ("ring6", "arc2"):
         yield _knocked(when, "turned-rows", 3.0, rig, _MIDDLE, None)
         yield _knocked(when, "turned-columns", 1.0, rig, _MIDDLE, None)
+    for how, px in (("turned-rows", 3.0), ("turned-columns", 1.0)):
+        yield _knocked(when, how, px, "arc4", _MIDDLE, None, _PLATE)
 
 
 def _knocked_between() -> Iterator[MishapRow]:
@@ -96,6 +97,7 @@ def _knocked_between() -> Iterator[MishapRow]:
     for rig in ("ring6", "arc2"):
         yield _knocked(when, "turned-rows", 1.0, rig, _MIDDLE, 2)
         yield _knocked(when, "turned-columns", 3.0, rig, _MIDDLE, 2)
+    yield _knocked(when, "turned-rows", 1.0, "arc4", _MIDDLE, 2, _PLATE)
 
 
 def _moved_rest() -> Iterator[MishapRow]:
@@ -106,6 +108,8 @@ def _moved_rest() -> Iterator[MishapRow]:
     yield MishapRow("moved", "bumped-two-cameras-1.5px", "arc4", both, Expectation((_MIDDLE, _NEIGHBOUR), (None, 0)))
     once = changes.knocked("turned-rows", 1.0, [_MIDDLE], [1])
     yield MishapRow("moved", "bumped-for-one-step-1px", "arc4", once, Expectation((_MIDDLE,), (1,)))
+    every = Expectation(words=("calibrat", "moved", "set up"))
+    yield MishapRow("moved", "set-up-again-after-calibration", "arc4", changes.set_up_again, every)
 
 
 def _lenses() -> Iterator[MishapRow]:
@@ -164,6 +168,7 @@ def _targets() -> Iterator[MishapRow]:
 def _images() -> Iterator[MishapRow]:
     middle = [_MIDDLE]
     smear, slight, bright = ShotCondition(smear=(6.0, 2.0)), ShotCondition(smear=(3.0, 1.0)), ShotCondition(light=4.0)
+    dark = ShotCondition(light=0.01)
     one_step, whole = Expectation((_MIDDLE,), (2,)), Expectation((_MIDDLE,), (None, 0))
     for name, change, expected in (
         ("motion-blur-one-step", changes.taken_otherwise(smear, None, [2]), Expectation((), (2,), _BLUR)),
@@ -174,8 +179,9 @@ def _images() -> Iterator[MishapRow]:
         ("defocus-all", changes.specimen_changed(defocus=2.0), Expectation(words=_BLUR)),
         ("overexposed-one-camera-one-step", changes.taken_otherwise(bright, middle, [2]), one_step),
         ("overexposed-all", changes.taken_otherwise(bright), Expectation(words=_LIGHT)),
-        ("coarse-speckle", changes.specimen_changed(speckle=6.5), Expectation(words=_PATTERN)),
-        ("fine-speckle", changes.specimen_changed(speckle=0.33), Expectation(words=_PATTERN)),
+        ("dark-one-camera-one-step", changes.taken_otherwise(dark, middle, [2]), one_step),
+        ("image-missing-one-step", changes.camera_missing(_MIDDLE, [2]), one_step),
+        ("image-missing-reference", changes.camera_missing(_MIDDLE, [0]), whole),
         ("glare-moving", changes.damaged(*_GLARE), Expectation(words=_LIGHT)),
         ("shadow-moving", changes.damaged(*_SHADOWS), Expectation(words=_LIGHT)),
         ("cable-in-view", changes.damaged(_CABLE, _CABLE, _CABLE), Expectation(words=_HIDDEN)),
@@ -184,7 +190,44 @@ def _images() -> Iterator[MishapRow]:
         yield MishapRow("image", name, "arc4", change, expected)
 
 
+def _patterns() -> Iterator[MishapRow]:
+    for name, size in (("coarse-speckle", 6.5), ("fine-speckle", 0.33)):
+        change = changes.specimen_changed(speckle=size)
+        yield MishapRow("pattern", name, "arc4", change, Expectation(words=_PATTERN))
+    for body in ("limb", _PLATE):
+        yield MishapRow(
+            "pattern", "repeating-pattern", "arc4", changes.specimen_changed(period=9.0), Expectation(words=_REPEATS),
+            motion=usual_motion(body), body=body,
+        )  # fmt: skip
+
+
 def _times() -> Iterator[MishapRow]:
     for name, recorded in (("clock-off-30ms-recorded", 30.0), ("clock-off-30ms-unrecorded", 0.0)):
         change = changes.other_instant(_MIDDLE, 0.2, 1, recorded)
         yield MishapRow("time", name, "arc4", change, Expectation((_MIDDLE,), (1,)))
+
+
+def _other_rigs() -> Iterator[MishapRow]:
+    """Mishaps of the other groups in a closed ring, where two cameras must tell, and of a flat body."""
+    a, b = _MIDDLE, _NEIGHBOUR
+    whole: tuple[int | None, ...] = (None, 0)
+    radius = changes.rig_described({"radius_mm": 58.0})
+    mirrored = changes.taken_otherwise(ShotCondition(mirrored=True), [a])
+    for group, name, rig, change, expected in (
+        ("lens", "refocused-1pct", "ring6", changes.refocused(1.01, [a]), Expectation((a,), whole)),
+        ("order", "exchanged-all-steps", "ring6", changes.exchanged(a, b), Expectation((a, b), whole)),
+        ("order", "repeated-reference", "ring6", changes.repeated(a, 2, 0), Expectation((a,), (2,))),
+        ("target", "radius-58", "ring6", radius, Expectation(words=_TARGET)),
+        ("lens", "refocused-1pct", "arc2", changes.refocused(1.01, [a]), Expectation((a,), whole, in_doubt=True)),
+        ("order", "exchanged-all-steps", "arc2", changes.exchanged(_END, a), Expectation((_END, a), whole)),
+        ("order", "shows-step-before", "arc2", changes.late_scene(a, 2, 1), Expectation((a,), (2,), in_doubt=True)),
+        ("order", "mirrored-one", "arc2", mirrored, Expectation((a,), whole, in_doubt=True)),
+        ("target", "radius-58", "arc2", radius, Expectation(words=_TARGET)),
+    ):
+        yield MishapRow(group, name, rig, change, expected)
+    flat: tuple[tuple[str, Change, Expectation], ...] = (
+        ("each-lacks-another", changes.gaps_closed, Expectation(words=_INSTANT)),
+        ("shows-step-before", changes.late_scene(a, 2, 1), Expectation((a,), (2,))),
+    )
+    for name, change, expected in flat:
+        yield MishapRow("order", name, "arc4", change, expected, motion=usual_motion(_PLATE), body=_PLATE)

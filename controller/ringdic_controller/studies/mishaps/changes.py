@@ -198,6 +198,30 @@ def _dated(measurement: PlannedMeasurement, late: str, step: int, late_ms: float
     return measurement.changed_captures(date)
 
 
+def camera_missing(camera: str, steps: Sequence[int]) -> Change:
+    """A camera that delivers no image at some steps."""
+
+    def without(_: int, shots: Shots) -> Shots:
+        return {id_: shot for id_, shot in shots.items() if id_ != camera}
+
+    return lambda measurement: measurement.changed_captures(without, steps=steps)
+
+
+def set_up_again(measurement: PlannedMeasurement) -> PlannedMeasurement:
+    """The rig taken down and set up again after the calibration: all cameras turned, shifted and refocused a little."""
+    change: Change = unchanged
+    for number, camera in enumerate(measurement.cameras):
+        rows, columns, aside, focus = np.random.default_rng([number, 88]).normal(size=4)
+        change = all_of(
+            change,
+            knocked("turned-rows", 8.0 * rows, [camera]),
+            knocked("turned-columns", 8.0 * columns, [camera]),
+            knocked("shifted-rows", 8.0 * aside, [camera]),
+            refocused(1.0 + 0.003 * focus, [camera]),
+        )
+    return change(measurement)
+
+
 def rig_described(values: Mapping[str, float | str]) -> Change:
     """The rig file with other values of the target or board, by names such as ``radius_mm``; each stands in it once."""
 

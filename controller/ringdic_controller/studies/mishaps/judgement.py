@@ -69,10 +69,10 @@ def judged_mishap(row: MishapRow, run: RunRecord, calm: RunRecord | None) -> Mis
     if run.errors is None:
         return _judged_refusal(row, run)
     faults = wrong_figures(run.errors, None if calm is None else calm.errors)
-    if row.expected is None:
-        return _judged_calm(row, run, faults)
-    usual = () if calm is None else calm.findings
+    usual = () if calm is None or row.name == row.calm.name else calm.findings
     news = [each for each in run.findings if not _among(each, usual)]
+    if row.expected is None:
+        return _judged_calm(row, run.errors, news, faults)
     naming = [each for each in news if names(row.expected, each, run.steps)]
     others = [each for each in news if each not in naming]
     codes = _codes(naming), _codes(others)
@@ -112,7 +112,8 @@ def wrong_figures(errors: RunErrors, calm: RunErrors | None) -> list[str]:
 
 def names(expected: Expectation, finding: dict[str, Any], steps: Sequence[str]) -> bool:
     """Whether a finding names what is to be mended: cameras, step and thing. steps : names of the captures."""
-    cameras = not expected.cameras or set(finding["cameras"]) == set(expected.cameras)
+    named, meant = set(finding["cameras"]), set(expected.cameras)
+    cameras = not meant or named == meant or (expected.in_doubt and named >= meant)
     allowed = [None if number is None else steps[number] for number in expected.steps if (number or 0) < len(steps)]
     step = not allowed or finding["step"] in allowed
     return cameras and step and _has_word(expected.words, (finding["code"], finding["sentence"]))
@@ -127,18 +128,17 @@ def _judged_refusal(row: MishapRow, run: RunRecord) -> MishapJudgement:
     return MishapJudgement(Outcome.REFUSED if blamed else Outcome.WRONG_REASON, run.refusal)
 
 
-def _judged_calm(row: MishapRow, run: RunRecord, faults: Sequence[str]) -> MishapJudgement:
+def _judged_calm(
+    row: MishapRow, errors: RunErrors, findings: Sequence[dict[str, Any]], faults: Sequence[str]
+) -> MishapJudgement:
     """A calm row is measured without a word, as well as the calmest or within the stated σ."""
-    assert run.errors is not None
     alarms = [
-        each
-        for each in run.findings
-        if not (row.tolerated and _has_word(row.tolerated, (each["code"], each["sentence"])))
+        each for each in findings if not (row.tolerated and _has_word(row.tolerated, (each["code"], each["sentence"])))
     ]
     if alarms:
         return MishapJudgement(Outcome.ALARM, "; ".join(each["sentence"] for each in alarms), others=_codes(alarms))
     lost = any(fault.startswith("lost") for fault in faults)
-    if faults and (lost or not run.errors.holds_in_sigma):
+    if faults and (lost or not errors.holds_in_sigma):
         return MishapJudgement(Outcome.SILENT, "; ".join(faults))
     return MishapJudgement(Outcome.CALM, "; ".join(faults))
 

@@ -80,19 +80,15 @@ class _Study:
     report: Report
     done: float = 0.0
     calibrated: dict[str, Path] = field(default_factory=dict)
-    calm: dict[str, RunRecord] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
+    calm: dict[str, tuple[RunRecord, float]] = field(default_factory=dict)
 
     def judged(self, row: MishapRow) -> MishapEntry:
-        """Process a row and judge it beside the calm row of its rig, which is processed once."""
-        calm = calm_row(row.rig)
-        if row.rig not in self.calm:
-            self.calm[row.rig], self.seconds[row.rig] = self._processed(calm)
-        if row.name == calm.name:
-            run, seconds = self.calm[row.rig], self.seconds[row.rig]
-        else:
-            run, seconds = self._processed(row)
-        return MishapEntry(row.name, row.group, run, judged_mishap(row, run, self.calm[row.rig]), round(seconds, 1))
+        """Process a row and judge it beside the calm row of its body and rig, which is processed once."""
+        name = row.calm.name
+        if name not in self.calm:
+            self.calm[name] = self._processed(row.calm)
+        run, seconds = self.calm[name] if row.name == name else self._processed(row)
+        return MishapEntry(row.name, row.group, run, judged_mishap(row, run, self.calm[name][0]), round(seconds, 1))
 
     def render(self, row: MishapRow) -> PlannedMeasurement:
         """Render the missing images of a row; returns what they are of."""

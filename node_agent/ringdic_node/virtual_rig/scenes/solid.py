@@ -142,8 +142,8 @@ class SolidSpecimen:
     """A solid body after a motion: the scene that cameras see, and the truth of its material points.
 
     seed : of the speckles. defocus : standard deviation of the Gaussian by which its images are blurred in addition to
-    the lens's point spread, px. speckle : size of the speckles, 1 is balls of 1.4 to 2 mm. damage : shadows,
-    reflections and bars.
+    the lens's point spread, px. speckle : size of the speckles, 1 is balls of 1.4 to 2 mm. period : mm, after
+    which the pattern repeats along the axes of the body's frame; 0 is never. damage : shadows, reflections and bars.
     """
 
     solid: Solid
@@ -151,6 +151,7 @@ class SolidSpecimen:
     seed: int = 0
     defocus: float = 0.0
     speckle: float = 1.0
+    period: float = 0.0
     damage: Damage = field(default_factory=Damage)
 
     def moved(self, xyz: Floats) -> Floats:

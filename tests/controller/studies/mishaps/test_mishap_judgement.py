@@ -64,9 +64,20 @@ def test_a_wrong_result_with_five_sigma_outliers_is_not_within_sigma() -> None:
     assert judged_mishap(BUMP, RunRecord(STEPS, outliers), CALM).outcome is Outcome.SILENT
 
 
+def test_where_two_cameras_contradict_each_other_both_may_be_named_but_not_the_wrong_one() -> None:
+    assert BUMP.expected is not None
+    doubtful = replace(BUMP, expected=replace(BUMP.expected, in_doubt=True))
+    for cameras, outcome in ((("cam_01", "cam_02"), Outcome.NAMED), (("cam_01",), Outcome.MISNAMED)):
+        run = RunRecord(STEPS, WRONG, (finding(cameras=cameras, step=STEPS[2]),))
+        assert judged_mishap(doubtful, run, CALM).outcome is outcome
+
+
 def test_what_the_calm_rig_says_too_is_neither_a_name_nor_a_blame() -> None:
     calm = replace(CALM, findings=(RIGHT,))
     assert judged_mishap(BUMP, RunRecord(STEPS, WRONG, (RIGHT,)), calm).outcome is Outcome.SILENT
+    noisy = replace(calm_row("arc4"), mishap="noise")
+    assert judged_mishap(noisy, RunRecord(STEPS, GOOD, (RIGHT,)), calm).outcome is Outcome.CALM
+    assert judged_mishap(calm_row("arc4"), calm, calm).outcome is Outcome.ALARM
 
 
 @pytest.mark.parametrize(
