@@ -21,7 +21,7 @@ from ringdic_node.virtual_rig.rig import paper_rig
 from ringdic_node.virtual_rig.room import BLACK, SKIN, STAMP, WHITE, brightness, room_radiance, to_world
 from ringdic_node.virtual_rig.scenes import BoardScene, Scene, SolidSpecimen, Specimen, TargetScene
 from ringdic_node.virtual_rig.scenes import scene as make_scene
-from ringdic_node.virtual_rig.scenes.board import MARGIN, SQUARE, SQUARES
+from ringdic_node.virtual_rig.scenes.board import MARGIN, SQUARE, SQUARES, bow_height
 from ringdic_node.virtual_rig.scenes.damage import BAR, GLARE_PEAK, GLARE_WIDTH, Damage
 from ringdic_node.virtual_rig.sensor import POINT_SPREAD, blurred, expose
 from ringdic_node.virtual_rig.texture import RADIUS, checker, covered, dots, speckle
@@ -63,7 +63,7 @@ def radiance(camera: VirtualCamera, scene: Scene) -> Radiance:
     out = np.zeros((camera.height, camera.width), np.float32)
     if isinstance(scene, BoardScene):
         R, t = scene.pose(camera)
-        _board_kernel(camera.lens, camera.R, camera.centre, R, t, out)
+        _board_kernel(camera.lens, camera.R, camera.centre, R, t, scene.bow, out)
         return blurred(out)
     if isinstance(scene, TargetScene):
         look = np.array([_PRINT_DOTS, 0.0, 0.0, 0.0, _TARGET_TOP, _widest(scene)])
@@ -376,13 +376,17 @@ def _behind(o, d, p, per):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True)
-def _board_sample(x, y, o, R, d, Rb, tb, per_x, per_y):  # type: ignore[no-untyped-def]
+def _board_sample(x, y, o, R, d, Rb, tb, bow, per_x, per_y):  # type: ignore[no-untyped-def]
     """Brightness along the ray (x, y, 1) of the camera's frame, and how many squares outside the sheet it passes."""
     slope = Rb[0, 2] * x + Rb[1, 2] * y + Rb[2, 2]
-    depth = (Rb[0, 2] * tb[0] + Rb[1, 2] * tb[1] + Rb[2, 2] * tb[2]) / slope
-    px, py, pz = depth * x - tb[0], depth * y - tb[1], depth - tb[2]
-    bx = (Rb[0, 0] * px + Rb[1, 0] * py + Rb[2, 0] * pz) / SQUARE
-    by = (Rb[0, 1] * px + Rb[1, 1] * py + Rb[2, 1] * pz) / SQUARE
+    off = Rb[0, 2] * tb[0] + Rb[1, 2] * tb[1] + Rb[2, 2] * tb[2]
+    depth, bx, by = off / slope, 0.0, 0.0
+    for _ in range(1 if bow == 0.0 else 5):  # each step multiplies the error by the slope of the bow, a few hundredths
+        px, py, pz = depth * x - tb[0], depth * y - tb[1], depth - tb[2]
+        bx = (Rb[0, 0] * px + Rb[1, 0] * py + Rb[2, 0] * pz) / SQUARE
+        by = (Rb[0, 1] * px + Rb[1, 1] * py + Rb[2, 1] * pz) / SQUARE
+        if bow != 0.0:
+            depth = (off + bow_height(SQUARE * by, bow)) / slope
     outside = (
         max(abs(bx - SQUARES[0] / 2) - SQUARES[0] / 2, abs(by - SQUARES[1] / 2) - SQUARES[1] / 2) - MARGIN / SQUARE
     )
@@ -401,8 +405,11 @@ def _board_sample(x, y, o, R, d, Rb, tb, per_x, per_y):  # type: ignore[no-untyp
 
 
 @nb.njit(nogil=True)
-def _render_board(lens, R, o, Rb, tb, out):  # type: ignore[no-untyped-def]
-    """Render the sheet with the checkerboard in front of the room. Rb, tb : from the board's frame to the camera's."""
+def _render_board(lens, R, o, Rb, tb, bow, out):  # type: ignore[no-untyped-def]
+    """Render the sheet with the checkerboard in front of the room.
+
+    Rb, tb : from the board's frame to the camera's. bow : of the sheet, mm.
+    """
     height, width = out.shape
     d = np.empty(3)
     share = 1.0 / SAMPLES
@@ -414,7 +421,7 @@ def _render_board(lens, R, o, Rb, tb, out):  # type: ignore[no-untyped-def]
             x, y, xu, xv, yu, yv = ideal_of_pixel(u, v, lens, x, y)
             if u == 0:
                 first_x, first_y = x, y
-            total, outside = _board_sample(x, y, o, R, d, Rb, tb, SAMPLES * per_x, SAMPLES * per_y)
+            total, outside = _board_sample(x, y, o, R, d, Rb, tb, bow, SAMPLES * per_x, SAMPLES * per_y)
             if outside > 1.0:  # more than a square beside the sheet: one sample of the room is enough
                 out[v, u] = total
                 continue
@@ -422,7 +429,7 @@ def _render_board(lens, R, o, Rb, tb, out):  # type: ignore[no-untyped-def]
             for k in range(SAMPLES * SAMPLES):
                 a = (k % SAMPLES + 0.5) * share - 0.5
                 b = (k // SAMPLES + 0.5) * share - 0.5
-                value, _ = _board_sample(x + a * xu + b * xv, y + a * yu + b * yv, o, R, d, Rb, tb, per_x, per_y)
+                value, _ = _board_sample(x + a * xu + b * xv, y + a * yu + b * yv, o, R, d, Rb, tb, bow, per_x, per_y)
                 total += value
             out[v, u] = total * share * share
 
@@ -436,9 +443,9 @@ def _compiled_kernels(stamp: int) -> tuple[Callable[..., None], Callable[..., No
             _render_body(lens, R, o, p, look, seed, marks, out)
 
     @nb.njit(cache=True, nogil=True)
-    def board(lens, R, o, Rb, tb, out):  # type: ignore[no-untyped-def]
+    def board(lens, R, o, Rb, tb, bow, out):  # type: ignore[no-untyped-def]
         if stamp >= 0:
-            _render_board(lens, R, o, Rb, tb, out)
+            _render_board(lens, R, o, Rb, tb, bow, out)
 
     return body, board
 

@@ -10,7 +10,7 @@ from ringdic_node.virtual_rig.body import approach
 from ringdic_node.virtual_rig.lens import VirtualCamera, distort, ideal_of_pixel
 from ringdic_node.virtual_rig.render import radiance, render
 from ringdic_node.virtual_rig.rig import paper_rig, write_truth
-from ringdic_node.virtual_rig.scenes import Cylinder, Limb, Specimen, TargetScene, scene
+from ringdic_node.virtual_rig.scenes import BoardScene, Cylinder, Limb, Specimen, TargetScene, scene
 from ringdic_node.virtual_rig.sensor import FULL_WELL, READ_NOISE, expose, srgb_coded
 from ringdic_node.virtual_rig.texture import speckle
 from scipy.stats import norm
@@ -122,8 +122,9 @@ def test_the_dots_are_where_their_centres_project(offset: tuple[float, float, fl
     assert np.sqrt(np.mean(np.sum(np.square(errors), axis=1))) < 0.06
 
 
-def test_the_corners_are_where_the_board_truth_says() -> None:
-    board = scene("board", 2, seed=3)
+@pytest.mark.parametrize("bow", [0.0, -4.0])
+def test_the_corners_are_where_the_board_truth_says(bow: float) -> None:
+    board = BoardScene(2, 3, bow)
     image = render(CAMERA, board, 5)
     truth = board.corners(CAMERA).astype(np.float32)
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
@@ -131,6 +132,10 @@ def test_the_corners_are_where_the_board_truth_says() -> None:
     error = found - truth
     assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.08
     assert np.linalg.norm(error.mean(axis=0)) < 0.02  # no shift of the whole image
+    shift = np.linalg.norm(truth - BoardScene(2, 3).corners(CAMERA), axis=1).max()
+    per_mm = CAMERA.K[0, 0] / 290.0  # px, at the least distance; no board is seen at more than 50°
+    assert shift <= 1.1 * per_mm * abs(bow) * np.tan(np.radians(50.0)) + 1e-3
+    assert (shift > 1.0) == (bow != 0.0)
 
 
 @pytest.mark.parametrize("step", [0, 5])

@@ -161,6 +161,9 @@ def _targets() -> Iterator[MishapRow]:
         ("target-in-cm", centimetres),
     ):
         yield MishapRow("target", name, "arc4", changes.rig_described(values), Expectation(words=_TARGET))
+    for bow in (1.0, 3.0):
+        change = changes.board_bowed(bow)
+        yield MishapRow("target", f"board-bowed-{bow:g}mm", "arc4", change, Expectation(words=(*_BOARD, "flat")))
     squares = changes.rig_described({"squares": "[14, 20]"})
     yield MishapRow("target", "board-squares-14-by-20", "arc4", squares, Expectation(words=_BOARD))
 

@@ -12,7 +12,7 @@ import numpy as np
 from ringdic_node.virtual_rig import disturbance
 from ringdic_node.virtual_rig.disturbance import ShotCondition
 from ringdic_node.virtual_rig.lens import VirtualCamera
-from ringdic_node.virtual_rig.scenes import Damage, SolidSpecimen
+from ringdic_node.virtual_rig.scenes import BoardScene, Damage, SolidSpecimen
 
 from ringdic_controller.studies.mishaps.measurement import PlannedMeasurement, Shots, motion_share
 from ringdic_controller.studies.validate.image_cache import RenderedShot
@@ -116,6 +116,16 @@ def specimen_changed(
 def damaged(*damages: Damage) -> Change:
     """Shadows, reflections or bars at each step, the reference first."""
     return all_of(*(specimen_changed(None, [step], damage=each) for step, each in enumerate(damages)))
+
+
+def board_bowed(bow: float) -> Change:
+    """The checkerboard bowed in all its views, mm."""
+
+    def change(shot: RenderedShot) -> RenderedShot:
+        assert isinstance(shot.scene, BoardScene)
+        return replace(shot, scene=replace(shot.scene, bow=bow))
+
+    return shots_changed(change, kind="board")
 
 
 def exchanged(first: str, second: str, steps: Sequence[int] | None = None, kind: str = "specimen") -> Change:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass
 
+import numba as nb
 import numpy as np
 
 from ringdic_node.virtual_rig.arrays import Floats
@@ -20,10 +21,14 @@ _PLASTIC = np.array([0.7548776662466927, 0.5698402909980532])  # 1/p and 1/p² o
 
 @dataclass(frozen=True)
 class BoardScene:
-    """The checkerboard in view number ``index``; its pose also depends on the camera and the seed."""
+    """The checkerboard in view number ``index``; its pose also depends on the camera and the seed.
+
+    bow : mm, by which the middle of the sheet lies behind its upper and lower edge, 0 for a flat board.
+    """
 
     index: int
     seed: int = 0
+    bow: float = 0.0
 
     def pose(self, camera: VirtualCamera) -> tuple[Floats, Floats]:
         """Pose of the board: R (3, 3) and t (3,) mm from the board's frame to the camera's.
@@ -67,8 +72,15 @@ class BoardScene:
         """Exact pixels of the 14 x 19 inner corners in a camera's image, (266, 2) px, row by row across the board."""
         y, x = np.mgrid[1 : SQUARES[1], 1 : SQUARES[0]] * SQUARE
         R, t = self.pose(camera)
-        xyz = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+        xyz = np.stack([x.ravel(), y.ravel(), bow_height(y.ravel(), self.bow)], axis=1)
         return camera.project_local(xyz @ R.T + t)
+
+
+@nb.njit(nogil=True)
+def bow_height(y, bow):  # type: ignore[no-untyped-def]
+    """Distance z, mm, of a bowed sheet from the plane of its upper and lower edge. y : mm, along it. bow : mm."""
+    off = y / (0.5 * SQUARE * SQUARES[1]) - 1.0
+    return bow * (1.0 - off * off)
 
 
 def _rotation(about_x: float, about_y: float, about_z: float) -> Floats:
