@@ -22,13 +22,15 @@ class ShotCondition:
     """How an image is taken, where that differs from the calm rig.
 
     light : exposure times gain, 1 is calm. noise : standard deviation of the sensor's noise, 1 is calm. smear : motion
-    of the image during the exposure, along x and y, px. mirrored : whether left and right are exchanged in the file.
+    of the image during the exposure, along x and y, px. mirrored : whether left and right are exchanged in the file;
+    upside_down : whether it is turned by 180°.
     """
 
     light: float = 1.0
     noise: float = 1.0
     smear: tuple[float, float] = (0.0, 0.0)
     mirrored: bool = False
+    upside_down: bool = False
 
 
 CALM = ShotCondition()

@@ -44,7 +44,9 @@ def render(camera: VirtualCamera, scene: Scene, seed: int = 0, condition: ShotCo
     """
     light = smeared(radiance(camera, scene), condition.smear)
     image = expose(light, seed, condition.light, condition.noise)
-    return np.ascontiguousarray(image[:, ::-1]) if condition.mirrored else image
+    if condition.upside_down:
+        image = image[::-1, ::-1]
+    return np.ascontiguousarray(image[:, ::-1] if condition.mirrored else image)
 
 
 def load_renderer(specimen: str = "limb") -> None:

@@ -70,6 +70,7 @@ def test_a_smear_keeps_light_and_place_and_has_the_length_stated() -> None:
 def test_a_mirrored_image_is_the_image_mirrored_and_light_and_noise_are_factors() -> None:
     plain = render(CAMERA, ROD, 5)
     assert (render(CAMERA, ROD, 5, ShotCondition(mirrored=True)) == plain[:, ::-1]).all()
+    assert (render(CAMERA, ROD, 5, ShotCondition(upside_down=True)) == plain[::-1, ::-1]).all()
     half = render(CAMERA, ROD, 5, ShotCondition(light=0.5))
     linear = lambda grey: ((grey / 255.0 + 0.055) / 1.055) ** 2.4  # noqa: E731 - decoding of sRGB
     bright = plain > 100

@@ -126,7 +126,7 @@ def _lenses() -> Iterator[MishapRow]:
 
 def _orders() -> Iterator[MishapRow]:
     a, b = _MIDDLE, _NEIGHBOUR
-    mirrored = ShotCondition(mirrored=True)
+    mirrored, turned = ShotCondition(mirrored=True), ShotCondition(upside_down=True)
     both, one = Expectation((a, b), (None, 0)), Expectation((a,), (2,))
     for name, change, expected in (
         ("exchanged-all-steps", changes.exchanged(a, b), both),
@@ -140,6 +140,9 @@ def _orders() -> Iterator[MishapRow]:
         ("reference-shows-next-step", changes.late_scene(a, 0, 1), Expectation((a,), (None, 0))),
         ("each-lacks-another", changes.gaps_closed, Expectation(words=_INSTANT)),
         ("mirrored-one", changes.taken_otherwise(mirrored, [a]), Expectation((a,), (None, 0))),
+        ("mirrored-one-always", changes.always_taken_otherwise(mirrored, a), Expectation((a,), (None, 0))),
+        ("upside-down-one", changes.taken_otherwise(turned, [a]), Expectation((a,), (None, 0))),
+        ("upside-down-one-always", changes.always_taken_otherwise(turned, a), Expectation((a,), (None, 0))),
         ("mirrored-all", changes.taken_otherwise(mirrored), Expectation(words=("mirror",))),
     ):
         yield MishapRow("order", name, "arc4", change, expected)
@@ -164,6 +167,8 @@ def _targets() -> Iterator[MishapRow]:
     for bow in (1.0, 3.0):
         change = changes.board_bowed(bow)
         yield MishapRow("target", f"board-bowed-{bow:g}mm", "arc4", change, Expectation(words=(*_BOARD, "flat")))
+    nudged = changes.target_nudged((0.5, 0.5, 0.0), _MIDDLE)
+    yield MishapRow("target", "target-nudged-for-one-camera", "arc4", nudged, Expectation((_MIDDLE,), (None, 0)))
     squares = changes.rig_described({"squares": "[14, 20]"})
     yield MishapRow("target", "board-squares-14-by-20", "arc4", squares, Expectation(words=_BOARD))
 

@@ -12,7 +12,7 @@ import numpy as np
 from ringdic_node.virtual_rig import disturbance
 from ringdic_node.virtual_rig.disturbance import ShotCondition
 from ringdic_node.virtual_rig.lens import VirtualCamera
-from ringdic_node.virtual_rig.scenes import BoardScene, Damage, SolidSpecimen
+from ringdic_node.virtual_rig.scenes import BoardScene, Damage, SolidSpecimen, TargetScene
 
 from ringdic_controller.studies.mishaps.measurement import PlannedMeasurement, Shots, motion_share
 from ringdic_controller.studies.validate.image_cache import RenderedShot
@@ -86,6 +86,15 @@ def taken_otherwise(
     return shots_changed(lambda shot: replace(shot, condition=condition), cameras, steps)
 
 
+def always_taken_otherwise(condition: ShotCondition, camera: str) -> Change:
+    """All images of a camera taken otherwise, those of board and target with them."""
+
+    def change(shot: RenderedShot) -> RenderedShot:
+        return replace(shot, condition=condition)
+
+    return all_of(*(shots_changed(change, [camera], kind=kind) for kind in ("board", "target", "specimen")))
+
+
 def coded_as_jpeg(quality: int) -> Change:
     """Images of the specimen coded as JPEG of a quality."""
     return shots_changed(lambda shot: replace(shot, jpeg=quality))
@@ -116,6 +125,11 @@ def specimen_changed(
 def damaged(*damages: Damage) -> Change:
     """Shadows, reflections or bars at each step, the reference first."""
     return all_of(*(specimen_changed(None, [step], damage=each) for step, each in enumerate(damages)))
+
+
+def target_nudged(offset: tuple[float, float, float], camera: str) -> Change:
+    """The target pushed aside before a camera took its image, mm."""
+    return shots_changed(lambda shot: replace(shot, scene=TargetScene(offset)), [camera], kind="target")
 
 
 def board_bowed(bow: float) -> Change:
