@@ -52,12 +52,12 @@ class GalleryRow:
         return before, replace(before, motion=self.motion)
 
 
-def gallery_rig(name: str, scale: float) -> VirtualRig:
-    """The cameras of a rig by its name, with images of a scale."""
+def gallery_rig(name: str, scale: float, seed: int = 0) -> VirtualRig:
+    """The cameras of a rig by its name, with images of a scale. seed : of the cameras' scatter."""
     if name == "rows2":
-        return two_row_rig(12, 6, scale)
+        return two_row_rig(12, 6, scale, seed)
     kind, count = name.rstrip("0123456789"), int(name[len(name.rstrip("0123456789")) :])
-    return paper_rig(count, scale) if kind == "ring" else arc_rig(count, 30.0, scale)
+    return paper_rig(count, scale, seed) if kind == "ring" else arc_rig(count, 30.0, scale, seed)
 
 
 def gallery_rows(only: Sequence[str] = ()) -> list[GalleryRow]:
@@ -104,9 +104,9 @@ _RIGS: Mapping[str, tuple[str, ...]] = {
 }
 
 
-def calibration_scenes() -> list[tuple[str, Scene]]:
-    """Kind of capture and scene of every calibration image of a rig."""
-    return [*(("board", BoardScene(k)) for k in range(BOARDS)), ("target", TargetScene())]
+def calibration_scenes(seed: int = 0) -> list[tuple[str, Scene]]:
+    """Kind of capture and scene of every calibration image of a rig. seed : of the board's poses."""
+    return [*(("board", BoardScene(k, seed)) for k in range(BOARDS)), ("target", TargetScene())]
 
 
 def rendered_shots(rig: VirtualRig, scenes: Sequence[tuple[str, Scene]]) -> list[tuple[str, dict[str, RenderedShot]]]:

@@ -9,7 +9,7 @@ from ringdic_node.virtual_rig.scenes import Bar, Damage, Shadow, SolidMotion
 
 from ringdic_controller.studies.mishaps import changes
 from ringdic_controller.studies.mishaps.changes import Change
-from ringdic_controller.studies.mishaps.rows import Expectation, MishapRow, calm_row, usual_motion
+from ringdic_controller.studies.mishaps.rows import Expectation, MishapRow, calm_row, random_rows, usual_motion
 
 _MIDDLE, _END = "cam_02", "cam_01"
 _NEIGHBOUR, _PLATE = "cam_03", "plate-tangent"
@@ -30,10 +30,10 @@ _CABLE = Damage(bars=(Bar((72.0, 62.0, -150.0), (62.0, 72.0, 400.0), 2.5),))
 
 
 def all_rows() -> list[MishapRow]:
-    """The rows of the study, those without a mishap first."""
+    """The rows of the study, those without a mishap first, the random ones last."""
     return [
         *_calm(), *_knocked_before(), *_knocked_between(), *_moved_rest(), *_lenses(), *_orders(), *_targets(),
-        *_images(), *_patterns(), *_times(), *_other_rigs(),
+        *_images(), *_patterns(), *_times(), *_other_rigs(), *random_rows(100),
     ]  # fmt: skip
 
 

@@ -137,6 +137,8 @@ def _judged_calm(
     ]
     if alarms:
         return MishapJudgement(Outcome.ALARM, "; ".join(each["sentence"] for each in alarms), others=_codes(alarms))
+    if row.calm.name == row.name and errors.wrong > WRONG_SHARE:
+        return MishapJudgement(Outcome.SILENT, f"{100 * errors.wrong:.1f} % of the points are off by more than 1 mm")
     lost = any(fault.startswith("lost") for fault in faults)
     if faults and (lost or not errors.holds_in_sigma):
         return MishapJudgement(Outcome.SILENT, "; ".join(faults))

@@ -26,13 +26,14 @@ class PlannedMeasurement:
     captures: Captures
 
     @classmethod
-    def calm(cls, rig: str, scale: float, specimens: Sequence[SolidSpecimen]) -> PlannedMeasurement:
+    def calm(cls, rig: str, scale: float, specimens: Sequence[SolidSpecimen], seed: int = 0) -> PlannedMeasurement:
         """A measurement without a mishap.
 
         rig : its name in the gallery. scale : of the images. specimens : the body at the reference and at the steps.
+        seed : of the cameras' scatter and the board's poses.
         """
-        cameras = gallery_rig(rig, scale)
-        scenes = [*calibration_scenes(), *(("specimen", specimen) for specimen in specimens)]
+        cameras = gallery_rig(rig, scale, seed)
+        scenes = [*calibration_scenes(seed), *(("specimen", specimen) for specimen in specimens)]
         return cls(cameras.rig_toml(), tuple(rendered_shots(cameras, scenes)))
 
     @property
@@ -94,7 +95,7 @@ def motion_share(motion: SolidMotion, share: float) -> SolidMotion:
     )
 
 
-def moving_specimens(motion: SolidMotion, body: str = "limb") -> tuple[SolidSpecimen, ...]:
-    """The body of a name in the gallery at the reference and at the two steps of a motion."""
+def moving_specimens(motion: SolidMotion, body: str = "limb", seed: int = 0) -> tuple[SolidSpecimen, ...]:
+    """The body of a name in the gallery at the reference and at the two steps of a motion. seed : of its speckles."""
     solid = solid_bodies()[body]()
-    return tuple(SolidSpecimen(solid, motion_share(motion, share), _SPECKLE_SEED) for share in SHARES)
+    return tuple(SolidSpecimen(solid, motion_share(motion, share), _SPECKLE_SEED + seed) for share in SHARES)

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ringdic.calibration.calibrated_rig import calibrate_rig
 from ringdic.cli.console import say, show_table
 from ringdic.errors import RingdicError
 from ringdic.jobs.pipeline import process_session
@@ -17,6 +16,7 @@ from ringdic.progress import Progress, Report, progress_bar
 from ringdic.results.reader import read_results
 from ringdic.session.folder import open_session
 from ringdic.settings import Settings
+from ringdic.tasks.work import work_folder
 from ringdic_node.virtual_rig.render import load_renderer
 
 from ringdic_controller.studies.gallery.run import FAULTS, gallery_settings
@@ -24,7 +24,7 @@ from ringdic_controller.studies.mishaps.catalogue import all_rows
 from ringdic_controller.studies.mishaps.errors import run_errors
 from ringdic_controller.studies.mishaps.judgement import RunRecord, judged_mishap
 from ringdic_controller.studies.mishaps.measurement import PlannedMeasurement
-from ringdic_controller.studies.mishaps.rows import MishapRow, calm_row, selected_rows
+from ringdic_controller.studies.mishaps.rows import MishapRow, selected_rows
 from ringdic_controller.studies.mishaps.tables import AIMS, MishapEntry, outcome_counts, write_mishaps
 from ringdic_controller.studies.validate.folders import make_session
 from ringdic_controller.studies.validate.image_cache import ImageCache
@@ -79,7 +79,6 @@ class _Study:
     settings: Settings
     report: Report
     done: float = 0.0
-    calibrated: dict[str, Path] = field(default_factory=dict)
     calm: dict[str, tuple[RunRecord, float]] = field(default_factory=dict)
 
     def judged(self, row: MishapRow) -> MishapEntry:
@@ -104,8 +103,7 @@ class _Study:
     def _processed(self, row: MishapRow) -> tuple[RunRecord, float]:
         """What processing a row gives, and the seconds that it took."""
         planned = self.render(row)
-        calibration = self._calibrated(row.rig)
-        path = self._session(row.name, planned, calibration)
+        path = self._session(row, planned)
         steps = tuple(capture.id for capture in open_session(path).of_kind("specimen"))
         began = time.monotonic()
         try:
@@ -117,31 +115,17 @@ class _Study:
             return RunRecord(steps, refusal=sentence, fault=True), time.monotonic() - began
         seconds = time.monotonic() - began
         results = read_results(run / "results.h5")
+        shutil.rmtree(work_folder(path))
         summary = results.summary
         errors = run_errors(results, [row.specimens[steps.index(step)] for step in results.steps])
         return RunRecord(steps, errors, tuple(summary["findings"]), verdict=summary["verdict"]), seconds
 
-    def _calibrated(self, rig: str) -> Path:
-        """The session in which a calm rig is calibrated, once; rows with another calibration do not use it."""
-        if rig in self.calibrated:
-            return self.calibrated[rig]
-        path = self.folder / "sessions" / f"calibration-{rig}"
+    def _session(self, row: MishapRow, planned: PlannedMeasurement) -> Path:
+        """A new session folder, with the calibration of the calm row; one of an earlier run is replaced."""
+        path, calm = (self.folder / "sessions" / each.name for each in (row, row.calm))
         shutil.rmtree(path, ignore_errors=True)
-        planned = calm_row(rig).planned(self.scale)
-        alone = [each for each in planned.captures if each[0] != "specimen"]
-        self._images.render_missing([shot for _, each in alone for shot in each.values()])
         path.parent.mkdir(exist_ok=True)
-        make_session(path, planned.rig_toml, alone, self._images)
-        calibrate_rig(
-            open_session(path), self.settings.calibration, lambda _, who: self._tell(f"{rig}: calibrate", who)
-        )
-        self.calibrated[rig] = path
-        return path
-
-    def _session(self, name: str, planned: PlannedMeasurement, calibration: Path) -> Path:
-        """A new session folder; one of an earlier run is replaced."""
-        path = self.folder / "sessions" / name
-        shutil.rmtree(path, ignore_errors=True)
+        calibration = calm if row.name != row.calm.name else None
         return make_session(path, planned.rig_toml, planned.captures, self._images, calibration=calibration)
 
     def _tell(self, stage: str, message: str) -> None:

@@ -10,9 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ringdic.findings import Verdict
 from ringdic.session.json_values import json_value
 
 from ringdic_controller.studies.mishaps.judgement import MishapJudgement, Outcome, RunRecord
+from ringdic_controller.studies.mishaps.rows import RANDOM
 
 AIMS = (
     "Followed: all errors within 3 times those of the calm row. Within σ: larger, and the stated standard deviations "
@@ -67,7 +69,7 @@ def write_mishaps(folder: Path, entries: Sequence[MishapEntry], about: Mapping[s
     counts = outcome_counts(entries)
     good = sum(entry.judgement.outcome.is_good for entry in entries)
     totals = {
-        **about, "rows": len(entries), "good": good, "outcomes": counts,
+        **about, "rows": len(entries), "good": good, "outcomes": counts, "alarms": _alarms(entries),
         "entries": [entry.to_dict() for entry in entries],
     }  # fmt: skip
     (folder / "mishaps.json").write_text(json.dumps(totals, indent=1, ensure_ascii=False), encoding="utf-8")
@@ -88,6 +90,13 @@ def write_mishaps(folder: Path, entries: Sequence[MishapEntry], about: Mapping[s
     ]
     (folder / "mishaps.md").write_text("\n".join(lines), encoding="utf-8")
     return totals
+
+
+def _alarms(entries: Sequence[MishapEntry]) -> dict[str, int]:
+    """Number of calm rows, and of those with false alarms by their verdict."""
+    calm = [entry for entry in entries if entry.group in ("calm", RANDOM)]
+    alarms = [entry.run.verdict for entry in calm if entry.judgement.outcome is Outcome.ALARM]
+    return {"calm": len(calm), **{str(verdict): alarms.count(str(verdict)) for verdict in list(Verdict)[1:]}}
 
 
 def _said(entry: MishapEntry) -> list[str]:

@@ -6,7 +6,7 @@ from ringdic.errors import InputError
 from ringdic_controller.studies.mishaps import changes
 from ringdic_controller.studies.mishaps.catalogue import all_rows
 from ringdic_controller.studies.mishaps.measurement import PlannedMeasurement
-from ringdic_controller.studies.mishaps.rows import MishapRow, calm_row, selected_rows
+from ringdic_controller.studies.mishaps.rows import RANDOM, MishapRow, calm_row, selected_rows
 from ringdic_node.virtual_rig.scenes import SolidSpecimen
 
 ROWS = {row.name: row for row in all_rows()}
@@ -26,8 +26,8 @@ def changed(planned: PlannedMeasurement, kind: str = "specimen") -> dict[str, li
 
 def test_names_are_unique_and_every_row_but_the_calm_ones_expects_a_name() -> None:
     assert len(ROWS) == len(all_rows()) > 75
-    assert all((row.expected is None) == (row.group == "calm") for row in ROWS.values())
-    assert {"arc4", "ring6", "arc2"} == {row.rig for row in ROWS.values()}
+    assert all((row.expected is None) == (row.group in ("calm", RANDOM)) for row in ROWS.values())
+    assert {row.rig for row in ROWS.values() if row.group != RANDOM} == {"arc4", "ring6", "arc2"}
 
 
 def test_every_mishap_changes_the_cameras_and_steps_that_it_expects_to_be_named() -> None:
@@ -113,7 +113,8 @@ def test_rows_are_chosen_by_name_group_rig_or_beginning() -> None:
     assert {row.group for row in selected_rows(rows, ["order"])} == {"order"}
     assert {row.rig for row in selected_rows(rows, ["arc2"])} == {"arc2"}
     assert all(row.name.startswith("bumped-between") for row in selected_rows(rows, ["bumped-between"]))
-    assert selected_rows(rows, []) == rows
+    assert [row.name for row in selected_rows(rows, [])] == [row.name for row in rows if row.group != RANDOM]
+    assert len(selected_rows(rows, [RANDOM])) == 100
     with pytest.raises(InputError, match="there is no mishap 'earthquake'"):
         selected_rows(rows, ["earthquake"])
 
@@ -124,6 +125,7 @@ def test_a_row_is_compared_with_the_calm_row_of_its_body_and_rig() -> None:
         assert (calm.rig, calm.body, calm.expected) == (row.rig, row.body, None)
         assert calm.calm.name == calm.name
         assert calm.name in ROWS
+        assert (calm.name == row.name) == (row.mishap == "calm" or row.group == RANDOM)
         if row.group != "calm":
             assert row.motion == calm.motion
 
@@ -131,3 +133,15 @@ def test_a_row_is_compared_with_the_calm_row_of_its_body_and_rig() -> None:
 def test_where_an_image_is_missing_there_is_none() -> None:
     planned = ROWS["image-missing-one-step-arc4"].planned(0.1)
     assert [len(planned.images("specimen", number)) for number in range(3)] == [4, 4, 3]
+
+
+def test_random_rows_differ_in_cameras_bodies_boards_speckles_and_motions_and_are_the_same_again() -> None:
+    drawn, again = (selected_rows(all_rows(), [RANDOM]) for _ in range(2))
+    assert [(row.name, row.motion) for row in drawn] == [(row.name, row.motion) for row in again]
+    assert len({row.body for row in drawn}) > 10
+    assert len({row.rig for row in drawn}) == 7
+    first, second = (next(row for row in drawn if row.rig == "arc4" and row.seed > least) for least in (0, 50))
+    shots = [row.planned(0.1).images("board", 0)["cam_01"] for row in (first, second)]
+    assert not np.allclose(shots[0].camera.t, shots[1].camera.t)
+    assert shots[0].scene != shots[1].scene
+    assert first.specimens[0].seed != second.specimens[0].seed

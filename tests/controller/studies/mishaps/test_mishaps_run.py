@@ -57,7 +57,6 @@ def test_what_is_refused_or_fails_is_a_row_with_its_sentence(
         raise error
 
     monkeypatch.setattr(gallery_rows, "BOARDS", 4)
-    monkeypatch.setattr(run, "calibrate_rig", lambda *_: None)
     monkeypatch.setattr(run, "process_session", refuse)
     totals = run_mishaps(folder, scale=0.15, only=[CALM])
     assert totals["good"] == 0
