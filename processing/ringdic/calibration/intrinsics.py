@@ -155,9 +155,16 @@ def calibrate_intrinsics(
         if bend.chi2 < _BENT:
             break
         board = board + bend.heights[:, None] * np.array([0.0, 0.0, 1.0])
-    bent = float(np.ptp(board[:, 2]))
-    covariance = bend.lens_covariance if bent else covariance
+    covariance = bend.lens_covariance if np.ptp(board[:, 2]) else covariance
     state, _ = _refine(state, px, board, np.zeros(10, dtype=bool))  # poses of all views, with the intrinsics fixed
+    return _fit_with_figures(size, state, covariance, px, board, inliers, choice, bend.sigma)
+
+
+def _fit_with_figures(
+    size: tuple[int, int], state: _State, covariance: Floats, px: Floats, board: Points, inliers: Mask,
+    choice: LensModelChoice, bend_sigma: float,
+) -> IntrinsicsFit:  # fmt: skip
+    """The fit of a state to views px (v, n, 2) of a board (n, 3) mm, with measures of its quality."""
     errors = _view_errors(state, px, board)
     residuals = (px - _project(state, board))[inliers]
     rms = float(np.sqrt(np.mean(errors[inliers] ** 2)))
@@ -175,8 +182,8 @@ def calibrate_intrinsics(
         coverage(px[inliers], size),
         residual_distortion(px[inliers], residuals, size),
         max(1.0, residuals.size / independent_observations(residuals, board[:, :2])),
-        bent,
-        bend.sigma,
+        float(np.ptp(board[:, 2])),
+        bend_sigma,
     )
 
 

@@ -28,11 +28,12 @@ from ringdic.geometry.triangulation import reprojection_residuals, triangulate
 
 #: Shift of a camera's image beyond which it has moved, px.
 MOVED_PX = 0.06
+_FOLLOWED_BY_TWO_PX = 1.0  # least motion that is followed with two cameras
 #: Most points that are used, and fewest that are needed.
 _MOST, _FEWEST = 3000, 50
 _STILL_PX, _UNKNOWN_PX = 0.02, 0.3  # px, motion in the image of a camera that stands still, and of one that may move
 _TAIL = 3.0  # squares of σ, for each of the six parameters, at which a motion's weight is a quarter
-_FREE = 3.0  # standard deviation of the motion of cameras that moved, in units of their root mean square
+_FREE, _FREE_ALL = 3.0, 1.0  # standard deviations of motions, in units of their root mean square: few moved; most did
 _GAIN = 0.5  # squares of σ an observation, least gain by a motion; noise gives 0.3 on a patch of a hundred points
 _LOOSE_STEPS, _STEPS = 2, 20
 _SETTLED = 1e-3  # px, greatest motion in the image in the last step
@@ -69,9 +70,17 @@ class CameraMotions:
         return np.asarray((np.nan_to_num(self.effect) > MOVED_PX) & (self.gain > _GAIN))
 
     @property
+    def followed(self) -> bool:
+        """Whether the motions are known well enough to be used.
+
+        Two cameras tell hardly more of a small motion than that there is one.
+        """
+        return len(self.cameras) > 2 or bool(np.nanmax(self.effect) > _FOLLOWED_BY_TWO_PX)
+
+    @property
     def moved_cameras(self) -> tuple[Camera, ...]:
-        """The cameras after the motion where any of them moved, else as they were."""
-        if not self.moved.any():
+        """The cameras after the motion where any of them moved and was followed, else as they were."""
+        if not (self.moved.any() and self.followed):
             return self.cameras
         return tuple(
             _after(CameraParameters.of(camera), each).camera(camera)
@@ -116,8 +125,8 @@ def find_moved_cameras(
     motions = fit.motions()
     if motions.moved.any():
         largest = float(np.sqrt(np.mean(motions.effect[motions.moved] ** 2)))
-        free = _inverses(known + fit.standing(_FREE * largest))
         few: bool = 2 * int(motions.moved.sum()) <= len(cameras) != 2
+        free = _inverses(known + fit.standing((_FREE if few else _FREE_ALL) * largest))
         prior = np.where(motions.moved[:, None, None], free, still) if few else free
         fit.settle(lambda: prior, still)
         motions = fit.motions()
