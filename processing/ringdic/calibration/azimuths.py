@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.calibration.dots import Dots
-from ringdic.calibration.labels import Labels, column_labels, column_shift, has_labels, mean_label
+from ringdic.calibration.labels import Labels, column_labels, column_shift, has_labels, mean_label, mirrored_labels
 from ringdic.calibration.target import identify_dots, possible_azimuths
 from ringdic.errors import InputError
 from ringdic.findings import Finding
@@ -102,16 +102,19 @@ def camera_azimuths(candidates: Mapping[str, AzimuthCandidates], target: Target)
     candidates : by camera id. Raises InputError, naming the camera, where one stands elsewhere than the rig says.
     """
     with_target = {id_: each for id_, each in candidates.items() if each.azimuths}
+    sure = _column_shifts(with_target, target)
     off = {
         id_: signed_degrees(
             _azimuth_after_shift(with_target[id_], columns, target) - with_target[id_].camera.azimuth_deg
         )
-        for id_, columns in _column_shifts(with_target, target).items()
+        for id_, columns in sure.items()
     }
-    turn = _middle(list(off.values())) if off else 0.0
+    turn = _middle([*off.values(), 0.0])  # where cameras disagree, the target was likely not turned
     for id_, each in off.items():
         if abs(signed_degrees(each - turn)) > _ELSEWHERE:
-            raise InputError(_elsewhere(id_, with_target, off, turn))
+            mirrored = _mirrored(off, with_target, target)
+            raise InputError(mirrored or _elsewhere(id_, with_target, off, turn))
+    _require_unmirrored(with_target, set(sure), target)
     shared = turn if abs(turn) > _TURNED else 0.0
     azimuths = {id_: (each.camera.azimuth_deg + off.get(id_, shared)) % 360.0 for id_, each in with_target.items()}
     findings: tuple[Finding, ...] = ()
@@ -148,6 +151,46 @@ def _column_shifts(with_target: dict[str, AzimuthCandidates], target: Target) ->
                     sure[other] = sure[known] + shift
                     queue.append(other)
     return sure
+
+
+def _require_unmirrored(with_target: dict[str, AzimuthCandidates], sure: set[str], target: Target) -> None:
+    """Raise InputError where the printed numbers in an image agree with those in another only if it is mirrored.
+
+    sure : cameras whose azimuth is determined.
+    """
+    labelled = {id_: each for id_, each in with_target.items() if each.labels}
+    known = sure & labelled.keys()
+    mean = mean_label(each.labels for each in labelled.values()) if known else np.zeros(0)
+    for id_ in labelled.keys() - sure if known else ():
+        mirrored = mirrored_labels(labelled[id_].labels, target.columns)
+        if any(column_shift(labelled[other].labels, mirrored, mean, target.columns) is not None for other in known):
+            raise InputError(_is_mirrored([id_], "its printed numbers are"))
+
+
+def _mirrored(off: dict[str, float], with_target: dict[str, AzimuthCandidates], target: Target) -> str:
+    """Message that images are mirrored left to right, "" where that does not explain where cameras seem to stand.
+
+    Mirrored, a column appears as that as far from the other end of the columns, and a camera at the azimuth of that.
+    off : deviations of cameras from rig.toml, degrees.
+    """
+    last = (target.columns - 1) * math.degrees(target.column_angle)
+    ids = []
+    for id_, each in off.items():
+        nominal = with_target[id_].camera.azimuth_deg
+        if abs(signed_degrees(each)) > _TURNED and abs(signed_degrees(last - 2 * nominal - each)) < _TURNED:
+            ids.append(id_)
+    right = [id_ for id_, each in off.items() if id_ not in ids and abs(signed_degrees(each)) > _TURNED]
+    if not ids or right:
+        return ""
+    return _is_mirrored(ids, "its columns are counted from the other end")
+
+
+def _is_mirrored(ids: list[str], why: str) -> str:
+    """Message that the images of the target of some cameras are mirrored, and what shows it."""
+    return (
+        f"camera {', '.join(ids)}: the image of the target is mirrored left to right ({why}); switch the flip of the "
+        "camera off, for all of its images"
+    )
 
 
 def _elsewhere(id_: str, with_target: dict[str, AzimuthCandidates], off: dict[str, float], turn: float) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,8 @@ from ringdic.session.rig import Board
 
 #: Long sides to which an image is scaled for the detection of the board, px: the smallest first, as it is fastest.
 _SEARCH_SIZES = (1000, 2000)
+#: Squares more or less that are tried, where the board is not found.
+_MISCOUNT = 2
 
 
 def board_points(board: Board) -> Floats:
@@ -41,6 +45,23 @@ def find_corners(image: NDArray[np.generic], inner_corners: tuple[int, int]) -> 
     fine = cv2.cornerSubPix(grey, start.copy(), (half, half), (-1, -1), stop).reshape(-1, 2).astype(float)
     moved = np.linalg.norm(fine - rough, axis=1)
     return fine if np.all(moved < 0.35 * spacing) else None
+
+
+def count_squares(image: NDArray[np.generic], board: Board) -> tuple[int, int] | None:
+    """Count the squares of the checkerboard in an image: their number (across, along), None if far from the board's.
+
+    image : (height, width) grey, uint8, uint16 or float in 0 … 255.
+    """
+    grey = _as_uint8(image)
+    scale = min(_SEARCH_SIZES[0] / max(grey.shape), 2.0)
+    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    across, along = board.squares
+    off = sorted(itertools.product(range(-_MISCOUNT, _MISCOUNT + 1), repeat=2), key=lambda each: sum(map(abs, each)))
+    for more_across, more_along in off:
+        squares = across + more_across, along + more_along
+        if min(squares) > 3 and cv2.findChessboardCornersSB(small, (squares[0] - 1, squares[1] - 1), flags=0)[0]:
+            return squares
+    return None
 
 
 def _search(grey: NDArray[np.uint8], inner_corners: tuple[int, int]) -> Pixels | None:

@@ -104,7 +104,8 @@ def calibrate_rig(
             keys.append(key)
             done += 1
             progress(done / len(taking_part), f"camera {id_}")
-    findings = (*findings, *contradictions(calibrated, session.rig.target, _expected(settings)))
+    distances = {each.id: each.distance_mm for each in session.rig.cameras if each.distance_mm is not None}
+    findings = (*findings, *contradictions(calibrated, session.rig.target, _expected(settings), distances))
     if settings.method == "dlt":
         return _with_quality(session.rig, CalibratedRig(session.rig.target, calibrated, findings))
     progress(1.0, "all cameras together")

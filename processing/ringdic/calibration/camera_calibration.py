@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ringdic.arrays import Pixels
 from ringdic.calibration import dlt
-from ringdic.calibration.board import board_points, find_corners
+from ringdic.calibration.board import board_points, count_squares, find_corners
 from ringdic.calibration.dots import find_dots
 from ringdic.calibration.intrinsics import VIEWS_NEEDED, IntrinsicsFit, calibrate_intrinsics
 from ringdic.calibration.target import DotObservations, identify_dots
@@ -174,6 +174,13 @@ def _board_corners(rig: Rig, camera_id: str, images: Sequence[NDArray[np.generic
     count = sum(view is not None for view in corners)
     if count < VIEWS_NEEDED:
         across, along = rig.board.squares
+        blank = next(image for image, view in zip(images, corners, strict=True) if view is None) if images else None
+        other = None if blank is None else count_squares(blank, rig.board)
+        if other is not None and other != (across, along):
+            raise InputError(
+                f"camera {camera_id}: its board images show a checkerboard of {other[0]} x {other[1]} squares, [board] "
+                f"squares in rig.toml says {across} x {along}; correct it, or take images of that board"
+            )
         raise InputError(
             f"camera {camera_id}: the checkerboard was found in {count} of {len(images)} board images; the lens "
             f"needs at least {VIEWS_NEEDED}. Check that every image shows the whole board, sharp and without glare, "

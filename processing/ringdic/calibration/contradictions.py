@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ringdic.calibration.camera_calibration import CameraCalibration
-from ringdic.calibration.target_evidence import CameraEvidence
+from ringdic.calibration.target_evidence import CameraEvidence, SheetChange
 from ringdic.calibration.target_measures import CONTRADICTION, TargetMeasures, target_measures
 from ringdic.findings import Finding
 from ringdic.session.rig import Target
@@ -18,6 +18,8 @@ from ringdic.session.rig import Target
 _MEASURE, _USUAL, _SURE, _MODEL = 0.002, 4.0, 5.0, 1e-4
 #: Least bend of a checkerboard that is a finding, mm.
 _BEND = 0.1
+#: Ratios of distances that are a finding: of a camera to that in rig.toml, and of the boards to the target.
+_FARTHER, _OTHER_UNITS = 1.25, 6.0
 #: Least rotation of the printed sheet on its cylinder that is a finding, rad.
 _TILT = 0.005
 #: Least deviation of a focal length that is a finding, as a part of it.
@@ -54,15 +56,18 @@ class ExpectedErrors:
 
 
 def contradictions(
-    calibrations: Mapping[str, CameraCalibration], target: Target, expected: ExpectedErrors | None = None
+    calibrations: Mapping[str, CameraCalibration],
+    target: Target,
+    expected: ExpectedErrors | None = None,
+    distances: Mapping[str, float] | None = None,
 ) -> tuple[Finding, ...]:
     """Findings that name what contradicts: measures of the target, cameras whose lens is not that of the boards, dots.
 
     calibrations : by camera id, of each camera alone. expected : how far the target may be from rig.toml, None for an
-    ordinary print.
+    ordinary print. distances : of cameras from the target's axis as rig.toml has them, by camera id, mm.
     """
     expected = expected or ExpectedErrors()
-    bent = _of_boards(calibrations)
+    bent = (*_of_boards(calibrations), *_of_scale(calibrations, target, distances or {}))
     measures = target_measures(calibrations, target, expected.tolerance(target))
     if measures is None:
         return bent
@@ -86,6 +91,37 @@ def _of_boards(calibrations: Mapping[str, CameraCalibration]) -> tuple[Finding, 
         "the lens was fitted to the bent board, but use a stiff flat board, as another bend in each view cannot be seen"
     )
     return (Finding("board-not-flat", sentence, ids, value=worst, limit=_BEND, unit="mm"),)
+
+
+def _of_scale(
+    calibrations: Mapping[str, CameraCalibration], target: Target, distances: Mapping[str, float]
+) -> list[Finding]:
+    """A finding where the target's measures are likely in other units, which its images cannot show.
+
+    The distance from the camera follows from them. It is held against that in rig.toml, by camera id in mm, and that of
+    the boards, which were held where the lens is in focus as well.
+    """
+    findings = []
+    stands = {id_: float(np.hypot(*each.camera.centre[:2])) for id_, each in calibrations.items()}
+    measured = {id_: stands[id_] / distance for id_, distance in distances.items() if id_ in stands and distance > 0}
+    if measured:
+        id_, ratio = max(measured.items(), key=lambda item: abs(np.log(item[1])))
+        if abs(np.log(ratio)) > np.log(_FARTHER):
+            sentence = (
+                f"camera {id_} stands {stands[id_]:.0f} mm from the target's axis by the measures of the target, "
+                f"rig.toml says distance_mm {distances[id_]:g}; check the units of [target], and distance_mm"
+            )
+            findings.append(Finding("world-scale", sentence, (id_,), value=ratio, limit=_FARTHER))
+    held = {id_: each.fit.distance for id_, each in calibrations.items() if each.fit is not None}
+    ratios = {id_: held[id_] / (stands[id_] - target.radius_mm) for id_ in held if stands[id_] > target.radius_mm}
+    ratio = float(np.median(list(ratios.values()))) if ratios else float("nan")
+    if abs(np.log(ratio)) > np.log(_OTHER_UNITS):
+        sentence = (
+            f"the boards were held {ratio:.2g} times as far from the cameras as the target stands, by square_mm of the "
+            "board and the measures of the target; one of both is likely in centimetres or inches: correct it"
+        )
+        findings.append(Finding("world-scale", sentence, tuple(ratios), value=ratio, limit=_OTHER_UNITS))
+    return findings
 
 
 def _of_target(measures: TargetMeasures, target: Target, expected: ExpectedErrors) -> list[Finding]:
@@ -156,7 +192,7 @@ def _of_lenses(measures: TargetMeasures, calibrations: Mapping[str, CameraCalibr
         amount = f"{each.camera}: focal length {100 * off:+.2f} % ± {100 * sigma:.2f} %"
         if other is not None:
             code, amount = other
-        elif focus and T - (off / sigma) ** 2 < max(0.3 * T, 0.4 * CONTRADICTION):
+        elif focus and each.distance_if_refocused(measures.change) < max(0.3 * T, 0.4 * CONTRADICTION):
             code = "camera-refocused"
         else:
             code = "lens-contradicts-target"
@@ -187,7 +223,7 @@ def _lens_finding(
         f"({amounts}); switch flips and turns of this camera off, or the same on in board, target and specimen",
         "lens-contradicts-target": f"the lens that fits the target is {worst:.0f} standard errors from that of the "
         f"{boards} ({amounts}); check that the board is flat and its squares true, that all images are of this camera, "
-        "and that no lens was touched in between",
+        "that [target] in rig.toml describes the target, and that no lens was touched in between",
     }[code]
     if code == "camera-refocused":
         off = max((each.focal_gap(measures.change)[0] for each, _ in of), key=abs)
@@ -211,7 +247,9 @@ def _other_lens(each: CameraEvidence, measures: TargetMeasures) -> tuple[str, st
             if other.camera != each.camera and other.board.size == board.size
         ),
     ]
-    distances = [each.distance(measures.change, lens) for _, _, lens in ways]
+    # Where hardly a camera agrees with its boards, the sheet is known no better than rig.toml has it.
+    stated = SheetChange(measures.stated_change)
+    distances = [min(each.distance(sheet, lens) for sheet in (measures.change, stated)) for _, _, lens in ways]
     best = int(np.argmin(distances))
     if distances[best] > min(CONTRADICTION, 0.1 * each.distance(measures.change)):
         return None

@@ -65,6 +65,7 @@ class IntrinsicsFit:
         displaces together, so that the true covariance is larger than ``covariance`` by about this factor.
     bend, bend_sigma : mm, height of the board's surface over its corners, highest minus lowest, and its standard error.
         Where the views show a bend for certain, the lens is fitted to the bent board; 0 for a flat one.
+    distance : mm, of the middle of the board from the camera, median of the views.
     """
 
     intrinsics: Intrinsics
@@ -80,6 +81,7 @@ class IntrinsicsFit:
     redundancy_factor: float = 1.0
     bend: float = 0.0
     bend_sigma: float = 0.0
+    distance: float = float("nan")
 
     def to_dict(self) -> dict[str, Any]:
         """The fit as JSON values."""
@@ -146,25 +148,9 @@ def calibrate_intrinsics(
     px = np.stack([np.asarray(view, dtype=float).reshape(-1, 2) for view in views])
     board = np.column_stack([np.asarray(board_xy, dtype=float), np.zeros(len(board_xy))])
     models = candidate_models(radial, tangential, skew, fewest_terms)
-    state = _start(px, board, size)
-    for _ in range(_MOST_BENDS):
-        state, _ = _refine(state, px, board, models[0].free)
-        inliers = _inlier_views(_view_errors(state, px, board), drop_percentile)
-        choice, state, covariance = _fit_of_chosen_model(models, state, px, board, inliers, fewest_terms)
-        bend = _board_bend(_of_views(state, inliers), px[inliers], board, choice.model.free)
-        if bend.chi2 < _BENT:
-            break
-        board = board + bend.heights[:, None] * np.array([0.0, 0.0, 1.0])
-    covariance = bend.lens_covariance if np.ptp(board[:, 2]) else covariance
-    state, _ = _refine(state, px, board, np.zeros(10, dtype=bool))  # poses of all views, with the intrinsics fixed
-    return _fit_with_figures(size, state, covariance, px, board, inliers, choice, bend.sigma)
-
-
-def _fit_with_figures(
-    size: tuple[int, int], state: _State, covariance: Floats, px: Floats, board: Points, inliers: Mask,
-    choice: LensModelChoice, bend_sigma: float,
-) -> IntrinsicsFit:  # fmt: skip
-    """The fit of a state to views px (v, n, 2) of a board (n, 3) mm, with measures of its quality."""
+    fit = _fit_to_bent_board(px, board, size, models, drop_percentile, fewest_terms)
+    board, inliers, choice = fit.board, fit.inliers, fit.choice
+    state, _ = _refine(fit.state, px, board, np.zeros(10, dtype=bool))  # poses of all views, with the intrinsics fixed
     errors = _view_errors(state, px, board)
     residuals = (px - _project(state, board))[inliers]
     rms = float(np.sqrt(np.mean(errors[inliers] ** 2)))
@@ -172,22 +158,60 @@ def _fit_with_figures(
     log.info("intrinsics from %d of %d views, %s (%s), RMS %.3f px", inliers.sum(), len(px), model, choice.reason, rms)
     return IntrinsicsFit(
         lens_of(state[0], size),
-        np.sqrt(np.diag(covariance)),
+        np.sqrt(np.diag(fit.covariance)),
         errors,
         inliers,
         rms,
-        covariance,
+        fit.covariance,
         model,
         choice.reason,
         coverage(px[inliers], size),
         residual_distortion(px[inliers], residuals, size),
         max(1.0, residuals.size / independent_observations(residuals, board[:, :2])),
         float(np.ptp(board[:, 2])),
-        bend_sigma,
+        fit.bend_sigma,
+        float(np.median(np.linalg.norm(state[1][inliers] @ board.mean(axis=0) + state[2][inliers], axis=1))),
     )
 
 
 _State = tuple[Floats, Floats, Floats]  # inner (10,), rotations (views, 3, 3), translations (views, 3) mm
+
+
+@dataclass(frozen=True)
+class _BoardFit:
+    """A lens fitted to a board that may be bent.
+
+    board : (n, 3) mm, its corners. state : with the poses of all v views. covariance : (10, 10) of the lens. inliers :
+    (v,) bool. bend_sigma : mm, standard error of the board's edge over its middle.
+    """
+
+    board: Points
+    state: _State
+    covariance: Floats
+    inliers: Mask
+    choice: LensModelChoice
+    bend_sigma: float
+
+
+def _fit_to_bent_board(
+    px: Pixels, board: Points, size: tuple[int, int], models: list[LensModel], drop_percentile: float, fewest: bool
+) -> _BoardFit:
+    """Choose a lens model and fit it to the views without gross errors; again with the board's bend, where one shows.
+
+    px : (v, n, 2). board : (n, 3) mm, flat.
+    """
+    state = _start(px, board, size)
+    for _ in range(_MOST_BENDS):
+        state, _ = _refine(state, px, board, models[0].free)
+        inliers = _inlier_views(_view_errors(state, px, board), drop_percentile)
+        choice, state, covariance = _fit_of_chosen_model(models, state, px, board, inliers, fewest)
+        bend = _board_bend(_of_views(state, inliers), px[inliers], board, choice.model.free)
+        if bend.chi2 < _BENT:
+            break
+        board = board + bend.heights[:, None] * np.array([0.0, 0.0, 1.0])
+    return _BoardFit(
+        board, state, bend.lens_covariance if board[:, 2].any() else covariance, inliers, choice, bend.sigma
+    )
 
 
 def _of_views(state: _State, which: Mask) -> _State:

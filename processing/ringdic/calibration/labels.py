@@ -85,6 +85,11 @@ def mean_label(all_labels: Iterable[Labels]) -> Floats:
     return np.asarray(np.mean([patch for labels in all_labels for patch in labels.values()], axis=0))
 
 
+def mirrored_labels(labels: Labels, columns: int) -> Labels:
+    """The labels as the mirrored image would show them: each turned over, counted from the other end of the columns."""
+    return {(-column) % columns + 1: patch[:, ::-1] for column, patch in labels.items()}
+
+
 def column_shift(first: Labels, second: Labels, mean: Floats, columns: int) -> int | None:
     """Shift that must be added to the second camera's column numbers to agree with those of the first camera.
 

@@ -134,12 +134,30 @@ class CameraEvidence:
 
         sheet : as for :meth:`gap`.
         """
+        off, sigma, _ = self._change_that_fits(sheet, np.eye(1, 3))
+        return float(off[0]), float(sigma[0])
+
+    def distance_if_refocused(self, sheet: SheetChange) -> float:
+        """The distance of the two lenses after a change of focal length and principal point.
+
+        sheet : (3,) mm, mm, rad, as for :meth:`gap`.
+        """
+        return self._change_that_fits(sheet, np.eye(3))[2]
+
+    def _change_that_fits(self, sheet: SheetChange, which: Floats) -> tuple[Floats, Floats, float]:
+        """Change of the boards' lens that fits the target best, its standard errors, and the distance that is left.
+
+        which : (j, 3), combinations of the focal lengths as a part of them and the principal point's x and y, px.
+        """
         gap, covariance = self.gap(sheet)
-        along = np.zeros(LENS)
-        along[:2] = self.board.values[:2]
-        weighted = _solved(covariance, np.column_stack([gap, along[self.board.free]]))
-        off, information = along[self.board.free] @ weighted
-        return float(off / information), float(information**-0.5)
+        ways = np.zeros((3, LENS))
+        ways[0, :2], ways[1, 3], ways[2, 4] = self.board.values[:2], 1.0, 1.0
+        ways = (which @ ways)[:, self.board.free]
+        weighted = _solved(covariance, np.column_stack([gap, ways.T]))
+        N = ways @ weighted[:, 1:]
+        change = _solved(N, ways @ weighted[:, 0])
+        left = float(gap @ weighted[:, 0] - change @ N @ change)
+        return change, np.sqrt(np.diag(_solved(N, np.eye(len(N))))), left
 
     def misfit(self, sheet: Vectors) -> float:
         """The distance, and by how much the residuals of the dots exceed their least, in units of their variance.

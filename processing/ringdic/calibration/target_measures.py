@@ -37,7 +37,8 @@ class TargetMeasures:
         explain the images best.
     sheet : radius (mm), column spacing (mm) and tilt (rad) of the printed sheet, for the row spacing of rig.toml.
     off, sigma : deviation of the measure that is wrong as a part of it, and its standard error; of two, the larger.
-    evidence : of each camera. change : the sheet minus that with which the cameras were fitted there.
+    evidence : of each camera. change : the sheet minus that with which the cameras were fitted there. stated_change :
+        (3,) mm, mm, rad, the sheet of rig.toml minus that.
     """
 
     wrong: str
@@ -46,6 +47,7 @@ class TargetMeasures:
     sigma: float
     evidence: tuple[CameraEvidence, ...]
     change: SheetChange
+    stated_change: Vectors
 
 
 def target_measures(
@@ -67,14 +69,14 @@ def target_measures(
 
     def followed(fit: _Fit, others: slice, rounds: int) -> _Round:
         """The cheapest of some hypotheses, with evidence taken at its own sheet."""
-        now = _Round(fit, evidence, nominal)
+        now = _Round(fit, evidence, nominal, nominal)
         for _ in range(rounds):
             if np.all(np.abs(now.fit.sheet[:2] / now.at[:2] - 1) < _LINEAR):
                 break
             at = np.clip(now.fit.sheet, low, high)
             again = _evidence(calibrations, target, at)
             fits = _fits(again, nominal, at, views, tolerance)[others]
-            now = _Round(min(fits, key=lambda each: each.cost), again, at)
+            now = _Round(min(fits, key=lambda each: each.cost), again, nominal, at)
         return now
 
     as_stated, *others = _fits(evidence, nominal, nominal, views, tolerance)
@@ -105,19 +107,22 @@ class _Fit:
 
 @dataclass(frozen=True)
 class _Round:
-    """A hypothesis, and the evidence for it. at : (3,) mm, mm, rad, the sheet with which the evidence was taken."""
+    """A hypothesis, and the evidence for it.
+
+    nominal, at : (3,) mm, mm, rad, the sheet of rig.toml and that with which the evidence was taken.
+    """
 
     fit: _Fit
     evidence: tuple[CameraEvidence, ...]
+    nominal: Vectors
     at: Vectors
 
     @property
     def measures(self) -> TargetMeasures:
         """The hypothesis as the measures of the target."""
         fit, change = self.fit, SheetChange(self.fit.sheet - self.at, self.fit.covariance)
-        return TargetMeasures(
-            fit.wrong, PrintedSheet(*map(float, fit.sheet)), fit.off, fit.sigma, self.evidence, change
-        )
+        sheet, stated = PrintedSheet(*map(float, fit.sheet)), self.nominal - self.at
+        return TargetMeasures(fit.wrong, sheet, fit.off, fit.sigma, self.evidence, change, stated)
 
 
 def _evidence(

@@ -28,6 +28,7 @@ CODES: dict[str, tuple[Verdict, str]] = {
     "camera-not-calibrated": (_LOOK, "a camera has no image of the target, and takes no part"),
     "target-turned": (_LOOK, "the target is turned against the azimuths in rig.toml"),
     "target-measures": (_STOP, "the target does not have the measures of rig.toml"),
+    "world-scale": (_STOP, "the target's measures are likely in other units"),
     "print-errors": (_LOOK, "dots of the target are printed off their places"),
     "print-errors-large": (_STOP, "dots of the target are far from where the target should have them"),
     "lens-contradicts-target": (_STOP, "the lenses that fit the target are not those that fit the board"),

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from ringdic.calibration.board import board_points, find_corners
+from ringdic.calibration.board import board_points, count_squares, find_corners
 from ringdic.session.rig import Board
 
 BOARD = Board("checkerboard", (15, 20), 10.0)
@@ -84,3 +84,10 @@ def test_an_image_without_the_whole_board_has_no_corners(shared_data):
     assert find_corners(image, (12, 19)) is None
     x, _ = np.rint(find_corners(image, BOARD.inner_corners).mean(axis=0)).astype(int)
     assert find_corners(np.ascontiguousarray(image[:, x:]), BOARD.inner_corners) is None
+
+
+def test_a_board_of_another_number_of_squares_is_counted(shared_data):
+    image = grey(shared_data / "rendered_ring/limb/board/cam_05/001.jpg")
+    for said in ((14, 20), (15, 19), (16, 21), (14, 19)):
+        assert count_squares(image, Board("checkerboard", said, 10.0)) == (15, 20)
+    assert count_squares(np.full((400, 300), 128, np.uint8), BOARD) is None

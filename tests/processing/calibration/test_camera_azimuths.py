@@ -101,6 +101,23 @@ def test_exchanged_cameras_are_refused_by_name(rig, look, pair) -> None:
         camera_azimuths(look(swapped={a: b, b: a}), rig.target)
 
 
+@pytest.mark.parametrize("names", [("cam_01",), ("cam_05",), ("cam_09",), ("cam_12", "cam_01", "cam_02")])
+def test_mirrored_images_are_refused_by_name(rig, images, dots, names) -> None:
+    # The seam is seen by three of the cameras; of the others the printed numbers tell.
+    candidates = {}
+    for camera in rig.cameras:
+        image = np.ascontiguousarray(images[camera.id][:, ::-1]) if camera.id in names else images[camera.id]
+        candidates[camera.id] = azimuth_candidates(image, find_dots(image, rig.target), camera, rig.target)
+    with pytest.raises(InputError, match=rf"camera .*({'|'.join(names)}): the image of the target is mirrored"):
+        camera_azimuths(candidates, rig.target)
+
+
+def test_exchanged_cameras_of_a_rig_of_two_are_refused(rig, look) -> None:
+    seen = look(swapped={"cam_01": "cam_02", "cam_02": "cam_01"})
+    with pytest.raises(InputError, match=r"camera cam_0[12] stands at .* where rig.toml has camera cam_0[12]"):
+        camera_azimuths({id_: seen[id_] for id_ in ("cam_01", "cam_02")}, rig.target)
+
+
 def test_one_wrong_azimuth_is_refused_by_name(rig, look) -> None:
     with pytest.raises(InputError, match=r"camera cam_06 stands at azimuth 150°, rig.toml says 165°"):
         camera_azimuths(look(cam_06=165.0), rig.target)

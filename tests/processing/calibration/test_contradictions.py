@@ -140,6 +140,25 @@ def test_a_target_larger_as_a_whole_cannot_be_told() -> None:
     assert distances[0] < distances[1] - 1.0
 
 
+@pytest.mark.parametrize("unit", [10.0, 25.4])
+def test_measures_in_other_units_are_named_by_the_distance_of_the_boards(unit) -> None:
+    measures = ("radius_mm", "row_spacing_mm", "first_row_z_mm", "column_spacing_mm", "dot_size_mm")
+    stated = replace(TARGET, **{name: getattr(TARGET, name) / unit for name in measures})
+    finding = only(contradictions(session(2, 13, stated=stated), stated))
+    assert finding.code == "world-scale"
+    # The boards are held at 320 mm, the cameras stand 293 mm from the target.
+    assert finding.value == pytest.approx(unit * 320 / 293, rel=0.06)
+
+
+def test_a_target_scaled_as_a_whole_is_named_where_the_distance_was_measured() -> None:
+    calibrations = session(2, 14)
+    assert contradictions(calibrations, TARGET, distances={"c01": 350.0, "c02": 360.0}) == ()
+    finding = only(contradictions(calibrations, TARGET, distances={"c01": 350.0, "c02": 250.0}))
+    assert finding.code == "world-scale"
+    assert finding.cameras == ("c02",)
+    assert finding.value == pytest.approx(350 / 250, rel=0.03)
+
+
 def test_what_the_rig_file_states_to_be_unsure_is_no_contradiction() -> None:
     calibrations = session(3, 1, replace(TARGET, radius_mm=57.285))
     assert only(contradictions(calibrations, TARGET)).code == "target-measures"
