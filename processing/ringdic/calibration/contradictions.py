@@ -16,8 +16,8 @@ from ringdic.session.rig import Target
 #: Least deviation of a measure of the target that is a finding, as a part of it, and in units of what is expected; its
 #: least ratio to the standard error; and least error that the model itself may have, as a part.
 _MEASURE, _USUAL, _SURE, _MODEL = 0.002, 4.0, 5.0, 1e-4
-#: Least bend of a checkerboard that is a finding, mm.
-_BEND = 0.1
+#: Least bend of a checkerboard that is a finding, mm, and least stretch of its squares, as a part of them.
+_BEND, _STRETCH = 0.1, 0.001
 #: Ratios of distances that are a finding: of a camera to that in rig.toml, and of the boards to the target.
 _FARTHER, _OTHER_UNITS = 1.25, 6.0
 #: Least rotation of the printed sheet on its cylinder that is a finding, rad.
@@ -79,18 +79,32 @@ def contradictions(
     )
 
 
-def _of_boards(calibrations: Mapping[str, CameraCalibration]) -> tuple[Finding, ...]:
-    """A finding that names the cameras whose board was bent; none where it was flat."""
-    bends = {id_: each.fit.bend for id_, each in calibrations.items() if each.fit is not None}
-    ids = tuple(id_ for id_, bend in bends.items() if bend > _BEND)
-    if not ids:
-        return ()
-    worst = max(bends.values())
-    sentence = (
-        f"camera {', '.join(ids)}: the checkerboard was bent by up to {worst:.2f} mm between its middle and its edges; "
-        "the lens was fitted to the bent board, but use a stiff flat board, as another bend in each view cannot be seen"
-    )
-    return (Finding("board-not-flat", sentence, ids, value=worst, limit=_BEND, unit="mm"),)
+def _of_boards(calibrations: Mapping[str, CameraCalibration]) -> list[Finding]:
+    """Findings that name the cameras whose board was bent, or had squares that are longer than wide."""
+    findings = []
+    fits = {id_: each.fit for id_, each in calibrations.items() if each.fit is not None}
+    bent = {id_: fit.bend for id_, fit in fits.items() if fit.bend > _BEND}
+    if bent:
+        sentence = (
+            f"camera {', '.join(bent)}: the checkerboard was bent, its surface rises and falls by up to "
+            f"{max(bent.values()):.2f} mm; the lens was fitted to the bent board, but use a stiff flat one, as another "
+            "bend in each view cannot be seen"
+        )
+        findings.append(
+            Finding("board-not-flat", sentence, tuple(bent), value=max(bent.values()), limit=_BEND, unit="mm")
+        )
+    stretched = {id_: 100 * fit.stretch for id_, fit in fits.items() if abs(fit.stretch) > _STRETCH}
+    if stretched:
+        worst = max(stretched.values(), key=abs)
+        sentence = (
+            f"camera {', '.join(stretched)}: the squares of the checkerboard are {abs(worst):.2f} % "
+            f"{'longer' if worst > 0 else 'shorter'} than wide, along the second number of [board] squares; the lens "
+            "was fitted to them, but print the board without scaling, and measure it"
+        )
+        findings.append(
+            Finding("board-not-square", sentence, tuple(stretched), value=worst, limit=100 * _STRETCH, unit="%")
+        )
+    return findings
 
 
 def _of_scale(

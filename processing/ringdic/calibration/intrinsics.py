@@ -40,8 +40,8 @@ VIEWS_FOR_DROPPING = 10
 _ALWAYS = np.array([True, True, False, True, True, True, True, False, False, False])
 #: Least standard deviation of a corner that is supposed, px.
 _CORNER_FLOOR = 1e-6
-#: Squared Mahalanobis distance from a flat board, of three numbers, that shows a bend for certain; and how often it is
-#: followed.
+#: Squared Mahalanobis distance from a flat board with square squares that shows another for certain; and how often that
+#: is followed.
 _BENT, _MOST_BENDS = 50.0, 4
 #: Fewest views that determine a camera with free skew, focal lengths and principal point.
 VIEWS_NEEDED = 3
@@ -65,6 +65,7 @@ class IntrinsicsFit:
         displaces together, so that the true covariance is larger than ``covariance`` by about this factor.
     bend, bend_sigma : mm, height of the board's surface over its corners, highest minus lowest, and its standard error.
         Where the views show a bend for certain, the lens is fitted to the bent board; 0 for a flat one.
+    stretch : part by which its squares are longer along the board than across, 0 where the views do not show that.
     distance : mm, of the middle of the board from the camera, median of the views.
     """
 
@@ -81,6 +82,7 @@ class IntrinsicsFit:
     redundancy_factor: float = 1.0
     bend: float = 0.0
     bend_sigma: float = 0.0
+    stretch: float = 0.0
     distance: float = float("nan")
 
     def to_dict(self) -> dict[str, Any]:
@@ -148,7 +150,7 @@ def calibrate_intrinsics(
     px = np.stack([np.asarray(view, dtype=float).reshape(-1, 2) for view in views])
     board = np.column_stack([np.asarray(board_xy, dtype=float), np.zeros(len(board_xy))])
     models = candidate_models(radial, tangential, skew, fewest_terms)
-    fit = _fit_to_bent_board(px, board, size, models, drop_percentile, fewest_terms)
+    fit = _fit_to_board(px, board, size, models, drop_percentile, fewest_terms)
     board, inliers, choice = fit.board, fit.inliers, fit.choice
     state, _ = _refine(fit.state, px, board, np.zeros(10, dtype=bool))  # poses of all views, with the intrinsics fixed
     errors = _view_errors(state, px, board)
@@ -170,6 +172,7 @@ def calibrate_intrinsics(
         max(1.0, residuals.size / independent_observations(residuals, board[:, :2])),
         float(np.ptp(board[:, 2])),
         fit.bend_sigma,
+        float(np.ptp(board[:, 1]) / np.ptp(np.asarray(board_xy)[:, 1]) - 1),
         float(np.median(np.linalg.norm(state[1][inliers] @ board.mean(axis=0) + state[2][inliers], axis=1))),
     )
 
@@ -179,7 +182,7 @@ _State = tuple[Floats, Floats, Floats]  # inner (10,), rotations (views, 3, 3), 
 
 @dataclass(frozen=True)
 class _BoardFit:
-    """A lens fitted to a board that may be bent.
+    """A lens fitted to a board that may be bent, and whose squares may be longer than wide.
 
     board : (n, 3) mm, its corners. state : with the poses of all v views. covariance : (10, 10) of the lens. inliers :
     (v,) bool. bend_sigma : mm, standard error of the board's edge over its middle.
@@ -193,25 +196,28 @@ class _BoardFit:
     bend_sigma: float
 
 
-def _fit_to_bent_board(
+def _fit_to_board(
     px: Pixels, board: Points, size: tuple[int, int], models: list[LensModel], drop_percentile: float, fewest: bool
 ) -> _BoardFit:
-    """Choose a lens model and fit it to the views without gross errors; again with the board's bend, where one shows.
+    """Choose a lens model and fit it to the views without gross errors; again with the board's shape, if it has one.
 
     px : (v, n, 2). board : (n, 3) mm, flat.
     """
-    state = _start(px, board, size)
+    state, followed = _start(px, board, size), np.zeros(2, dtype=bool)
     for _ in range(_MOST_BENDS):
         state, _ = _refine(state, px, board, models[0].free)
         inliers = _inlier_views(_view_errors(state, px, board), drop_percentile)
         choice, state, covariance = _fit_of_chosen_model(models, state, px, board, inliers, fewest)
-        bend = _board_bend(_of_views(state, inliers), px[inliers], board, choice.model.free)
-        if bend.chi2 < _BENT:
+        seen = _of_views(state, inliers), px[inliers], board, choice.model.free
+        shape = _board_shape(*seen)
+        certain = np.array(shape.chi2) > _BENT
+        if not certain.any():
             break
-        board = board + bend.heights[:, None] * np.array([0.0, 0.0, 1.0])
-    return _BoardFit(
-        board, state, bend.lens_covariance if board[:, 2].any() else covariance, inliers, choice, bend.sigma
-    )
+        followed |= certain
+        board = board + _board_shape(*seen, bend=certain[0], stretch=certain[1]).shift
+    if followed.any():
+        covariance = _board_shape(*seen, bend=followed[0], stretch=followed[1]).lens_covariance
+    return _BoardFit(board, state, covariance, inliers, choice, shape.bend_sigma)
 
 
 def _of_views(state: _State, which: Mask) -> _State:
@@ -220,43 +226,53 @@ def _of_views(state: _State, which: Mask) -> _State:
 
 
 @dataclass(frozen=True)
-class _Bend:
-    """Quadratic bend of a board, beside the shape that its corners have already.
+class _Shape:
+    """Errors of a board's shape beside that which its corners have already: its bend, and the stretch of its squares.
 
-    heights : (n,) mm, of the corners. sigma : mm, standard error of the height of the board's edge over its middle.
-    chi2 : squared Mahalanobis distance from no bend, about 3 without one. lens_covariance : (10, 10), with a free bend.
+    shift : (n, 3) mm, of the corners. bend_sigma : mm, standard error of the height of the board's edge over its
+    middle. chi2 : of bend and stretch, squared Mahalanobis distances from none, about 3 and 1 without.
+    lens_covariance : (10, 10), with the shape free.
     """
 
-    heights: Floats
-    sigma: float
-    chi2: float
+    shift: Points
+    bend_sigma: float
+    chi2: tuple[float, float]
     lens_covariance: Floats
 
 
-def _board_bend(state: _State, px: Pixels, board: Points, free: Mask) -> _Bend:
-    """Bend that lowers the residuals of all v views most, with the lens and the poses free to follow, to first order.
+def _board_shape(
+    state: _State, px: Pixels, board: Points, free: Mask, *, bend: bool = True, stretch: bool = True
+) -> _Shape:
+    """Errors of shape that lower the residuals of all v views most, lens and poses free to follow, to first order.
 
-    px : (v, n, 2). board : (n, 3) mm. free : (10,) parameters of the lens. Standard errors are for as many residuals as
-    are independent without the bend.
+    px : (v, n, 2). board : (n, 3) mm. free : (10,) parameters of the lens. bend, stretch : the errors to estimate.
+    Standard errors are for as many residuals as are independent without these.
     """
     centred = board[:, :2] - board[:, :2].mean(axis=0)
     x, y = (centred / np.abs(centred).max()).T
-    modes = np.column_stack([x * x, x * y, y * y])
+    modes = np.zeros((len(board), 3, 4))
+    modes[:, 2, :3], modes[:, 1, 3] = np.column_stack([x * x, x * y, y * y]), y
+    modes = modes[..., np.array([bend, bend, bend, stretch])]
     projected, by_inner, by_pose, by_point = pose_jacobians(lens_of(state[0]), *_in_cameras(state, board))
-    by_height = (by_point @ state[1][:, None])[..., 2:]
-    J, r = np.concatenate([by_inner[..., free], by_height * modes[:, None]], axis=-1), px - projected
+    by_shape = np.einsum("vnki,nij->vnkj", by_point @ state[1][:, None], modes)
+    J, r = np.concatenate([by_inner[..., free], by_shape], axis=-1), px - projected
     A, B, C, a, c = _normal_equations(r, J, by_pose)
     change, pose = _solve(A, B, C, a, c, 0.0)
     left = r - J @ change - np.einsum("vnij,vj->vni", by_pose, pose)
     degrees = max(r.size - len(change) - 6 * len(px), 1)
     variance = max(float(np.sum(left**2)) / degrees, _CORNER_FLOOR**2)
     covariance = variance * _inner_inverse(A, B, C)
-    redundancy = max(1.0, left.size / independent_observations(left, board[:, :2]))
-    q, of_bend = change[-3:], redundancy * covariance[-3:, -3:]
+    k = int(free.sum())
+    q, own = change[k:], covariance[k:, k:] * max(1.0, left.size / independent_observations(left, board[:, :2]))
     lens = np.zeros((10, 10))
-    lens[np.ix_(free, free)] = covariance[:-3, :-3]
-    sigma = float(np.sqrt(np.max(np.einsum("ni,ij,nj->n", modes, of_bend, modes))))
-    return _Bend(modes @ q, sigma, float(q @ np.linalg.pinv(of_bend) @ q), lens)
+    lens[np.ix_(free, free)] = covariance[:k, :k]
+    b = 3 * bend
+    heights = modes[:, 2, :b]
+    sigma = float(np.sqrt(np.max(np.einsum("ni,ij,nj->n", heights, own[:b, :b], heights))))
+    of_bend, of_stretch = (
+        float(q[part] @ np.linalg.pinv(own[part, part]) @ q[part]) for part in (slice(0, b), slice(b, None))
+    )
+    return _Shape(modes @ q, sigma, (of_bend, of_stretch), lens)
 
 
 def _inner_inverse(A: Floats, B: Floats, C: Floats) -> Floats:

@@ -33,6 +33,7 @@ CODES: dict[str, tuple[Verdict, str]] = {
     "print-errors-large": (_STOP, "dots of the target are far from where the target should have them"),
     "lens-contradicts-target": (_STOP, "the lenses that fit the target are not those that fit the board"),
     "board-not-flat": (_LOOK, "the checkerboard was bent"),
+    "board-not-square": (_LOOK, "the squares of the checkerboard are longer than wide"),
     "camera-refocused": (_STOP, "a camera's focal length changed between board and target"),
     "wrong-board": (_STOP, "the board images of a camera are those of another camera"),
     "images-mirrored": (_STOP, "board and target images of a camera are not turned over alike"),

@@ -39,10 +39,18 @@ def camera_on_the_ring(name: str, azimuth_deg: float, rng: np.random.Generator) 
 
 
 def lens_from_boards(
-    lens: Intrinsics, noise: float, rng: np.random.Generator, heights: np.ndarray | float = 0.0
+    lens: Intrinsics,
+    noise: float,
+    rng: np.random.Generator,
+    heights: np.ndarray | float = 0.0,
+    stretch: float = 0.0,
 ) -> IntrinsicsFit:
-    """A lens fitted to ten views of a board. noise : of the corners, px. heights : of the corners, mm."""
-    board = np.column_stack([BOARD - BOARD.mean(axis=0), heights * np.ones(len(BOARD))])
+    """A lens fitted to ten views of a board.
+
+    noise : of the corners, px. heights : of the corners, mm. stretch : of the squares along the board, as a part.
+    """
+    flat = (BOARD - BOARD.mean(axis=0)) * [1, 1 + stretch]
+    board = np.column_stack([flat, heights * np.ones(len(BOARD))])
     views = []
     for _ in range(10):
         R = turned(rng.uniform(-1, 1, 3) * [0.6, 0.6, 0.3])

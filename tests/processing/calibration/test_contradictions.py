@@ -241,6 +241,18 @@ def test_a_bent_board_is_named_and_does_not_contradict() -> None:
     assert finding.value == pytest.approx(0.4, abs=0.01)
 
 
+def test_a_stretched_board_is_named_and_not_taken_for_a_wrong_target() -> None:
+    calibrations = session(3, 11)
+    rng = np.random.default_rng(13)
+    for name, each in calibrations.items():
+        fit = lens_from_boards(true_camera(name).intrinsics, 0.03, rng, stretch=0.005)
+        calibrations[name] = replace(each, fit=fit, camera=replace(each.camera, intrinsics=fit.intrinsics))
+    finding = only(contradictions(calibrations, TARGET))
+    assert finding.code == "board-not-square"
+    assert finding.cameras == ("c01", "c02", "c03")
+    assert finding.value == pytest.approx(0.5, abs=0.02)
+
+
 @pytest.mark.parametrize(("print_error", "code"), [(0.15, "print-errors"), (0.4, "print-errors-large")])
 def test_a_bad_print_is_told_by_its_size(print_error, code) -> None:
     finding = only(contradictions(session(2, 9, print_error=print_error), TARGET))

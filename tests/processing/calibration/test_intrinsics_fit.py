@@ -28,16 +28,26 @@ def values(lens: Intrinsics) -> np.ndarray:
     return np.array([lens.K[0, 0], lens.K[1, 1], lens.K[0, 1], lens.K[0, 2], lens.K[1, 2], *lens.distortion])
 
 
-def see(count: int, noise: float, seed: int, part: float = 1.0, heights: np.ndarray | float = 0.0) -> list[np.ndarray]:
+def see(
+    count: int,
+    noise: float,
+    seed: int,
+    part: float = 1.0,
+    heights: np.ndarray | float = 0.0,
+    stretch: float = 0.0,
+    turn: float = 1.5,
+) -> list[np.ndarray]:
     """Views of the board held about 350 mm away at all angles, through ``LENS``; ``part``: a smaller board.
 
-    heights : of the board's corners over its plane, mm.
+    heights : of the board's corners over its plane, mm. stretch : of its squares along, as a part. turn : rad, largest
+    rotation within its plane.
     """
     rng = np.random.default_rng(seed)
-    board = np.column_stack([part * (BOARD - BOARD.mean(axis=0)), heights * np.ones(len(BOARD))])
+    flat = part * (BOARD - BOARD.mean(axis=0)) * [1, 1 + stretch]
+    board = np.column_stack([flat, heights * np.ones(len(BOARD))])
     views = []
     for _ in range(count):
-        R, _ = cv2.Rodrigues(rng.uniform(-1, 1, 3) * [0.6, 0.6, 1.5])
+        R, _ = cv2.Rodrigues(rng.uniform(-1, 1, 3) * [0.6, 0.6, turn])
         camera = board @ R.T + rng.uniform(-1, 1, 3) * part * [30, 50, 60] + [0, 0, 350]
         distorted = LENS.distort_normalised(camera[:, :2] / camera[:, 2:])
         px = distorted @ LENS.K[:2, :2].T + LENS.K[:2, 2]
@@ -70,9 +80,20 @@ def test_a_bent_board_is_measured_and_leaves_the_lens_alone(shape, amount):
     assert fit.sigma[0] < 5e-4 * fit.intrinsics.K[0, 0]
 
 
-def test_a_flat_board_shows_no_bend():
-    # Of forty sets of views the bend is certain in none: χ² of three numbers exceeds 50 in one of 10¹⁰.
-    assert not any(calibrate_intrinsics(see(3 + seed % 8, 0.05, seed), BOARD, SIZE).bend for seed in range(40))
+@pytest.mark.parametrize("turn", [0.1, 1.5])  # always upright, and turned in all directions
+@pytest.mark.parametrize("stretch", [0.002, -0.01])
+def test_squares_that_are_not_square_are_measured_and_leave_the_lens_alone(stretch, turn):
+    fit = calibrate_intrinsics(see(8, 0.03, 2, stretch=stretch, turn=turn), BOARD, SIZE)
+    assert fit.stretch == pytest.approx(stretch, abs=2e-4)
+    assert fit.bend == 0
+    assert np.abs((values(fit.intrinsics) - values(LENS)) / fit.sigma).max() < 4.5
+
+
+def test_a_flat_board_shows_neither_bend_nor_stretch():
+    # Of forty sets of views they are certain in none: χ² of three numbers exceeds 50 in one of 10¹⁰.
+    fits = [calibrate_intrinsics(see(3 + seed % 8, 0.05, seed), BOARD, SIZE) for seed in range(40)]
+    assert not any(fit.bend or fit.stretch for fit in fits)
+    assert np.median([fit.distance for fit in fits]) == pytest.approx(350, abs=10)
 
 
 def test_a_board_that_flexes_differently_in_each_view_is_not_taken_for_sure():
