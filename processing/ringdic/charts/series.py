@@ -139,6 +139,7 @@ class SurfaceSeries:
         self._textures = [texture_of(surface.texture[k, view.vertex]) for k, view in enumerate(self._views)]
         self._motions: dict[int, CameraMotions] = {} if moved is None else {0: moved}
         self._drift = np.full((len(self.names), len(cameras)), np.nan)
+        self._measured = np.ones(len(self.names))
         residuals = [surface.px[c, view.vertex] - view.px for c, view in enumerate(self._views)]
         self._drift[0] = [float(np.mean(one[:, 1])) if len(one) else np.nan for one in residuals]
         # In the image of its own camera a point lies on a whole pixel by definition.
@@ -150,6 +151,7 @@ class SurfaceSeries:
         steps = range(1, len(self.names))
         for k, step in enumerate(map_in_order(lambda k: self._measure(k, matches), steps), start=1):
             cache.put(k, step)
+            self._measured[k] = np.mean(step.status == 0)
             self._drift[k] = self._drift[0] + step.residual
             for samples, one in zip(c_ls, step.cameras, strict=True):
                 samples.append(_sample(one.c_ls))
@@ -172,6 +174,11 @@ class SurfaceSeries:
         """How cameras moved since the reference, or for step 0 since the calibration; None where none moved."""
         motions = self._motions.get(step)
         return motions if motions is not None and motions.moved.any() else None
+
+    @property
+    def measured(self) -> Floats:
+        """Share of the points that each step measured, (F,), no unit, 0 to 1."""
+        return self._measured
 
     @property
     def agreement(self) -> dict[str, Any]:

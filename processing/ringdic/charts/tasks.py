@@ -22,11 +22,14 @@ from ringdic.charts.body_motion import SeenBody, SurfaceFrames
 from ringdic.charts.chart import Chart, chart_with_uncertainty
 from ringdic.charts.depth_map import DepthMap, depths_at_fitting_size
 from ringdic.charts.evidence import why_unmatched
+from ringdic.charts.image_findings import RunImages
+from ringdic.charts.image_state import ImageState, image_state, pixel_digest
 from ringdic.charts.images import ChartImages
 from ringdic.charts.matching import drop_masked, match_chart
 from ringdic.charts.patches import Patches
 from ringdic.charts.plane_sweep import DepthRange
 from ringdic.charts.poses import motions_as_arrays, motions_from_arrays, poses_of_charts
+from ringdic.charts.reference_state import ReferenceState
 from ringdic.charts.surface import reference_surface
 from ringdic.charts.tracked_points import TrackedPoints, tracked_points
 from ringdic.charts.tracking import CameraMatches, match_in_two_passes, surface_grid
@@ -120,6 +123,27 @@ class ChartsJob:
         except ComputationError:
             return None
         return CameraMatches(step=int(arrays["step"]), **{name: arrays[name] for name in _MATCHES})
+
+    def images(self, steps: Sequence[str], measured: Floats, radius: int) -> RunImages:
+        """The states of all images.
+
+        steps : ids of the F captures. measured : (F,) share of the surface's points that each measured. radius : px.
+        """
+        references = tuple(ReferenceState.of_arrays(read_output(task.output)) for task in self.maps)
+        states, digests = {}, {}
+        for c, row in enumerate(self.steps):
+            for step, task in enumerate(row, start=1):
+                if task is None:
+                    continue
+                try:
+                    arrays = read_output(task.output)
+                except ComputationError:  # the camera has no part in the surface
+                    states[c, step] = ImageState(0, 0, *[np.nan] * 7)
+                    continue
+                states[c, step] = ImageState.of_array(arrays["image_state"])
+                digests[c, step] = str(arrays["digest"])
+        cameras = tuple(camera.id for camera in self.views.cameras)
+        return RunImages(cameras, tuple(steps), references, states, digests, measured, radius)
 
 
 def charts_job(
@@ -237,12 +261,15 @@ def depth_task(files: _ReferenceFiles, k: int, *, inputs: tuple[Path, ...]) -> A
     )
     nearest = partners[0] if partners else None
     why, features = why_unmatched(images, depth_map, k, nearest, space, mask)
+    state = ReferenceState.of(files.views.cameras[k].id, files.image(k), depth_map, files.correlation.radius)
+    if why and state.repetition:
+        why = state.repetition[0].sentence
     patches = depth_map.patches
     return {
         "px": patches.px, "inverse_depth": patches.inverse_depth, "gradient": patches.gradient,
         "sigma": depth_map.sigma, "textured": depth_map.textured, "patterned": depth_map.patterned,
         "spacing": np.array(depth_map.spacing), "grey_noise": np.array(depth_map.grey_noise),
-        "points": np.array(len(patches.px)), "why": np.array(why),
+        "points": np.array(len(patches.px)), "why": np.array(why), **state.arrays(),
         "features": features, "between": np.array([k, k if nearest is None else nearest]),
     }  # fmt: skip
 
@@ -323,7 +350,12 @@ def tracking_task(
     current = step_image(image, cameras[k], again=False)
     matches = match_in_two_passes(prepared, current, points, settings, curved=curved)
     arrays = {name: getattr(matches, name) for name in _MATCHES}
-    return {**arrays, "step": np.array(matches.step), "points": np.array(len(points.positions))}
+    warp = np.column_stack([matches.uv, matches.gradient.reshape(-1, 4)])
+    state = image_state(prepared.image, current, matches.xy.astype(float), warp)
+    return {
+        **arrays, "step": np.array(matches.step), "points": np.array(len(points.positions)),
+        "image_state": state.array(), "digest": np.array(pixel_digest(current)),
+    }  # fmt: skip
 
 
 def _reference_and_points(

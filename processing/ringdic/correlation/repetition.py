@@ -48,13 +48,15 @@ class Repetition:
     """Windows of an image and whether their pattern repeats itself.
 
     xy : (k, 2) px, middles of the windows. likeness : (k,) ZNCC of the second peak, without the noise. period : (k, 2)
-    px, where this peak lies. repeats : (k,) bool.
+    px, where this peak lies. repeats : (k,) bool. speckle : px, size of the speckles, as the full width at half maximum
+    of the autocorrelation, the geometric mean of its least and largest.
     """
 
     xy: Pixels
     likeness: Floats
     period: Pixels
     repeats: Mask
+    speckle: float
 
     @property
     def share(self) -> float:
@@ -114,7 +116,8 @@ def find_repetition(image: Image, xy: Pixels, radius: int, region: Mask | None =
         if one is not None:
             found.append((*point, one[0], *(factor * lag for lag in one[1:])))
     rows = np.array(found, dtype=np.float64).reshape(-1, 5)
-    return Repetition(rows[:, :2], rows[:, 2], rows[:, 3:], rows[:, 2] >= limit)
+    speckle = 2.0 * factor * math.sqrt(narrow * wide)
+    return Repetition(rows[:, :2], rows[:, 2], rows[:, 3:], rows[:, 2] >= limit, speckle)
 
 
 def _levelled(grey: Levels, inside: Levels, side: int) -> Levels:

@@ -48,6 +48,14 @@ CODES: dict[str, tuple[Verdict, str]] = {
     "file-numbers-shifted": (_LOOK, "the file numbers of a camera differ from those that they are paired with"),
     # images
     "repeating-pattern": (_STOP, "the pattern repeats itself, so matches can be wrong by its period"),
+    "coarse-speckle": (_LOOK, "speckles are as large as a subset"),
+    "fine-speckle": (_LOOK, "speckles are as small as a pixel"),
+    "image-repeated": (_STOP, "an image is that of another camera or step, pixel for pixel"),
+    "image-missing": (_LOOK, "a camera has no image of a step"),
+    "image-blurred": (_LOOK, "an image is more blurred than its reference"),
+    "image-clipped": (_LOOK, "a good part of the pattern is white or black without any grey level"),
+    "image-faint": (_LOOK, "an image has far less contrast than its reference"),
+    "camera-lost-points": (_LOOK, "a camera lost far more points at a step than the others"),
     # surface
     "area-unmeasured": (_LOOK, "textured area that two cameras see was not measured"),
     "step-unmeasured": (_LOOK, "hardly a point was measured at a step"),

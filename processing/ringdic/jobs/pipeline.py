@@ -152,12 +152,9 @@ def match_session(
         ReferenceSurface.from_arrays(found), job.matches, settings, StepCache(work),
         places_of_arrays(cameras, found), found["unmatched"].tolist(), job.motions,
     )  # fmt: skip
-    findings = (
-        *rig.findings,
-        *left_out,
-        *moment_findings([step for step in steps if step.kind == "specimen"]),
-        *series.findings,
-    )
+    images = job.images(series.names, series.measured, settings.correlation.radius_px)
+    moments = moment_findings([step for step in steps if step.kind == "specimen"])
+    findings = (*rig.findings, *left_out, *moments, *images.findings(), *series.findings)
     return SessionMatches(series, rig, errors, series.drift, series.agreement, findings)
 
 
@@ -221,10 +218,17 @@ def _usable_pairs(
 ) -> tuple[dict[tuple[str, str], ReconstructionError], tuple[Finding, ...]]:
     """Pairs of calibrated cameras with a reference image, with their errors at the control points.
 
-    The second value has a finding for each pair that cannot be used. Raises InputError where no pair can.
+    The second value has a finding for each camera without a reference image and each pair that cannot be used. Raises
+    InputError where no pair can.
     """
     usable: dict[tuple[str, str], ReconstructionError] = {}
-    findings: list[Finding] = []
+    reference = steps[0]
+    absent = [id_ for id_ in rig.cameras if id_ not in reference.images]
+    sentence = "{}: camera {} has no image of the reference, so it takes no part; capture it again"
+    findings = [
+        Finding("image-missing", sentence.format(reference.id, id_), (id_,), reference.id, 1, 0, "images")
+        for id_ in absent
+    ]
 
     def leave_out(sentence: str) -> None:
         findings.append(Finding("pair-left-out", sentence, pair))

@@ -201,9 +201,15 @@ def _table(figures: dict[str, Any]) -> list[dict[str, str]]:
             value = f"{known['position_mm']:.4f} mm, {known['displacement_mm']:.5f} mm, {known['stretch']:.1e}"
             rows.append((f"standard deviations by the {cause}: place, displacement, λ2", value))
     for step in figures["steps"][1:]:
-        if step["measured"]:
-            value = f"{step['displacement_mm']:.3f} mm, {step['lambda1_median']:.4f}, {step['lambda2_median']:.4f}"
-            rows.append((f"{step['step']}: displacement, λ1, λ2 (medians), lost", f"{value}, {step['lost']:,}"))
+        known = None not in (step["displacement_mm"], step["lambda1_median"], step["lambda2_median"])
+        value = f"{step['lost']:,}"
+        if known:
+            value = (
+                f"{step['displacement_mm']:.3f} mm, {step['lambda1_median']:.4f}, {step['lambda2_median']:.4f}, {value}"
+            )
+        elif not step["measured"]:
+            value = f"nothing measured, {value}"
+        rows.append((f"{step['step']}: displacement, λ1, λ2 (medians), lost", value))
     return [{"figure": figure, "value": value} for figure, value in rows]
 
 

@@ -1,0 +1,210 @@
+"""Findings about the images of a run: blurred, clipped, dark, repeated or missing ones, and what was lost for it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ringdic.arrays import Floats
+from ringdic.charts.image_state import ImageState
+from ringdic.charts.reference_state import ReferenceState
+from ringdic.findings import Finding
+
+_BLUR = 0.8  # px, that a calm image never has more than its reference: stretch, JPEG and noise make 0.3, where both
+# images are out of focus 0.65
+_BLUR_APART = 1.2  # px, where hardly a point was matched, so that the squares show other material
+_BLUR_OF_CAMERA = 1.0  # px, beside other cameras, which may stand nearer or show the pattern more squarely
+_WIDTH = 16.0 * np.log(2.0)  # square of the full width of an autocorrelation, in that of the blur's standard deviation
+_FOLLOWED = 0.5  # share of the points lost, below which an image's squares show the same material
+_CLIPPED = 0.25  # of the pixels of the pattern: white paper or black ink alone may be at the end of the grey levels
+_MORE_CLIPPED = 0.1  # than in the reference
+_FAINT = 0.25  # of the reference's contrast
+_LOST = 0.15  # of a camera's points, that are worth a finding
+_TIMES = 3.0  # times as much as the median of all cameras
+_HARDLY = 0.1  # of the points of a step
+_COARSE = 0.75  # of a subset's width, from which on speckles are too large for it: it holds hardly an edge
+_FINE = 1.7  # px, below which pixels do not resolve speckles
+
+
+@dataclass(frozen=True)
+class RunImages:
+    """States of the images of a run.
+
+    cameras : ids of the C cameras. steps : ids of the F captures, the reference first. references : (C,). states :
+    images of the later steps by camera and step, None where there is none; digests : of their pixels. measured : (F,)
+    share of the surface's points that each step measured. radius : px, of the subsets.
+    """
+
+    cameras: tuple[str, ...]
+    steps: tuple[str, ...]
+    references: tuple[ReferenceState, ...]
+    states: Mapping[tuple[int, int], ImageState]
+    digests: Mapping[tuple[int, int], str]
+    measured: Floats
+    radius: int
+
+    def findings(self) -> list[Finding]:
+        """All findings about the images."""
+        return [
+            *(one for reference in self.references for one in reference.repetition),
+            *self._speckle(),
+            *(one for c in range(len(self.cameras)) for one in self._reference(c)),
+            *self._repeated(),
+            *(one for step in range(1, len(self.steps)) for one in self._step(step)),
+        ]
+
+    def _speckle(self) -> Iterator[Finding]:
+        """Speckles that are too large for the subsets, or too small for the pixels, in the median of the cameras."""
+        sizes = [one.speckle for one in self.references]
+        size, width = float(np.median(sizes)), 2 * self.radius + 1
+        if size > _COARSE * width:
+            sentence = (
+                f"the speckles are {size:.1f} px wide (median of the cameras; limit {_COARSE * width:.0f} px), a "
+                f"subset is {width} px wide and holds hardly one: its σ is too small; set correlation.radius_px to "
+                f"{round(1.5 * size)} or more, or apply a finer pattern"
+            )
+            yield Finding("coarse-speckle", sentence, value=round(size, 2), limit=_COARSE * width, unit="px")
+        elif size < _FINE:
+            sentence = (
+                f"the speckles are {size:.1f} px wide (median of the cameras; limit {_FINE} px): pixels do not resolve "
+                "them, which biases the matches; apply a coarser pattern, or move the cameras closer"
+            )
+            yield Finding("fine-speckle", sentence, value=round(size, 2), limit=_FINE, unit="px")
+
+    def _reference(self, c: int) -> Iterator[Finding]:
+        """Whether a camera's reference image is more blurred than its later ones, or than those of other cameras."""
+        camera, name = self.cameras[c], self.steps[0]
+        later = [state.across for (of, _), state in self.states.items() if of == c and state.lost < _FOLLOWED]
+        blur, limit, beside = -float(np.median(later)) if later else 0.0, _BLUR, "its later images"
+        if not blur > limit:
+            own, usual = self.references[c].speckle, float(np.median([one.speckle for one in self.references]))
+            blur, limit = float(np.sqrt(max(own**2 - usual**2, 0.0) / _WIDTH)), _BLUR_OF_CAMERA
+            beside = "those of the other cameras"
+        if blur > limit:
+            sentence = (
+                f"{name}, camera {camera}: the image is blurred by {blur:.1f} px beside {beside} (limit {limit} px); "
+                "focus the camera, and capture the reference again"
+            )
+            yield Finding("image-blurred", sentence, (camera,), name, round(blur, 3), limit, "px")
+
+    def _repeated(self) -> Iterator[Finding]:
+        """Images whose pixels are those of another camera or step."""
+        first: dict[str, tuple[int, int]] = {one.digest: (c, 0) for c, one in enumerate(self.references)}
+        for c, one in enumerate(self.references):
+            if first[one.digest] != (c, 0):
+                yield self._same((c, 0), first[one.digest])
+        for (c, step), digest in sorted(self.digests.items(), key=lambda each: each[0][::-1]):
+            known = first.setdefault(digest, (c, step))
+            if known != (c, step):
+                yield self._same((c, step), known)
+
+    def _same(self, image: tuple[int, int], other: tuple[int, int]) -> Finding:
+        (c, step), (d, before) = image, other
+        cameras = tuple(dict.fromkeys((self.cameras[c], self.cameras[d])))
+        sentence = (
+            f"{self.steps[step]}: the image of camera {self.cameras[c]} is the same, pixel for pixel, as that of "
+            f"camera {self.cameras[d]} in {self.steps[before]}; replace it by the one that was taken, or leave the "
+            "step out"
+        )
+        return Finding("image-repeated", sentence, cameras, self.steps[step])
+
+    def _step(self, step: int) -> Iterator[Finding]:
+        """Findings about the images of a step: missing ones, each camera's own, and the step itself where it failed."""
+        known = {c: self.states[c, step] for c in range(len(self.cameras)) if (c, step) in self.states}
+        missing = [self.cameras[c] for c in range(len(self.cameras)) if c not in known]
+        if missing:
+            sentence = f"{self.steps[step]}: camera {' and '.join(missing)} has no image; capture the step again"
+            yield Finding("image-missing", sentence, tuple(missing), self.steps[step], len(missing), 0, "images")
+        if self.measured[step] < _HARDLY:
+            yield self._unmeasured(step, known)
+            return
+        usual = float(np.median([state.lost for state in known.values()])) if known else 0.0
+        single = [finding for c, state in known.items() for finding in self._image(c, step, state, usual)]
+        for code in dict.fromkeys(each.code for each in single):
+            yield _joint([each for each in single if each.code == code])
+
+    def _image(self, c: int, step: int, state: ImageState, usual: float) -> Iterator[Finding]:
+        """What is wrong with one image. usual : share of the points that cameras lose at this step, their median."""
+        camera, name = self.cameras[c], self.steps[step]
+        causes = self._causes(c, state)
+        lost = state.lost > max(_LOST, _TIMES * usual)
+        losing = f"; {100 * state.lost:.0f} % of its points were lost" if lost else ""
+        for code, sentence, value, limit, unit in causes:
+            yield Finding(code, f"{name}, camera {camera}: {sentence}{losing}", (camera,), name, value, limit, unit)
+        if lost and not causes:
+            sentence = (
+                f"{name}, camera {camera}: {100 * state.lost:.0f} % of its points were lost (limit {100 * _LOST:.0f} "
+                f"%), {100 * usual:.0f} % in the median camera; check that it shows the specimen unobstructed, at this "
+                "step"
+            )
+            yield Finding("camera-lost-points", sentence, (camera,), name, 100 * state.lost, 100 * _LOST, "%")
+
+    def _causes(self, c: int, state: ImageState) -> list[tuple[str, str, float, float, str]]:
+        """Code, sentence, figure, limit and unit of all that is wrong with an image of camera c."""
+        before, causes = self.references[c].state, []
+        limit = _BLUR if state.lost < _FOLLOWED else _BLUR_APART
+        if state.blur > limit and state.contrast > _FAINT / 2:
+            causes.append(("image-blurred", _blur_sentence(state, limit), state.blur, limit, "px"))
+        for what, share, then, remedy in (
+            ("white", state.bright, before.bright, "expose shorter, or remove what reflects"),
+            ("black", state.dark, before.dark, "expose longer, or light the specimen"),
+        ):
+            if share > _CLIPPED and share > then + _MORE_CLIPPED:
+                sentence = (
+                    f"{100 * share:.0f} % of the pattern's pixels are {what}, without any grey level (reference "
+                    f"{100 * then:.0f} %, limit {100 * _CLIPPED:.0f} %); {remedy}"
+                )
+                causes.append(("image-clipped", sentence, 100 * share, 100 * _CLIPPED, "%"))
+        if state.contrast < _FAINT and not causes:
+            sentence = (
+                f"its contrast is {100 * state.contrast:.0f} % of the reference's (limit {100 * _FAINT:.0f} %); light "
+                "the specimen as at the reference"
+            )
+            causes.append(("image-faint", sentence, 100 * state.contrast, 100 * _FAINT, "%"))
+        return causes
+
+    def _unmeasured(self, step: int, known: Mapping[int, ImageState]) -> Finding:
+        """The finding of a step at which hardly a point was measured, with the cause that most images show."""
+        name, share = self.steps[step], float(self.measured[step])
+        causes = {c: self._causes(c, state) for c, state in known.items()}
+        codes = [each[0][0] for each in causes.values() if each]
+        common = max(set(codes), key=codes.count) if codes else ""
+        affected = [c for c, each in causes.items() if each and each[0][0] == common]
+        if common and 2 * len(affected) >= len(known):
+            worst = max(affected, key=lambda c: causes[c][0][2])
+            cameras = tuple(self.cameras[c] for c in affected)
+            why = f"camera {' and '.join(cameras)}: {causes[worst][0][1]}"
+        else:
+            lost = ", ".join(f"{self.cameras[c]} {100 * state.lost:.0f} %" for c, state in known.items())
+            cameras = ()
+            why = (
+                "the images are as sharp and as bright as the reference, but its points were not found in them (lost: "
+                f"{lost}); check that the step shows the same specimen, and that it moved by less than 160 px"
+            )
+        sentence = f"{name}: {100 * share:.0f} % of the points were measured (limit {100 * _HARDLY:.0f} %); {why}"
+        return Finding("step-unmeasured", sentence, cameras, name, 100 * share, 100 * _HARDLY, "%")
+
+
+def _joint(findings: list[Finding]) -> Finding:
+    """One finding in place of those of one code about several cameras at one step: the gravest, and whom it is of."""
+    worst = max(findings, key=lambda each: abs((each.value or 0.0) - (each.limit or 0.0)))
+    if len(findings) == 1:
+        return worst
+    cameras = tuple(camera for each in findings for camera in each.cameras)
+    sentence = f"{worst.sentence} (so {len(cameras)} cameras: {', '.join(cameras)})"
+    return replace(worst, sentence=sentence, cameras=cameras)
+
+
+def _blur_sentence(state: ImageState, limit: float) -> str:
+    """What a blur is and what helps: one along a direction is a motion's, one in all directions that of a lens."""
+    if state.across > 0.5 * state.blur:
+        return (
+            f"blurred by {state.blur:.1f} px beside its reference (limit {limit} px), in all directions; focus the "
+            "camera and capture again"
+        )
+    return (
+        f"blurred by {state.blur:.1f} px beside its reference (limit {limit} px), along {state.along:.0f}° from x "
+        "towards y, as by a motion; expose shorter, or capture when the specimen rests"
+    )

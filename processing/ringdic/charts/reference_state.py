@@ -1,0 +1,75 @@
+"""Figures of a camera's reference image that tell whether it can be matched: speckles, their repetition, light."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ringdic.arrays import Image, Mask, Pixels
+from ringdic.charts.depth_map import DepthMap
+from ringdic.charts.image_state import ImageState, image_state, pixel_digest
+from ringdic.correlation.repetition import find_repetition
+from ringdic.findings import Finding
+
+_KNOWN = 0.1  # of the textured places have a depth: with fewer, all textured places are looked at
+
+
+@dataclass(frozen=True)
+class ReferenceState:
+    """State of a camera's reference image.
+
+    state : the image beside itself: how it is lit. speckle : px, size of the speckles. repetition : findings of a
+    repeating pattern. digest : of its pixels.
+    """
+
+    state: ImageState
+    speckle: float
+    repetition: tuple[Finding, ...]
+    digest: str
+
+    @classmethod
+    def of(cls, camera: str, image: Image, depth_map: DepthMap, radius: int) -> ReferenceState:
+        """The state of a camera's image (height, width), at the places of its depth map.
+
+        camera : its id. radius : px, of the subsets.
+        """
+        known = depth_map.patches.px
+        places = known if len(known) > _KNOWN * len(depth_map.textured) else depth_map.textured
+        found = find_repetition(image, places, radius, _about(places, image.shape, depth_map.spacing))
+        return cls(
+            image_state(image, image, places, np.zeros((len(places), 6))), found.speckle,
+            tuple(found.findings(f"camera {camera}", (camera,))), pixel_digest(image),
+        )  # fmt: skip
+
+    def arrays(self) -> dict[str, NDArray]:
+        """The state as arrays of a task's output, by name.
+
+        "image_state" (9,), "speckle" () px, "digest" () of text, "repetition" (k, 4) of text.
+        """
+        sentences = [(one.sentence, *one.cameras, one.value, one.limit) for one in self.repetition]
+        return {
+            "image_state": self.state.array(), "speckle": np.array(self.speckle), "digest": np.array(self.digest),
+            "repetition": np.array(sentences, dtype=str).reshape(-1, 4),
+        }  # fmt: skip
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, NDArray]) -> ReferenceState:
+        """The state from the arrays (9,), () px, () and (k, 4) of :meth:`arrays`, by name."""
+        repetition = tuple(
+            Finding("repeating-pattern", str(sentence), (str(camera),), None, float(value), float(limit), "ZNCC")
+            for sentence, camera, value, limit in arrays["repetition"]
+        )
+        state = ImageState.of_array(arrays["image_state"])
+        return cls(state, float(arrays["speckle"]), repetition, str(arrays["digest"]))
+
+
+def _about(places: Pixels, shape: tuple[int, ...], spacing: int) -> Mask:
+    """The pixels of an image of a shape (height, width) about places (n, 2) px of a lattice of some spacing, px."""
+    region = np.zeros(shape, np.uint8)
+    column, row = np.rint(places).astype(int).T
+    region[row.clip(0, shape[0] - 1), column.clip(0, shape[1] - 1)] = 1
+    return np.asarray(cv2.dilate(region, np.ones((2 * spacing + 1,) * 2, np.uint8))) > 0
