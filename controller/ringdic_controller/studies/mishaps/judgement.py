@@ -73,7 +73,7 @@ def judged_mishap(row: MishapRow, run: RunRecord, calm: RunRecord | None) -> Mis
     news = [each for each in run.findings if not _among(each, usual)]
     if row.expected is None:
         return _judged_calm(row, run.errors, news, faults)
-    naming = [each for each in news if names(row.expected, each, run.steps)]
+    naming = naming_findings(row.expected, news, run.steps)
     others = [each for each in news if each not in naming]
     codes = _codes(naming), _codes(others)
     reason = "; ".join(faults)
@@ -110,13 +110,25 @@ def wrong_figures(errors: RunErrors, calm: RunErrors | None) -> list[str]:
     return faults
 
 
-def names(expected: Expectation, finding: dict[str, Any], steps: Sequence[str]) -> bool:
-    """Whether a finding names what is to be mended: cameras, step and thing. steps : names of the captures."""
-    named, meant = set(finding["cameras"]), set(expected.cameras)
-    cameras = not meant or named == meant or (expected.in_doubt and named >= meant)
+def naming_findings(
+    expected: Expectation, findings: Sequence[dict[str, Any]], steps: Sequence[str]
+) -> list[dict[str, Any]]:
+    """The findings that name what is to be mended: together all cameras, and each the step and the thing.
+
+    findings : as JSON objects. steps : names of the captures of the specimen.
+    """
+    meant = set(expected.cameras)
     allowed = [None if number is None else steps[number] for number in expected.steps if (number or 0) < len(steps)]
-    step = not allowed or finding["step"] in allowed
-    return cameras and step and _has_word(expected.words, (finding["code"], finding["sentence"]))
+
+    def fits(finding: dict[str, Any]) -> bool:
+        named = set(finding["cameras"])
+        cameras = not meant or (bool(named) and (named <= meant or (expected.in_doubt and named >= meant)))
+        step = not allowed or finding["step"] in allowed
+        return cameras and step and _has_word(expected.words, (finding["code"], finding["sentence"]))
+
+    fitting = [each for each in findings if fits(each)]
+    complete = meant <= {camera for each in fitting for camera in each["cameras"]}
+    return fitting if complete else []
 
 
 def _judged_refusal(row: MishapRow, run: RunRecord) -> MishapJudgement:

@@ -16,6 +16,7 @@ LOST = replace(GOOD, measured=(1000, 1000, 0))
 LARGER = replace(GOOD, shape_mm=0.05, displacement_mm=0.02)  # and within the stated σ
 CALM = RunRecord(STEPS, GOOD)
 BUMP = MishapRow("moved", "bump", "arc4", unchanged, Expectation(("cam_02",), (2,)))
+EXCHANGE = MishapRow("order", "exchange", "arc4", unchanged, Expectation(("cam_02", "cam_03"), (None, 0)))
 RADIUS = MishapRow("target", "radius", "arc4", unchanged, Expectation(words=("radius",)))
 
 
@@ -46,6 +47,10 @@ RIGHT = finding(cameras=("cam_02",), step=STEPS[2])
         (BUMP, LOST, [], Outcome.SILENT),
         (BUMP, LOST, [finding("step-unmeasured", step=STEPS[2])], Outcome.LESS),
         (BUMP, LOST, [RIGHT], Outcome.NAMED),
+        (EXCHANGE, WRONG, [finding(cameras=("cam_03", "cam_02"))], Outcome.NAMED),
+        (EXCHANGE, WRONG, [finding(cameras=("cam_03",)), finding(cameras=("cam_02",), step=STEPS[0])], Outcome.NAMED),
+        (EXCHANGE, WRONG, [finding(cameras=("cam_03",))], Outcome.MISNAMED),  # half of it
+        (EXCHANGE, WRONG, [finding(cameras=("cam_01", "cam_02", "cam_03"))], Outcome.MISNAMED),
         (RADIUS, WRONG, [finding(sentence="the Radius is 57 mm")], Outcome.NAMED),
         (RADIUS, WRONG, [finding(sentence="the speckles are faint")], Outcome.SILENT),
         (calm_row("arc4"), GOOD, [], Outcome.CALM),
