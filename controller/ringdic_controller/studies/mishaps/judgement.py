@@ -115,6 +115,8 @@ def naming_findings(
 ) -> list[dict[str, Any]]:
     """The findings that name what is to be mended: together all cameras, and each the step and the thing.
 
+    A code by which other cameras are blamed too names nothing.
+
     findings : as JSON objects. steps : names of the captures of the specimen.
     """
     meant = set(expected.cameras)
@@ -126,7 +128,10 @@ def naming_findings(
         step = not allowed or finding["step"] in allowed
         return cameras and step and _has_word(expected.words, (finding["code"], finding["sentence"]))
 
-    fitting = [each for each in findings if fits(each)]
+    astray = {
+        each["code"] for each in findings if meant and not expected.in_doubt and not set(each["cameras"]) <= meant
+    }
+    fitting = [each for each in findings if fits(each) and each["code"] not in astray]
     complete = meant <= {camera for each in fitting for camera in each["cameras"]}
     return fitting if complete else []
 

@@ -104,9 +104,10 @@ class _Study:
         """What processing a row gives, and the seconds that it took."""
         planned = self.render(row)
         path = self._session(row, planned)
-        steps = tuple(capture.id for capture in open_session(path).of_kind("specimen"))
+        steps: tuple[str, ...] = ()
         began = time.monotonic()
         try:
+            steps = tuple(capture.id for capture in open_session(path).of_kind("specimen"))
             run = process_session(path, self.settings, self._renamed(row.name))
         except RingdicError as error:
             return RunRecord(steps, refusal=str(error)), time.monotonic() - began

@@ -37,7 +37,8 @@ RIGHT = finding(cameras=("cam_02",), step=STEPS[2])
         (BUMP, GOOD, [finding(cameras=("cam_03",), step=STEPS[2])], Outcome.MISNAMED),
         (BUMP, WRONG, [], Outcome.SILENT),
         (BUMP, WRONG, [RIGHT], Outcome.NAMED),
-        (BUMP, WRONG, [RIGHT, finding(cameras=("cam_03",))], Outcome.NAMED),
+        (BUMP, WRONG, [RIGHT, finding("camera-unmatched", cameras=("cam_03",))], Outcome.NAMED),
+        (BUMP, WRONG, [RIGHT, finding(cameras=("cam_03",))], Outcome.MISNAMED),
         (BUMP, WRONG, [finding(cameras=("cam_03",), step=STEPS[2])], Outcome.MISNAMED),
         (BUMP, WRONG, [finding(cameras=("cam_02", "cam_03"), step=STEPS[2])], Outcome.MISNAMED),
         (BUMP, WRONG, [finding(cameras=("cam_02",), step=STEPS[1])], Outcome.MISNAMED),
@@ -49,6 +50,7 @@ RIGHT = finding(cameras=("cam_02",), step=STEPS[2])
         (BUMP, LOST, [RIGHT], Outcome.NAMED),
         (EXCHANGE, WRONG, [finding(cameras=("cam_03", "cam_02"))], Outcome.NAMED),
         (EXCHANGE, WRONG, [finding(cameras=("cam_03",)), finding(cameras=("cam_02",), step=STEPS[0])], Outcome.NAMED),
+        (EXCHANGE, WRONG, [finding(cameras=(f"cam_0{k}",)) for k in (1, 2, 3, 4)], Outcome.MISNAMED),  # each of all
         (EXCHANGE, WRONG, [finding(cameras=("cam_03",))], Outcome.MISNAMED),  # half of it
         (EXCHANGE, WRONG, [finding(cameras=("cam_01", "cam_02", "cam_03"))], Outcome.MISNAMED),
         (RADIUS, WRONG, [finding(sentence="the Radius is 57 mm")], Outcome.NAMED),

@@ -7,6 +7,8 @@ import pytest
 from ringdic.errors import ComputationError
 from ringdic_controller.studies.gallery import rows as gallery_rows
 from ringdic_controller.studies.mishaps import run
+from ringdic_controller.studies.mishaps.changes import rig_described
+from ringdic_controller.studies.mishaps.rows import Expectation, MishapRow
 from ringdic_controller.studies.mishaps.run import run_mishaps
 
 CALM, BUMPED = "calm-arc2", "bumped-after-calibration-3px-turned-rows-arc2"
@@ -64,3 +66,15 @@ def test_what_is_refused_or_fails_is_a_row_with_its_sentence(
     assert entry["run"]["errors"] is None
     assert entry["run"]["refusal"] == sentence
     assert entry["judgement"]["outcome"] == outcome
+
+
+def test_a_rig_file_that_is_refused_is_a_refusal(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def impossible() -> list[MishapRow]:
+        values = {"column_spacing_mm": 15.0}
+        return [MishapRow("target", "wide", "arc2", rig_described(values), Expectation(words=("columns",)))]
+
+    monkeypatch.setattr(gallery_rows, "BOARDS", 4)
+    monkeypatch.setattr(run, "all_rows", impossible)
+    (entry,) = run_mishaps(folder, scale=0.15)["entries"]
+    assert entry["judgement"]["outcome"] == "refused"
+    assert "do not fit round the radius" in entry["run"]["refusal"]
