@@ -199,7 +199,7 @@ def _images() -> Iterator[MishapRow]:
 
 
 def _patterns() -> Iterator[MishapRow]:
-    for name, size in (("coarse-speckle", 6.5), ("fine-speckle", 0.33)):
+    for name, size in (("speckles-of-28px", 6.5), ("speckles-of-16px", 3.7), ("speckles-of-1.5px", 0.33)):
         change = changes.specimen_changed(speckle=size)
         yield MishapRow("pattern", name, "arc4", change, Expectation(words=_PATTERN))
     for body in ("limb", _PLATE):
