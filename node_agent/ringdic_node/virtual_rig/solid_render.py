@@ -28,7 +28,7 @@ from ringdic_node.virtual_rig.texture import solid_speckle
 LONG = 0.8
 _TILE = 8  # px
 _STEEP = 5.0  # depths of neighbouring pixels that differ by more pixels than this lie on both sides of an edge
-_FINE_SPECKLE, _SUBPIXELS = 0.7, 3  # size of speckles below which the image has this many pixels for one, both ways
+_FINE_SPECKLE, _SUBPIXELS = 0.7, 2  # size of speckles below which the image has this many pixels for one, both ways
 _DELTA = 1e-3  # mm, of the central differences
 
 
