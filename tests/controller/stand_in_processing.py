@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from ringdic.findings import Finding, verdict_figures
 from ringdic.geometry.camera import Camera
 from ringdic.results.results import Results
 from ringdic.results.series import select_steps
@@ -26,6 +27,15 @@ BARE = (
     UnmeasuredPlaces(
         "01", np.array([[30.0, 20.0], [40.0, 20.0]]), 10.0, np.array([3, 16], np.int8), np.array([70.0, 50])
     ),
+)
+MOVED = Finding(
+    "camera-moved",
+    "camera 02 moved since the reference, by 1.20 px in its image",
+    ("02",),
+    "0004-specimen",
+    1.2,
+    0.06,
+    "px",
 )
 
 
@@ -57,6 +67,7 @@ def tube(steps: tuple[str, ...]) -> Results:
         sigma_xyz=np.where(lost[..., None], np.nan, np.full((*shape, 3), 0.01)),
         status=lost.astype(np.int8),
         summary={
+            **verdict_figures([MOVED]),
             "table": [{"quantity": "larger stretch", "measured": "1.1", "true": "1.1"}],
             "unmeasured": unmeasured_areas(BARE, 37_000.0),
         },
