@@ -13,7 +13,7 @@ from ringdic.session.rig import Board
 
 #: Long sides to which an image is scaled for the detection of the board, px: the smallest first, as it is fastest.
 _SEARCH_SIZES = (1000, 2000)
-#: Squares more or less that are tried, where the board is not found.
+#: Squares more or less, across and along together, that are tried where the board is not found.
 _MISCOUNT = 2
 
 
@@ -59,7 +59,12 @@ def count_squares(image: NDArray[np.generic], board: Board) -> tuple[int, int] |
     off = sorted(itertools.product(range(-_MISCOUNT, _MISCOUNT + 1), repeat=2), key=lambda each: sum(map(abs, each)))
     for more_across, more_along in off:
         squares = across + more_across, along + more_along
-        if min(squares) > 3 and cv2.findChessboardCornersSB(small, (squares[0] - 1, squares[1] - 1), flags=0)[0]:
+        near = abs(more_across) + abs(more_along) <= _MISCOUNT
+        if (
+            near
+            and min(squares) > 3
+            and cv2.findChessboardCornersSB(small, (squares[0] - 1, squares[1] - 1), flags=0)[0]
+        ):
             return squares
     return None
 

@@ -174,9 +174,8 @@ def _board_corners(rig: Rig, camera_id: str, images: Sequence[NDArray[np.generic
     count = sum(view is not None for view in corners)
     if count < VIEWS_NEEDED:
         across, along = rig.board.squares
-        blank = next(image for image, view in zip(images, corners, strict=True) if view is None) if images else None
-        other = None if blank is None else count_squares(blank, rig.board)
-        if other is not None and other != (across, along):
+        counted = {count_squares(image, rig.board) for image in images[:2]} if count == 0 and len(images) > 1 else set()
+        if len(counted) == 1 and (other := counted.pop()) is not None:
             raise InputError(
                 f"camera {camera_id}: its board images show a checkerboard of {other[0]} x {other[1]} squares, [board] "
                 f"squares in rig.toml says {across} x {along}; correct it, or take images of that board"

@@ -181,3 +181,12 @@ def test_held_out_dots_are_predicted_by_the_others(ring) -> None:
     # A dot that took part pulls the camera to itself.
     own = each.dots.px - each.camera.project(each.dots.xyz)
     assert 1.0 < np.linalg.norm(each.held_out) / np.linalg.norm(own) < 1.2
+
+
+def test_miscounted_squares_are_told_by_their_number(ring_rig, shared_data) -> None:
+    folder = shared_data / "rendered_ring" / "limb"
+    boards = [grey(folder / "board" / "cam_05" / f"{view:03d}.jpg") for view in range(3)]
+    target = grey(folder / "target" / "cam_05.jpg")
+    miscounted = replace(ring_rig, board=replace(ring_rig.board, squares=(14, 19)))  # its inner corners
+    with pytest.raises(InputError, match=r"camera cam_05: .* a checkerboard of 15 x 20 squares, .* says 14 x 19"):
+        calibrate_camera(miscounted, "cam_05", boards, target)
