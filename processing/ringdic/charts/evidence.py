@@ -15,6 +15,7 @@ import numpy as np
 from ringdic.arrays import Floats, Image, Mask, Pixels
 from ringdic.charts.contrast import contrast
 from ringdic.charts.depth_map import DepthImages, DepthMap, lattice_places
+from ringdic.charts.exchanged import exchanged_or_mirrored
 from ringdic.charts.patches import depths
 from ringdic.charts.plane_sweep import DepthRange
 from ringdic.correlation import prepare_reference
@@ -47,7 +48,8 @@ class MatchEvidence:
     deviation by which its image is more blurred than the partner's, negative where less. matches : number of features
     matched, of which in_mask lie inside the mask and in_range at a depth that is searched. offset : px, their median
     distance from the epipolar lines; limit : px, that is allowed. near, far : mm, 5th and 95th percentile of their
-    depths; low, high : mm, range of depths searched. features : (2, n, 2) px, of the full images of both.
+    depths; low, high : mm, range of depths searched. features : (2, n, 2) px, of the full images of both. confused :
+    that an image is another camera's or mirrored, empty where nothing shows it.
     """
 
     camera: str
@@ -69,6 +71,7 @@ class MatchEvidence:
     low: float
     high: float
     features: Pixels = field(repr=False)
+    confused: str = ""
 
     @property
     def sentence(self) -> str:
@@ -87,6 +90,8 @@ class MatchEvidence:
     def _verdict(self, partner: str) -> str:
         """The figure that stands against a match, and what to check."""
         known = self.matches >= _FEWEST
+        if self.confused and not (known and 2 * self.in_range >= self.matches):
+            return self.confused
         if not self.masked and not self.textured:
             return f"the strongest contrast of its image is {self.contrast:.1f} grey levels a px; speckle the specimen"
         if self.masked and known and self.in_mask < 0.1 * self.matches:
@@ -152,6 +157,7 @@ def match_evidence(
         int(within[row, column].sum()), int((space.holds(cameras[0], xyz) & space.holds(cameras[1], xyz)).sum()),
         factor * offset, factor * _OFF_LINE, float(near), float(far), low, high,
         (np.stack([first, second]) + 0.5) * factor - 0.5,
+        exchanged_or_mirrored(images, k, partner, space),
     )  # fmt: skip
 
 

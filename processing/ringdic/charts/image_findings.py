@@ -14,6 +14,7 @@ from ringdic.findings import Finding
 
 _BLUR = 0.8  # px, that a calm image never has more than its reference: stretch, JPEG and noise make 0.3, where both
 # images are out of focus 0.65
+_BLUR_OF_REFERENCE = 0.9  # px, beside later images: a stretch of 50 % alone makes 0.8
 _BLUR_APART = 1.2  # px, where hardly a point was matched, so that the squares show other material
 _BLUR_OF_CAMERA = 1.0  # px, beside other cameras, which may stand nearer or show the pattern more squarely
 _WIDTH = 16.0 * np.log(2.0)  # square of the full width of an autocorrelation, in that of the blur's standard deviation
@@ -22,7 +23,7 @@ _CLIPPED = 0.25  # of the pixels of the pattern: white paper or black ink alone 
 _MORE_CLIPPED = 0.1  # than in the reference
 _FAINT = 0.25  # of the reference's contrast
 _LOST = 0.15  # of a camera's points, that are worth a finding
-_TIMES = 3.0  # times as much as the median of all cameras
+_TIMES = 3.0  # times as much as the lower quartile of all cameras
 _HARDLY = 0.1  # of the points of a step
 _COARSE = 0.75  # of a subset's width, from which on speckles are too large for it: it holds hardly an edge
 _FINE = 1.7  # px, below which pixels do not resolve speckles
@@ -58,7 +59,9 @@ class RunImages:
     def _speckle(self) -> Iterator[Finding]:
         """Speckles that are too large for the subsets, or too small for the pixels, in the median of the cameras."""
         sizes = [one.speckle for one in self.references]
-        size, width = float(np.median(sizes)), 2 * self.radius + 1
+        if np.isnan(sizes).all():
+            return
+        size, width = float(np.nanmedian(sizes)), 2 * self.radius + 1
         if size > _COARSE * width:
             sentence = (
                 f"the speckles are {size:.1f} px wide (median of the cameras; limit {_COARSE * width:.0f} px), a "
@@ -77,9 +80,10 @@ class RunImages:
         """Whether a camera's reference image is more blurred than its later ones, or than those of other cameras."""
         camera, name = self.cameras[c], self.steps[0]
         later = [state.across for (of, _), state in self.states.items() if of == c and state.lost < _FOLLOWED]
-        blur, limit, beside = -float(np.median(later)) if later else 0.0, _BLUR, "its later images"
+        # A stretch of the surface widens the reference's own blur too: the least stretched step counts.
+        blur, limit, beside = -max(later, default=0.0), _BLUR_OF_REFERENCE, "its later images"
         if not blur > limit:
-            own, usual = self.references[c].speckle, float(np.median([one.speckle for one in self.references]))
+            own, usual = self.references[c].speckle, float(np.nanmedian([one.speckle for one in self.references]))
             blur, limit = float(np.sqrt(max(own**2 - usual**2, 0.0) / _WIDTH)), _BLUR_OF_CAMERA
             beside = "those of the other cameras"
         if blur > limit:
@@ -120,13 +124,15 @@ class RunImages:
         if self.measured[step] < _HARDLY:
             yield self._unmeasured(step, known)
             return
-        usual = float(np.median([state.lost for state in known.values()])) if known else 0.0
-        single = [finding for c, state in known.items() for finding in self._image(c, step, state, usual)]
+        usual = float(np.percentile([state.lost for state in known.values()], 25)) if known else 0.0
+        single = [
+            finding for c, state in known.items() if state.points for finding in self._image(c, step, state, usual)
+        ]
         for code in dict.fromkeys(each.code for each in single):
             yield _joint([each for each in single if each.code == code])
 
     def _image(self, c: int, step: int, state: ImageState, usual: float) -> Iterator[Finding]:
-        """What is wrong with one image. usual : share of the points that cameras lose at this step, their median."""
+        """What is wrong with one image. usual : share of the points that the better cameras lose at this step."""
         camera, name = self.cameras[c], self.steps[step]
         causes = self._causes(c, state)
         lost = state.lost > max(_LOST, _TIMES * usual)
@@ -136,7 +142,7 @@ class RunImages:
         if lost and not causes:
             sentence = (
                 f"{name}, camera {camera}: {100 * state.lost:.0f} % of its points were lost (limit {100 * _LOST:.0f} "
-                f"%), {100 * usual:.0f} % in the median camera; check that it shows the specimen unobstructed, at this "
+                f"%), {100 * usual:.0f} % in the better ones; check that it shows the specimen unobstructed, at this "
                 "step"
             )
             yield Finding("camera-lost-points", sentence, (camera,), name, 100 * state.lost, 100 * _LOST, "%")

@@ -15,15 +15,16 @@ from ringdic.charts.image_state import ImageState, image_state, pixel_digest
 from ringdic.correlation.repetition import find_repetition
 from ringdic.findings import Finding
 
-_KNOWN = 0.1  # of the textured places have a depth: with fewer, all textured places are looked at
+_KNOWN = 0.3  # of the textured places have a depth: with fewer, all textured places are looked at, background too
+_MOST = 0.6  # of these that must repeat: lamps in the background do
 
 
 @dataclass(frozen=True)
 class ReferenceState:
     """State of a camera's reference image.
 
-    state : the image beside itself: how it is lit. speckle : px, size of the speckles. repetition : findings of a
-    repeating pattern. digest : of its pixels.
+    state : the image beside itself: how it is lit. speckle : px, size of the speckles, NaN where the surface is hardly
+    known. repetition : findings of a repeating pattern. digest : of its pixels.
     """
 
     state: ImageState
@@ -38,11 +39,13 @@ class ReferenceState:
         camera : its id. radius : px, of the subsets.
         """
         known = depth_map.patches.px
-        places = known if len(known) > _KNOWN * len(depth_map.textured) else depth_map.textured
+        certain = len(known) > _KNOWN * len(depth_map.textured)
+        places = known if certain else depth_map.textured
         found = find_repetition(image, places, radius, _about(places, image.shape, depth_map.spacing))
+        repeats = found.share >= (0.0 if certain else _MOST)
         return cls(
-            image_state(image, image, places, np.zeros((len(places), 6))), found.speckle,
-            tuple(found.findings(f"camera {camera}", (camera,))), pixel_digest(image),
+            image_state(image, image, places, np.zeros((len(places), 6))), found.speckle if certain else np.nan,
+            tuple(found.findings(f"camera {camera}", (camera,))) if repeats else (), pixel_digest(image),
         )  # fmt: skip
 
     def arrays(self) -> dict[str, NDArray]:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from ringdic.charts.depth_map import DepthImages, measure_depths
 from ringdic.charts.evidence import MatchEvidence, match_evidence
+from ringdic.charts.exchanged import exchanged_or_mirrored
 from ringdic.charts.plane_sweep import DepthRange
 from ringdic.correlation import CorrelationSettings
 from ringdic.geometry.camera import Camera, Intrinsics
@@ -105,3 +106,31 @@ def test_a_camera_that_looks_at_something_else_is_told_by_its_matches(images) ->
     assert found.matches == 0
     assert abs(found.blur) < 1.0
     assert "0 features of its image are found in that of camera cam_02" in found.sentence
+
+
+def test_exchanged_images_are_told_with_both_cameras(images) -> None:
+    found = evidence(images[::-1])
+    assert "the image of camera cam_01 shows what camera cam_02 would" in found.sentence
+
+
+def test_an_image_of_a_third_camera_is_told_of_from_either_side() -> None:
+    """The second and the third of three cameras are exchanged; the first has its own image."""
+    rig = paper_rig(12, SCALE).cameras[:3]
+    cameras = [calibrated(camera) for camera in rig]
+    taken = [render(camera, Specimen(Limb(), 0, seed=4), seed=7 + k) for k, camera in enumerate(rig)]
+    reduced = DepthImages.of(cameras, lambda c: taken[(0, 2, 1)[c]], SETTINGS)
+    for k, partner in ((0, 1), (1, 0), (1, 2)):
+        sentence = exchanged_or_mirrored(reduced, k, partner, SPACE)
+        assert "cam_02" in sentence
+        assert "cam_03" in sentence
+        assert "cam_01" not in sentence
+    calm = DepthImages.of(cameras, lambda c: taken[c], SETTINGS)
+    assert [exchanged_or_mirrored(calm, k, partner, SPACE) for k, partner in ((0, 1), (1, 2), (2, 1))] == [""] * 3
+
+
+def test_mirrored_images_are_told_by_their_camera(images) -> None:
+    mirrored = [np.ascontiguousarray(image[:, ::-1]) for image in images]
+    assert "the image of camera cam_01 is mirrored" in evidence([mirrored[0], images[1]]).sentence
+    assert "the image of camera cam_01 is mirrored" in evidence([mirrored[0], images[1]], k=1).sentence
+    both = evidence(mirrored).sentence
+    assert "cam_01, like that of camera cam_02, is mirrored" in both
