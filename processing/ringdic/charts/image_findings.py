@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +20,7 @@ _BLUR_OF_CAMERA = 1.0  # px, beside other cameras, which may stand nearer or sho
 _WIDTH = 16.0 * np.log(2.0)  # square of the full width of an autocorrelation, in that of the blur's standard deviation
 _FOLLOWED = 0.5  # share of the points lost, below which an image's squares show the same material
 _CLIPPED = 0.25  # of the pixels of the pattern: white paper or black ink alone may be at the end of the grey levels
+_CLIPPED_REFERENCE = 0.45  # of the pixels of the pattern at the reference
 _MORE_CLIPPED = 0.1  # than in the reference
 _FAINT = 0.25  # of the reference's contrast
 _LOST = 0.15  # of a camera's points, that are worth a finding
@@ -51,6 +52,7 @@ class RunImages:
         return [
             *(one for reference in self.references for one in reference.repetition),
             *self._speckle(),
+            *self._clipped_references(),
             *(one for c in range(len(self.cameras)) for one in self._reference(c)),
             *self._repeated(),
             *(one for step in range(1, len(self.steps)) for one in self._step(step)),
@@ -58,23 +60,30 @@ class RunImages:
 
     def _speckle(self) -> Iterator[Finding]:
         """Speckles that are too large for the subsets, or too small for the pixels, in the median of the cameras."""
-        sizes = [one.speckle for one in self.references]
-        if np.isnan(sizes).all():
-            return
-        size, width = float(np.nanmedian(sizes)), 2 * self.radius + 1
-        if size > _COARSE * width:
-            sentence = (
-                f"the speckles are {size:.1f} px wide (median of the cameras; limit {_COARSE * width:.0f} px), a "
-                f"subset is {width} px wide and holds hardly one: its σ is too small; set correlation.radius_px to "
-                f"{round(1.5 * size)} or more, or apply a finer pattern"
-            )
+        size, width = float(np.median([one.speckle for one in self.references])), 2 * self.radius + 1
+        for sentence in coarse_speckle([one.speckle for one in self.references], self.radius):
             yield Finding("coarse-speckle", sentence, value=round(size, 2), limit=_COARSE * width, unit="px")
-        elif size < _FINE:
+        if size < _FINE:
             sentence = (
                 f"the speckles are {size:.1f} px wide (median of the cameras; limit {_FINE} px): pixels do not resolve "
                 "them, which biases the matches; apply a coarser pattern, or move the cameras closer"
             )
             yield Finding("fine-speckle", sentence, value=round(size, 2), limit=_FINE, unit="px")
+
+    def _clipped_references(self) -> Iterator[Finding]:
+        """Cameras whose reference image is mostly white or black."""
+        for what, shares, remedy in (
+            ("white", [one.state.bright for one in self.references], "expose shorter"),
+            ("black", [one.state.dark for one in self.references], "expose longer, or light the specimen"),
+        ):
+            cameras = tuple(self.cameras[c] for c, share in enumerate(shares) if share > _CLIPPED_REFERENCE)
+            if cameras:
+                sentence = (
+                    f"{self.steps[0]}, camera {', '.join(cameras)}: up to {100 * max(shares):.0f} % of the pattern's "
+                    f"pixels are {what}, without any grey level (limit {100 * _CLIPPED_REFERENCE:.0f} %); {remedy}"
+                )
+                limit = 100 * _CLIPPED_REFERENCE
+                yield Finding("image-clipped", sentence, cameras, self.steps[0], 100 * max(shares), limit, "%")
 
     def _reference(self, c: int) -> Iterator[Finding]:
         """Whether a camera's reference image is more blurred than its later ones, or than those of other cameras."""
@@ -83,8 +92,10 @@ class RunImages:
         # A stretch of the surface widens the reference's own blur too: the least stretched step counts.
         blur, limit, beside = -max(later, default=0.0), _BLUR_OF_REFERENCE, "its later images"
         if not blur > limit:
-            own, usual = self.references[c].speckle, float(np.nanmedian([one.speckle for one in self.references]))
-            blur, limit = float(np.sqrt(max(own**2 - usual**2, 0.0) / _WIDTH)), _BLUR_OF_CAMERA
+            sizes = [one.speckle for one in self.references if one.certain]
+            own = self.references[c].speckle if self.references[c].certain else 0.0
+            excess = own**2 - float(np.median(sizes)) ** 2 if sizes else 0.0
+            blur, limit = float(np.sqrt(max(excess, 0.0) / _WIDTH)), _BLUR_OF_CAMERA
             beside = "those of the other cameras"
         if blur > limit:
             sentence = (
@@ -191,6 +202,21 @@ class RunImages:
             )
         sentence = f"{name}: {100 * share:.0f} % of the points were measured (limit {100 * _HARDLY:.0f} %); {why}"
         return Finding("step-unmeasured", sentence, cameras, name, 100 * share, 100 * _HARDLY, "%")
+
+
+def coarse_speckle(sizes: Sequence[float], radius: int) -> list[str]:
+    """The sentence about speckles that are too large for the subsets, if they are.
+
+    sizes : px, of the speckles in each camera. radius : px, of the subsets.
+    """
+    size, width = float(np.median(sizes)), 2 * radius + 1
+    if size <= _COARSE * width:
+        return []
+    return [
+        f"the speckles are {size:.1f} px wide (median of the cameras; limit {_COARSE * width:.0f} px), a subset is "
+        f"{width} px wide and holds hardly one: set correlation.radius_px to {round(1.5 * size)} or more, or apply a "
+        "finer pattern"
+    ]
 
 
 def _joint(findings: list[Finding]) -> Finding:

@@ -23,12 +23,14 @@ _MOST = 0.6  # of these that must repeat: lamps in the background do
 class ReferenceState:
     """State of a camera's reference image.
 
-    state : the image beside itself: how it is lit. speckle : px, size of the speckles, NaN where the surface is hardly
-    known. repetition : findings of a repeating pattern. digest : of its pixels.
+    state : the image beside itself: how it is lit. speckle : px, size of the speckles. certain : whether the surface is
+    known well enough to tell the pattern from the background. repetition : findings of a repeating pattern. digest : of
+    its pixels.
     """
 
     state: ImageState
     speckle: float
+    certain: bool
     repetition: tuple[Finding, ...]
     digest: str
 
@@ -44,30 +46,32 @@ class ReferenceState:
         found = find_repetition(image, places, radius, _about(places, image.shape, depth_map.spacing))
         repeats = found.share >= (0.0 if certain else _MOST)
         return cls(
-            image_state(image, image, places, np.zeros((len(places), 6))), found.speckle if certain else np.nan,
+            image_state(image, image, places, np.zeros((len(places), 6))), found.speckle, certain,
             tuple(found.findings(f"camera {camera}", (camera,))) if repeats else (), pixel_digest(image),
         )  # fmt: skip
 
     def arrays(self) -> dict[str, NDArray]:
         """The state as arrays of a task's output, by name.
 
-        "image_state" (9,), "speckle" () px, "digest" () of text, "repetition" (k, 4) of text.
+        "image_state" (9,), "speckle" () px, "certain" () bool, "digest" () of text, "repetition" (k, 4) of text.
         """
         sentences = [(one.sentence, *one.cameras, one.value, one.limit) for one in self.repetition]
         return {
-            "image_state": self.state.array(), "speckle": np.array(self.speckle), "digest": np.array(self.digest),
+            "image_state": self.state.array(), "speckle": np.array(self.speckle),
+            "certain": np.array(self.certain), "digest": np.array(self.digest),
             "repetition": np.array(sentences, dtype=str).reshape(-1, 4),
         }  # fmt: skip
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, NDArray]) -> ReferenceState:
-        """The state from the arrays (9,), () px, () and (k, 4) of :meth:`arrays`, by name."""
+        """The state from the arrays (9,), () px, (), () and (k, 4) of :meth:`arrays`, by name."""
         repetition = tuple(
             Finding("repeating-pattern", str(sentence), (str(camera),), None, float(value), float(limit), "ZNCC")
             for sentence, camera, value, limit in arrays["repetition"]
         )
         state = ImageState.of_array(arrays["image_state"])
-        return cls(state, float(arrays["speckle"]), repetition, str(arrays["digest"]))
+        certain = bool(arrays["certain"])
+        return cls(state, float(arrays["speckle"]), certain, repetition, str(arrays["digest"]))
 
 
 def _about(places: Pixels, shape: tuple[int, ...], spacing: int) -> Mask:

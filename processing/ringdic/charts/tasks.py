@@ -22,7 +22,7 @@ from ringdic.charts.body_motion import SeenBody, SurfaceFrames
 from ringdic.charts.chart import Chart, chart_with_uncertainty
 from ringdic.charts.depth_map import DepthMap, depths_at_fitting_size
 from ringdic.charts.evidence import why_unmatched
-from ringdic.charts.image_findings import RunImages
+from ringdic.charts.image_findings import RunImages, coarse_speckle
 from ringdic.charts.image_state import ImageState, image_state, pixel_digest
 from ringdic.charts.images import ChartImages
 from ringdic.charts.matching import drop_masked, match_chart
@@ -185,7 +185,7 @@ def charts_job(
         key = digest(stamp, "poses", needs, list(cameras), [] if covariance is None else covariance)
         poses = Task(key, "poses of the cameras", poses_task, (tuple(cameras), covariance), folder, needs)
     views = replace(views, cameras=tuple(placed or views.cameras))
-    joining = (correlation.step, settings.surface)
+    joining = (correlation.step, correlation.radius, settings.surface)
     key = digest(stamp, "surface", needs, joining, list(views.cameras))
     surface = Task(key, "surface", surface_task, (views, *joining), folder, needs)
     curved = settings.method == "best"
@@ -317,7 +317,9 @@ def poses_task(cameras: tuple[Camera, ...], covariance: Floats | None, *, inputs
     return motions_as_arrays(poses_of_charts(cameras, list(map(Chart.from_arrays, charts)), features, covariance))
 
 
-def surface_task(views: RigViews, step: int, settings: SurfaceGroup, *, inputs: tuple[Path, ...]) -> Arrays:
+def surface_task(
+    views: RigViews, step: int, radius: int, settings: SurfaceGroup, *, inputs: tuple[Path, ...]
+) -> Arrays:  # fmt: skip
     """Triangulate and merge the charts, and find what they left unmeasured.
 
     inputs : outputs of the depth maps of all cameras, then of the charts. Returns the arrays of the surface and of the
@@ -332,8 +334,11 @@ def surface_task(views: RigViews, step: int, settings: SurfaceGroup, *, inputs: 
     try:
         measured = [Chart.from_arrays(chart.result()) for chart in charts]
         surface = reference_surface(cameras, measured, step, settings.sigma_max_px, settings.merge)
+        if not len(surface.xyz):
+            raise ComputationError("no point of the surface was measured by two cameras")
     except ComputationError as error:
-        raise ComputationError(f"{error}: {'; '.join(filter(None, why))}") from error
+        coarse = coarse_speckle([float(one["speckle"]) for one in depths], radius)
+        raise ComputationError(f"{error}: {'; '.join(filter(None, [*coarse, *why]))}") from error
     places = unmeasured_places(cameras, maps, surface, settings.incidence_deg, views.space.centre)
     return {**surface.arrays(), **arrays_of_places(places), "unmatched": np.array(why)}
 

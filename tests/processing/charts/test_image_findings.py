@@ -11,7 +11,7 @@ from ringdic.findings import Finding, Verdict
 
 CALM = ImageState(1000, 980, 0.1, 20.0, -0.1, 0.95, 0.01, 0.0, 120.0)
 CAMERAS, STEPS = ("1", "2", "3"), ("0001-specimen", "0002-specimen", "0003-specimen")
-REFERENCES = tuple(ReferenceState(CALM, 4.0, (), f"reference {camera}") for camera in CAMERAS)
+REFERENCES = tuple(ReferenceState(CALM, 4.0, True, (), f"reference {camera}") for camera in CAMERAS)
 PLACES = [(c, step) for c in range(3) for step in (1, 2)]
 
 
@@ -85,6 +85,13 @@ def test_a_pattern_that_is_white_by_itself_is_not_clipped() -> None:
     assert replace(images, references=tuple(replace(one, state=white) for one in REFERENCES)).findings() == []
 
 
+def test_a_reference_that_is_mostly_white_is_named() -> None:
+    white = replace(CALM, bright=0.6)
+    references = (REFERENCES[0], replace(REFERENCES[1], state=white), REFERENCES[2])
+    finding = only(replace(run_images(), references=references))
+    assert (finding.code, finding.cameras, finding.step, finding.value) == ("image-clipped", ("2",), STEPS[0], 60.0)
+
+
 def test_a_camera_that_loses_far_more_points_than_the_others_is_named() -> None:
     lost = only(run_images(c1s1=replace(CALM, matched=700)))
     assert (lost.code, lost.cameras, lost.step) == ("camera-lost-points", ("2",), STEPS[1])
@@ -137,6 +144,6 @@ def test_speckles_that_do_not_suit_the_subset_or_the_pixels_are_named(size: floa
 
 def test_the_state_of_a_reference_survives_its_storage() -> None:
     finding = Finding("repeating-pattern", "camera 1: it repeats", ("1",), None, 0.98, 0.65, "ZNCC")
-    state = ReferenceState(CALM, 4.5, (finding,), "digest")
+    state = ReferenceState(CALM, 4.5, False, (finding,), "digest")
     assert ReferenceState.of_arrays(state.arrays()) == state
     assert ReferenceState.of_arrays(REFERENCES[0].arrays()) == REFERENCES[0]
