@@ -54,6 +54,7 @@ RIGHT = finding(cameras=("cam_02",), step=STEPS[2])
         (EXCHANGE, WRONG, [finding(cameras=("cam_03",))], Outcome.MISNAMED),  # half of it
         (EXCHANGE, WRONG, [finding(cameras=("cam_01", "cam_02", "cam_03"))], Outcome.MISNAMED),
         (RADIUS, WRONG, [finding(sentence="the Radius is 57 mm")], Outcome.NAMED),
+        (RADIUS, WRONG, [finding("area-unmeasured", sentence="check the radius, or the light")], Outcome.SILENT),
         (RADIUS, WRONG, [finding(sentence="the speckles are faint")], Outcome.SILENT),
         (calm_row("arc4"), GOOD, [], Outcome.CALM),
         (calm_row("arc4"), GOOD, [finding(cameras=("cam_02",))], Outcome.ALARM),
