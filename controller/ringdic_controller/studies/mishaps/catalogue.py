@@ -159,7 +159,7 @@ def _targets() -> Iterator[MishapRow]:
         ("print-rows-0.5pct-large", {"row_spacing_mm": 12.0 * small}),
         ("radius-58", {"radius_mm": 58.0}),
         ("row-spacing-13", {"row_spacing_mm": 13.0}),
-        ("column-spacing-12.5", {"column_spacing_mm": 12.5}),
+        ("column-spacing-11.5", {"column_spacing_mm": 11.5}),
         ("radius-in-cm", {"radius_mm": 5.7}),
         ("target-in-cm", centimetres),
     ):
