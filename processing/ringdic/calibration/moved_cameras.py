@@ -3,9 +3,10 @@
 The cost ``Σ ρ(r / σ) + Σ_c ρ_c(p_cᵀ Σ_c⁻¹ p_c)`` is minimised over the points and a small motion p_c = (ω, τ) of each
 camera, with the lenses fixed. r are the reprojection residuals with Huber's ρ; Σ_c is the covariance of the pose of a
 camera that stands still. ρ_c is the cost of Geman and McClure: a camera's prior counts the less the more the points
-contradict it (iteratively reweighted least squares), so that the motion of one camera is not spread over all. At last
-the cameras that moved are free, and the others stand still; where most have moved, all are free, and the smallest
-motion that fits is taken. The points are eliminated from the normal equations (Schur complement).
+contradict it (iteratively reweighted least squares), so that the motion of one camera is not spread over all. Where
+that shows a motion, cameras are freed one after the other, that which explains most first, and all others stand still;
+where more than half have moved, all are free, and the smallest motion that fits is taken. The points are eliminated
+from the normal equations (Schur complement).
 
 Two cameras that see a point each along one line tell all of their motion against each other but its scale. What moves
 all cameras alike cannot be told from a rigid motion of the body.
@@ -13,6 +14,7 @@ all cameras alike cannot be told from a rigid motion of the body.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -33,7 +35,8 @@ _FOLLOWED_BY_TWO_PX = 1.0  # least motion that is followed with two cameras
 _MOST, _FEWEST = 3000, 50
 _STILL_PX, _UNKNOWN_PX = 0.02, 0.3  # px, motion in the image of a camera that stands still, and of one that may move
 _TAIL = 3.0  # squares of σ, for each of the six parameters, at which a motion's weight is a quarter
-_FREE, _FREE_ALL = 3.0, 1.0  # standard deviations of motions, in units of their root mean square: few moved; most did
+_PRICE = 50.0  # squares of σ that a freed camera must explain
+_FREE_PX, _ALL_FREE_PX = 30.0, 1.0  # px, standard deviation of a motion where few cameras moved, and where most did
 _GAIN = 0.5  # squares of σ an observation, least gain by a motion; noise gives 0.3 on a patch of a hundred points
 _LOOSE_STEPS, _STEPS = 2, 20
 _SETTLED = 1e-3  # px, greatest motion in the image in the last step
@@ -123,14 +126,38 @@ def find_moved_cameras(
         fit.step(_inverses(known + fit.standing(_UNKNOWN_PX)))
     fit.settle(lambda: still / (1.0 + fit.squares(still) / (_TAIL * POSE))[:, None, None] ** 2, still)
     motions = fit.motions()
-    if motions.moved.any():
-        largest = float(np.sqrt(np.mean(motions.effect[motions.moved] ** 2)))
-        few: bool = 2 * int(motions.moved.sum()) <= len(cameras) != 2
-        free = _inverses(known + fit.standing((_FREE if few else _FREE_ALL) * largest))
-        prior = np.where(motions.moved[:, None, None], free, still) if few else free
-        fit.settle(lambda: prior, still)
-        motions = fit.motions()
-    return motions
+    if not motions.moved.any():
+        return motions
+    return _fewest_moved(fit, still, known).motions()
+
+
+def _fewest_moved(fit: _Fit, still: Floats, known: Floats) -> _Fit:
+    """The fit that explains the points best with the fewest free cameras: at most half of them, or all.
+
+    One camera after the other is freed, that which explains most. still : (C, 6, 6) information matrices of motions of
+    cameras that stand still. known : (C, 6, 6) covariances of the poses.
+    """
+    count, scale = len(fit.cameras), fit.scale
+
+    def freed(which: Mask, px: float) -> tuple[float, _Fit]:
+        trial = fit.restarted()
+        prior = np.where(which[:, None, None], _inverses(known + fit.standing(px)), still)
+        trial.settle(lambda: prior, still)
+        unmoved = float(trial.squares(still)[~which].sum())
+        return trial.cost() / scale**2 + unmoved + _PRICE * int(which.sum()), trial
+
+    moved = np.zeros(count, dtype=bool)
+    best = freed(~moved, _ALL_FREE_PX)
+    last = np.inf
+    while count > 2 and 2 * (moved.sum() + 1) <= count:
+        trials = [(c, *freed(moved | (np.arange(count) == c), _FREE_PX)) for c in np.flatnonzero(~moved)]
+        c, price, trial = min(trials, key=lambda each: each[1])
+        if price >= last:
+            break
+        moved[c], last = True, price
+        if price < best[0]:
+            best = price, trial
+    return best[1]
 
 
 class _Fit:
@@ -153,8 +180,20 @@ class _Fit:
         self.start = [CameraParameters.of(camera) for camera in cameras]
         self.motion, self.covariance = np.zeros((len(cameras), POSE)), np.zeros((POSE * len(cameras),) * 2)
         self.scale = 1.0
+        self._first = self.xyz
         self.before = _reprojection_rms(cameras, self.px)
         self.residuals = reprojection_residuals(cameras, self.xyz, self.px)
+
+    def restarted(self) -> _Fit:
+        """A fit to the same points from the beginning."""
+        other = copy.copy(self)
+        other.xyz, other.motion = self._first, np.zeros_like(self.motion)
+        return other
+
+    def cost(self) -> float:
+        """Robust cost of the residuals after the motions so far, in squares of the pixels' own standard deviations."""
+        residuals = reprojection_residuals(self._moved(), self.xyz, self.px)
+        return _huber_cost(residuals[self.seen] / self.sigma[self.seen])
 
     def standing(self, px: float) -> Floats:
         """Covariances (C, 6, 6), rad and mm, of motions by which the points move by some px in the images."""
@@ -209,9 +248,15 @@ class _Fit:
         size = 1 / np.sqrt(np.diag(N))
         self.covariance = np.linalg.inv(N * np.outer(size, size)) * np.outer(size, size)
         step = self.covariance @ (right.ravel() - flat @ solved[..., -1].ravel())
-        self.xyz = self.xyz + solved[..., -1] - solved[..., :-1] @ step
         self.motion = self.motion + step.reshape(count, POSE)
+        again = triangulate(self._moved(), self.px)  # as a step of the points too would diverge after large motions
+        self.xyz = np.where(np.isfinite(again), again, self.xyz)
         return step.reshape(count, POSE)
+
+    def _moved(self) -> list[Camera]:
+        """The cameras after their motions so far."""
+        rows = zip(self.start, self.motion, self.cameras, strict=True)
+        return [_after(first, each).camera(camera) for first, each, camera in rows]
 
     def _gain(self, moved: Sequence[Camera], which: Mask) -> float:
         """Decrease of the residuals' robust cost by the motions, for each observation of the points that they concern.
@@ -222,16 +267,13 @@ class _Fit:
         if not concerned.any():
             return 0.0
         after = reprojection_residuals(moved, triangulate(moved, self.px), self.px)
-        ratios = (np.abs(r[concerned]) / (self.scale * self.sigma[concerned]) for r in (self.residuals, after))
-        before, now = (np.sum(np.where(r < HUBER, r**2, 2 * HUBER * r - HUBER**2)) for r in ratios)
-        return float((before - now) / concerned.sum())
+        spread = self.scale * self.sigma[concerned]
+        before, now = (_huber_cost(r[concerned] / spread) for r in (self.residuals, after))
+        return (before - now) / int(concerned.sum())
 
     def motions(self) -> CameraMotions:
         """The motions so far, and measures of the fit."""
-        moved = [
-            _after(first, each).camera(camera)
-            for first, each, camera in zip(self.start, self.motion, self.cameras, strict=True)
-        ]
+        moved = self._moved()
         shift, effect = np.full((len(moved), 2), np.nan), np.full(len(moved), np.nan)
         for c, (before, after, seen) in enumerate(zip(self.cameras, moved, self.seen, strict=True)):
             if seen.any():
@@ -254,6 +296,13 @@ class _Fit:
             square[seen] += np.sum((r / sigma[seen]) ** 2, axis=1)
         median = 2.0 * scipy.special.gammaincinv(0.5 * np.maximum(2 * views - 3, 1), 0.5)  # of the χ² distribution
         return max(1.0, float(np.sqrt(np.median((square / median)[views >= 2]))))
+
+
+def _huber_cost(ratios: Floats) -> float:
+    """Sum of Huber's cost over residuals in units of their standard deviations; infinite where one is undefined."""
+    r = np.abs(ratios)
+    cost = float(np.sum(np.where(r < HUBER, r**2, 2 * HUBER * r - HUBER**2)))
+    return cost if np.isfinite(cost) else np.inf
 
 
 def _inverses(matrices: Floats) -> Floats:
