@@ -90,7 +90,7 @@ class MatchEvidence:
     def _verdict(self, partner: str) -> str:
         """The figure that stands against a match, and what to check."""
         known = self.matches >= _FEWEST
-        if self.confused and not (known and 2 * self.in_range >= self.matches):
+        if self.confused:
             return self.confused
         if not self.masked and not self.textured:
             return f"the strongest contrast of its image is {self.contrast:.1f} grey levels a px; speckle the specimen"
@@ -157,7 +157,7 @@ def match_evidence(
         int(within[row, column].sum()), int((space.holds(cameras[0], xyz) & space.holds(cameras[1], xyz)).sum()),
         factor * offset, factor * _OFF_LINE, float(near), float(far), low, high,
         (np.stack([first, second]) + 0.5) * factor - 0.5,
-        exchanged_or_mirrored(images, k, partner, space),
+        exchanged_or_mirrored(images, k, partner, space, len(first) // 2),
     )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from ringdic.correlation.features import matched_features
 from ringdic.geometry.triangulation import reprojection_residuals, triangulate
 
 _MISS = 1.5  # px of the reduced images, by which lines of sight that meet pass a feature
-_FEWEST = 40  # features whose lines of sight meet
+_FEWEST = 20  # features whose lines of sight meet
 _TIMES = 3.0  # times as many as with the cameras as they are
 
 _EXCHANGED = (
@@ -25,10 +25,11 @@ _EXCHANGED = (
 _MIRRORED = "the image of camera {0} is mirrored; turn it back"
 
 
-def exchanged_or_mirrored(images: DepthImages, k: int, partner: int, space: DepthRange) -> str:
+def exchanged_or_mirrored(images: DepthImages, k: int, partner: int, space: DepthRange, least: int = 0) -> str:
     """Say where features show that an image of two cameras is another's, or mirrored; an empty text where they do not.
 
-    images : of all cameras. k, partner : indices of the two. space : where the surface may be.
+    images : of all cameras. k, partner : indices of the two. space : where the surface may be. least :
+    number of features that must agree at least.
     """
     ids = [camera.id for camera in images.cameras]
     pictures = images.current(k).image, images.current(partner).image
@@ -48,7 +49,7 @@ def exchanged_or_mirrored(images: DepthImages, k: int, partner: int, space: Dept
     counts = [_meeting(images, pair, space, one, other) for _, pair, one, other in tried]
     best = int(np.argmax(counts))
     own = _meeting(images, (k, partner), space, first, second)
-    return tried[best][0] if counts[best] >= max(_FEWEST, _TIMES * own) else ""
+    return tried[best][0] if counts[best] >= max(_FEWEST, least, _TIMES * own) else ""
 
 
 def _features(images: DepthImages, first: Image, second: Image) -> tuple[Pixels, Pixels]:
