@@ -49,8 +49,9 @@ class RunImages:
 
     def findings(self) -> list[Finding]:
         """All findings about the images."""
+        repeating = [one for reference in self.references for one in reference.repetition]
         return [
-            *(one for reference in self.references for one in reference.repetition),
+            *([_joint(repeating)] if repeating else []),
             *self._speckle(),
             *self._clipped_references(),
             *(one for c in range(len(self.cameras)) for one in self._reference(c)),
