@@ -36,7 +36,7 @@ from ringdic.jobs.cluster import ClusterExecutor  # noqa: E402 - after the check
 
 SCALE = 0.2
 STEPS = 4  # with the reference
-TASKS = 7 + 3 * (STEPS - 1)  # depth map and chart of each of three cameras, the surface, and each later step of each
+TASKS = 8 + 3 * (STEPS - 1)  # depth map and chart of each of three cameras, poses, surface, and each later step of each
 SETTINGS = ["correlation.radius_px=10", "correlation.step_px=5"]
 Workers = Callable[..., "Worker"]
 

@@ -7,12 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ringdic.calibration.moved_cameras import MOVED_PX, CameraMotions
+from ringdic.calibration.moved_cameras import MOVED_PX, UNEXPLAINED, CameraMotions
 from ringdic.findings import Finding
-
-#: Robust ratio of residuals to their standard deviations, and their RMS, px, beyond which motions of the cameras do not
-#: explain them. A lens that its model does not describe quite leaves some hundredths of a pixel.
-_UNEXPLAINED, _UNEXPLAINED_PX = 3.0, 0.1
 
 
 def motion_figures(motions: Mapping[int, CameraMotions], steps: Sequence[str]) -> list[dict[str, Any]]:
@@ -51,7 +47,7 @@ def motion_findings(motions: Mapping[int, CameraMotions], steps: Sequence[str]) 
     """
     findings = [] if 0 not in motions else _since_calibration(motions[0], steps[0])
     later = {step: one for step, one in motions.items() if step and one.moved.any()}
-    unknown = [step for step, one in later.items() if _is_unexplained(one)]
+    unknown = [step for step, one in later.items() if one.unexplained]
     findings += [_unknown(later[step], steps[step], "since the reference") for step in unknown]
     count = max((len(one.cameras) for one in later.values()), default=0)
     for c in range(count):
@@ -63,19 +59,28 @@ def motion_findings(motions: Mapping[int, CameraMotions], steps: Sequence[str]) 
     return findings
 
 
+def left_out_finding(motions: CameraMotions, step: str) -> Finding:
+    """The finding on the camera that contradicts all others at a step, and was left out there.
+
+    motions : whose `contradicting` is the camera. step : name of the step.
+    """
+    camera, missed = motions.cameras[motions.contradicting].id, float(np.nanmax(motions.before))
+    sentence = (
+        f"camera {camera} contradicts all others in {step}: lines of sight miss one another by {missed:.2f} px, no "
+        "motion of the camera explains that, and without it the others agree. It was left out there; check that its "
+        "image is of this instant and of this camera"
+    )
+    return Finding("camera-contradicts", sentence, (camera,), step, float(np.nanmax(motions.misfit)), UNEXPLAINED, "σ")
+
+
 def _since_calibration(motions: CameraMotions, reference: str) -> list[Finding]:
     """Findings on cameras that moved between the calibration and the reference."""
     if not motions.moved.any():
         return []
-    if _is_unexplained(motions):
+    if motions.unexplained:
         return [_unknown(motions, reference, "between the calibration and the reference")]
     when = "between the calibration and the reference"
     return [_followed(motions, int(c), reference, when) for c in np.flatnonzero(motions.moved)]
-
-
-def _is_unexplained(motions: CameraMotions) -> bool:
-    """Whether the residuals are too large for cameras that moved only."""
-    return motions.scale > _UNEXPLAINED and bool(np.nanmax(motions.after) > _UNEXPLAINED_PX)
 
 
 def _followed(motions: CameraMotions, c: int, step: str, when: str) -> Finding:
@@ -93,12 +98,12 @@ def _followed(motions: CameraMotions, c: int, step: str, when: str) -> Finding:
 
 def _unknown(motions: CameraMotions, step: str, when: str) -> Finding:
     """A finding on cameras that seem to have moved, but whose matches no motion explains."""
-    moved = np.flatnonzero(motions.moved)
-    ids = tuple(motions.cameras[c].id for c in moved)
+    c = motions.contradicting
+    ids = tuple(motions.cameras[k].id for k in (np.flatnonzero(motions.moved) if c < 0 else [c]))
     sentence = (
         f"camera {', '.join(ids)}: lines of sight miss those of the other cameras by {np.nanmax(motions.before):.2f} "
         f"px and no motion of a camera {when} brings them nearer than {np.nanmax(motions.after):.2f} px, "
-        f"{motions.scale:.0f} times what the matches are good to. Check that all images of {step} are of the same "
-        "instant and each of its own camera, then calibrate again"
+        f"{np.nanmax(motions.misfit):.0f} times what the matches are good to. Check that all images of {step} are of "
+        "the same instant and each of its own camera, then calibrate again"
     )
-    return Finding("camera-moved-unknown", sentence, ids, step, motions.scale, _UNEXPLAINED, "σ")
+    return Finding("camera-moved-unknown", sentence, ids, step, float(np.nanmax(motions.misfit)), UNEXPLAINED, "σ")

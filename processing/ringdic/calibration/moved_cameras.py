@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -35,6 +35,10 @@ _FOLLOWED_BY_TWO_PX = 1.0  # least motion that is followed with two cameras
 _MOST, _FEWEST = 3000, 50
 _STILL_PX, _UNKNOWN_PX = 0.02, 0.3  # px, motion in the image of a camera that stands still, and of one that may move
 _TAIL = 3.0  # squares of σ, for each of the six parameters, at which a motion's weight is a quarter
+#: Robust ratio of residuals to their standard deviations, and their RMS, px, beyond which motions of the cameras do not
+#: explain them. A lens that its model does not describe quite leaves some hundredths of a pixel.
+UNEXPLAINED, _UNEXPLAINED_PX = 3.0, 0.1
+_MEDIAN_OF_CHI2 = 2.0 * np.log(2.0)  # with two degrees of freedom
 _PRICE = 50.0  # squares of σ that a freed camera must explain
 _FREE_PX, _ALL_FREE_PX = 30.0, 1.0  # px, standard deviation of a motion where few cameras moved, and where most did
 _GAIN = 0.5  # squares of σ an observation, least gain by a motion; noise gives 0.3 on a patch of a hundred points
@@ -51,8 +55,11 @@ class CameraMotions:
     shift : (C, 2) px, median shift of the points' images by the motion, and effect : (C,) px, RMS of its length; NaN
         for a camera without points.
     before, after : (C,) px, RMS reprojection error of each camera's points without the motion and with it, else NaN.
+    misfit : (C,) robust ratio of each camera's residuals, with the motion, to their standard deviations, else NaN.
     scale : factor, 1 or more, by which the standard deviations of the pixels must be multiplied to fit the residuals.
     gain : decrease of the residuals' robust cost, in squares of σ, for each observation that the moved cameras concern.
+    contradicting : index of the one camera without which all others agree, where no motion explains the residuals; else
+        -1.
     used : number of points that were used.
     """
 
@@ -63,14 +70,22 @@ class CameraMotions:
     effect: Floats
     before: Floats
     after: Floats
+    misfit: Floats
     scale: float
     gain: float
+    contradicting: int
     used: int
 
     @property
     def moved(self) -> Mask:
         """Which of the cameras, (C,) bool, moved by more than `MOVED_PX` in their images, as the residuals bear out."""
         return np.asarray((np.nan_to_num(self.effect) > MOVED_PX) & (self.gain > _GAIN))
+
+    @property
+    def unexplained(self) -> bool:
+        """Whether the residuals are too large for cameras that moved only."""
+        large = (np.nan_to_num(self.misfit) > UNEXPLAINED) & (np.nan_to_num(self.after) > _UNEXPLAINED_PX)
+        return bool(large.any())
 
     @property
     def followed(self) -> bool:
@@ -97,7 +112,7 @@ def still_cameras(cameras: Sequence[Camera]) -> CameraMotions:
     nothing = np.full(count, np.nan)
     return CameraMotions(
         tuple(cameras), np.zeros((count, POSE)), np.zeros((POSE * count,) * 2), np.full((count, 2), np.nan), nothing,
-        nothing, nothing, 1.0, 0.0, 0,
+        nothing, nothing, nothing, 1.0, 0.0, -1, 0,
     )  # fmt: skip
 
 
@@ -128,7 +143,9 @@ def find_moved_cameras(
     motions = fit.motions()
     if not motions.moved.any():
         return motions
-    return _fewest_moved(fit, still, known).motions()
+    best = _fewest_moved(fit, still, known)
+    motions = best.motions()
+    return replace(motions, contradicting=best.contradicting()) if motions.unexplained else motions
 
 
 def _fewest_moved(fit: _Fit, still: Floats, known: Floats) -> _Fit:
@@ -274,16 +291,34 @@ class _Fit:
     def motions(self) -> CameraMotions:
         """The motions so far, and measures of the fit."""
         moved = self._moved()
-        shift, effect = np.full((len(moved), 2), np.nan), np.full(len(moved), np.nan)
+        shift, (effect, misfit) = np.full((len(moved), 2), np.nan), np.full((2, len(moved)), np.nan)
+        residuals = reprojection_residuals(moved, self.xyz, self.px)
         for c, (before, after, seen) in enumerate(zip(self.cameras, moved, self.seen, strict=True)):
             if seen.any():
                 shifts = after.project(self.xyz[seen]) - before.project(self.xyz[seen])
                 shift[c], effect[c] = np.median(shifts, axis=0), np.sqrt(np.mean(np.sum(shifts**2, axis=1)))
+                square = np.sum((residuals[c, seen] / self.sigma[c, seen]) ** 2, axis=1)
+                misfit[c] = np.sqrt(np.median(square) / _MEDIAN_OF_CHI2)
         return CameraMotions(
             self.cameras, self.motion, self.covariance, shift, effect, self.before,
-            _reprojection_rms(moved, self.px), self.scale, self._gain(moved, np.nan_to_num(effect) > MOVED_PX),
-            len(self.xyz),
+            _reprojection_rms(moved, self.px), misfit, self.scale, self._gain(moved, np.nan_to_num(effect) > MOVED_PX),
+            -1, len(self.xyz),
         )  # fmt: skip
+
+    def contradicting(self) -> int:
+        """Index of the one camera without which all others agree, before any motion; -1 where there is none."""
+        costs = np.full(len(self.cameras), np.inf)
+        for c in range(len(self.cameras)):
+            px = self.px.copy()
+            px[c] = np.nan
+            r = reprojection_residuals(self.cameras, triangulate(self.cameras, px), px)
+            seen = np.isfinite(r[..., 0])
+            degrees = 2 * int(seen.sum()) - 3 * int(seen.any(axis=0).sum())
+            if degrees >= _FEWEST:
+                costs[c] = _huber_cost(r[seen] / self.sigma[seen]) / degrees
+        order = np.argsort(costs)
+        agree = len(costs) > 2 and costs[order[0]] < UNEXPLAINED and costs[order[1]] > UNEXPLAINED * costs[order[0]]
+        return int(order[0]) if agree else -1
 
     def _robust_scale(self, residuals: Sequence[Floats]) -> float:
         """Robust ratio, 1 or more, of the residuals, (k, 2) px of each camera, to their standard deviations.

@@ -53,7 +53,8 @@ def motions_as_arrays(motions: CameraMotions) -> dict[str, NDArray]:
 def motions_from_arrays(cameras: Sequence[Camera], arrays: Mapping[str, NDArray]) -> CameraMotions:
     """The motions (C, 6), rad and mm, with their figures. cameras : as calibrated. arrays : as stored."""
     values: dict[str, Any] = {each.name: arrays[each.name] for each in fields(CameraMotions) if each.name != "cameras"}
-    values |= {"scale": float(arrays["scale"]), "gain": float(arrays["gain"]), "used": int(arrays["used"])}
+    values |= {name: float(arrays[name]) for name in ("scale", "gain")}
+    values |= {name: int(arrays[name]) for name in ("contradicting", "used")}
     return CameraMotions(cameras=tuple(cameras), **values)
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Mask, Pixels, Points
 from ringdic.calibration.drift import drift_findings
-from ringdic.calibration.motion_findings import motion_figures, motion_findings
+from ringdic.calibration.motion_findings import left_out_finding, motion_figures, motion_findings
 from ringdic.calibration.moved_cameras import CameraMotions, find_moved_cameras
 from ringdic.charts.agreement import triangulate_agreeing
 from ringdic.charts.chart import texture_of
@@ -138,6 +138,7 @@ class SurfaceSeries:
         self._views = [camera_view(camera, c, surface) for c, camera in enumerate(cameras)]
         self._textures = [texture_of(surface.texture[k, view.vertex]) for k, view in enumerate(self._views)]
         self._motions: dict[int, CameraMotions] = {} if moved is None else {0: moved}
+        self._contradictions: dict[int, CameraMotions] = {}
         self._drift = np.full((len(self.names), len(cameras)), np.nan)
         self._measured = np.ones(len(self.names))
         residuals = [surface.px[c, view.vertex] - view.px for c, view in enumerate(self._views)]
@@ -207,14 +208,15 @@ class SurfaceSeries:
         ]
         if self._settings.method == "paper":
             return [*idle, *drift_findings(self.drift, self.names)]
-        return idle + motion_findings(self._motions, self.names)
+        left_out = [left_out_finding(one, self.names[k]) for k, one in sorted(self._contradictions.items())]
+        return [*idle, *left_out, *motion_findings(self._motions, self.names)]
 
     def _measure(self, k: int, matches: MatchesOfStep) -> SurfaceStep:
         """Triangulate the points of step k from all cameras."""
         px, weight = (np.full(self.surface.px.shape, np.nan) for _ in range(2))
         status = np.full(px.shape[:2], Status.NOT_REACHED, np.int8)
         tracked = [self._track(c, matches(c, k), px[c], weight[c], status[c]) for c in range(len(px))]
-        cameras = self._placed(k, px, weight)
+        cameras = self._placed(k, px, weight, status)
         points, used = triangulate_agreeing(cameras, px, weight)
         turned = self._oblique(cameras, points.xyz, px)
         again = np.flatnonzero(turned.any(axis=0))
@@ -244,15 +246,24 @@ class SurfaceSeries:
             residual,
         )  # fmt: skip
 
-    def _placed(self, k: int, px: Pixels, sigma: Pixels) -> tuple[Camera, ...]:
-        """The cameras at step k, from the points (C, N, 2) px tracked in them and their standard deviations."""
+    def _placed(self, k: int, px: Pixels, sigma: Pixels, status: NDArray[np.int8]) -> tuple[Camera, ...]:
+        """The cameras at step k, from the points (C, N, 2) px tracked in them and their standard deviations.
+
+        The matches of a camera that contradicts all others, as one that shows another instant, are taken out.
+        """
         if not self._settings.calibration.refine_poses or self._settings.method == "paper":
             return self._cameras
         try:
-            self._motions[k] = find_moved_cameras(self._cameras, px, sigma)
+            motions = find_moved_cameras(self._cameras, px, sigma)
+            if motions.contradicting >= 0:
+                self._contradictions[k], c = motions, motions.contradicting
+                status[c, np.isfinite(px[c, :, 0])] = LostPoint.RESIDUAL
+                px[c], sigma[c] = np.nan, np.nan
+                motions = find_moved_cameras(self._cameras, px, sigma)
         except ComputationError:  # too few points to say
             return self._cameras
-        return self._motions[k].moved_cameras
+        self._motions[k] = motions
+        return motions.moved_cameras
 
     def _track(
         self, c: int, matches: CameraMatches | None, px: Pixels, weight: Pixels, status: NDArray[np.int8]

@@ -98,13 +98,17 @@ class ChartsJob:
     @property
     def tasks(self) -> list[Task]:
         """All tasks in order, camera by camera, so that a reference image is prepared once for all its steps."""
-        later = [task for row in self.steps for task in row if task is not None]
-        return [*self.at_reference, self.surface, *later]
+        return [*self.at_reference, *self.later]
 
     @property
     def at_reference(self) -> list[Task]:
         """The tasks before the surface: depth maps, charts, and the check of the poses."""
         return [*self.maps, *self.charts, *([] if self.poses is None else [self.poses])]
+
+    @property
+    def later(self) -> list[Task]:
+        """The tasks from the surface on, which need those before."""
+        return [self.surface, *(task for row in self.steps for task in row if task is not None)]
 
     @property
     def motions(self) -> CameraMotions:

@@ -25,6 +25,8 @@ from ringdic.findings import Finding, verdict_figures
 from ringdic.session.images import read_gray, read_mask
 from ringdic.settings import load_settings
 
+_MOST = 0.5  # of the pattern, that must repeat itself to be named for why nothing was matched
+
 
 def correlate_files(
     reference: Path,
@@ -137,7 +139,8 @@ def correlate_images(
     repetition = find_repetition(reference, textured if len(textured) else xy, settings.radius, region)
     findings = repetition.findings(names[0])
     if not matches.good.any():
-        why = findings[0].sentence if findings else "check that both images show the same surface in focus"
+        repeats = repetition.share > _MOST
+        why = findings[0].sentence if repeats else "check that both images show the same surface in focus"
         raise ComputationError(f"{names[1]}: none of the {len(xy)} points of {names[0]} was found in it; {why}")
     if findings and findings[0].code not in accept:
         matches = matches.without(repetition.ambiguous(xy), Status.AMBIGUOUS)

@@ -78,7 +78,8 @@ class Repetition:
         """
         if not self.share:
             return []
-        period = float(np.median(np.linalg.norm(self.period[self.repeats], axis=1)))
+        lengths = np.linalg.norm(self.period[self.repeats], axis=1)
+        period = float(np.percentile(lengths, 50.0, method="lower"))  # a period that there is
         likeness = float(np.median(self.likeness[self.repeats]))
         sentence = (
             f"{what}: over {100 * self.share:.0f} % of the pattern it repeats itself at {period:.0f} px, with a second "
@@ -200,7 +201,8 @@ def _second_peak(
     cv2.floodFill(high, None, (column, row), 2)
     zncc[high == 2] = -1.0
     highest = float(zncc.max())
-    at, to = np.nonzero(zncc >= _AS_HIGH * highest)
+    peaks = zncc >= cv2.dilate(zncc, np.ones((3, 3), np.uint8))
+    at, to = np.nonzero(peaks & (zncc >= _AS_HIGH * highest))
     down, along = at - row, to - column
     nearest = np.argmin(np.hypot(down, along))
     dx, dy = int(along[nearest]), int(down[nearest])

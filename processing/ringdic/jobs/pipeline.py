@@ -144,7 +144,7 @@ def match_session(
         if _image_shift(assumed, placed, job.views.space.centre) < _LOOK_AGAIN_PX:
             break
     job = job_with(assumed, placed)
-    _run_tasks(job.tasks, job.tasks, work, stages, executor)
+    _run_tasks(job.later, job.tasks, work, stages, executor)
     stages.at("triangulate", 0.0)
     found = read_output(job.surface.output)
     series = SurfaceSeries(
@@ -264,16 +264,16 @@ def _run_tasks(tasks: Sequence[Task], whole: Sequence[Task], folder: Path, stage
 
     whole : all tasks of the job, of which these may be a part.
     """
-    total_cost = sum(task.cost for task in whole)
-    began, cost, points = time.monotonic(), 0.0, 0
+    total_cost, first = sum(task.cost for task in whole), [task.key for task in whole].index(tasks[0].key)
+    began, cost, points = time.monotonic(), sum(task.cost for task in whole[:first]), 0
 
     def report(task: Task, outcome: TaskReport, count: int, total: int) -> None:
         nonlocal cost, points
         cost += task.cost
         points += outcome.points
         rate = f"{points / max(time.monotonic() - began, 1e-3):,.0f} points/s" if points else ""
-        stages.at("correlate", cost / total_cost, f"{task.name} ({count} of {len(whole)})", rate)
+        stages.at("correlate", cost / total_cost, f"{task.name} ({first + count} of {len(whole)})", rate)
 
-    stages.at("correlate", 0.0)
+    stages.at("correlate", cost / total_cost)
     executor.run(tasks, report)
     tidy(folder, whole)

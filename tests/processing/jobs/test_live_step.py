@@ -36,17 +36,17 @@ def test_the_reference_and_each_step_are_made_once_and_the_whole_run_uses_them(s
     reference, middle, last = (f"000{k}-specimen" for k in (6, 7, 8))
     shape = read_results(process_step(session, reference, SETTINGS, executor=counted) / "results.h5")
     maps, charts = ([f"{what} {id_}" for id_ in ("cam_01", "cam_02")] for what in ("depth of camera", "chart of"))
-    assert counted.made == [*maps, *charts, "surface"]
+    assert counted.made == [*maps, *charts, "poses of the cameras", "surface"]
     assert shape.steps == (reference,)
     live = process_step(session, last, SETTINGS, executor=counted)
-    assert counted.made[5:] == [f"camera {id_}, {last}" for id_ in ("cam_01", "cam_02")]
+    assert counted.made[6:] == [f"camera {id_}, {last}" for id_ in ("cam_01", "cam_02")]
     found = read_results(live / "results.h5")
     assert found.steps == (reference, last)
     assert found.matches == ()
     np.testing.assert_array_equal(found.faces, shape.faces)
 
     run = read_results(process_session(session, SETTINGS, executor=counted) / "results.h5")
-    assert counted.made[7:] == [f"camera {id_}, {middle}" for id_ in ("cam_01", "cam_02")]
+    assert counted.made[8:] == [f"camera {id_}, {middle}" for id_ in ("cam_01", "cam_02")]
     by_place = {tuple(place): k for k, place in enumerate(run.vertices_ref)}
     same = [(k, by_place[tuple(place)]) for k, place in enumerate(found.vertices_ref) if tuple(place) in by_place]
     assert len(same) > 0.98 * len(run.vertices_ref)
