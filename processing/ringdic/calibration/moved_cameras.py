@@ -5,8 +5,8 @@ camera, with the lenses fixed. r are the reprojection residuals with Huber's ρ;
 camera that stands still. ρ_c is the cost of Geman and McClure: a camera's prior counts the less the more the points
 contradict it (iteratively reweighted least squares), so that the motion of one camera is not spread over all. Where
 that shows a motion, cameras are freed one after the other, that which explains most first, and all others stand still;
-where more than half have moved, all are free, and the smallest motion that fits is taken. The points are eliminated
-from the normal equations (Schur complement).
+where more than three or half have moved, all are free, and the smallest motion that fits is taken. The points are
+eliminated from the normal equations (Schur complement).
 
 Two cameras that see a point each along one line tell all of their motion against each other but its scale. What moves
 all cameras alike cannot be told from a rigid motion of the body.
@@ -31,6 +31,7 @@ from ringdic.geometry.triangulation import reprojection_residuals, triangulate
 #: Shift of a camera's image beyond which it has moved, px.
 MOVED_PX = 0.06
 _FOLLOWED_BY_TWO_PX = 1.0  # least motion that is followed with two cameras
+_FARTHEST_PX = 60.0  # greatest motion that is followed; more would be another image, not a bump
 #: Most points that are used, and fewest that are needed.
 _MOST, _FEWEST = 3000, 50
 _STILL_PX, _UNKNOWN_PX = 0.02, 0.3  # px, motion in the image of a camera that stands still, and of one that may move
@@ -39,10 +40,11 @@ _TAIL = 3.0  # squares of σ, for each of the six parameters, at which a motion'
 #: explain them. A lens that its model does not describe quite leaves some hundredths of a pixel.
 UNEXPLAINED, _UNEXPLAINED_PX = 3.0, 0.1
 _MEDIAN_OF_CHI2 = 2.0 * np.log(2.0)  # with two degrees of freedom
+_FEW = 3  # cameras at most that are freed alone
 _PRICE = 50.0  # squares of σ that a freed camera must explain
 _FREE_PX, _ALL_FREE_PX = 30.0, 1.0  # px, standard deviation of a motion where few cameras moved, and where most did
 _GAIN = 0.5  # squares of σ an observation, least gain by a motion; noise gives 0.3 on a patch of a hundred points
-_LOOSE_STEPS, _STEPS = 2, 20
+_LOOSE_STEPS, _STEPS = 2, 14
 _SETTLED = 1e-3  # px, greatest motion in the image in the last step
 
 
@@ -83,7 +85,9 @@ class CameraMotions:
 
     @property
     def unexplained(self) -> bool:
-        """Whether the residuals are too large for cameras that moved only."""
+        """Whether the residuals are too large for cameras that moved only, or a motion is too large to be believed."""
+        if np.nanmax(self.effect, initial=0.0) > _FARTHEST_PX:
+            return True
         large = (np.nan_to_num(self.misfit) > UNEXPLAINED) & (np.nan_to_num(self.after) > _UNEXPLAINED_PX)
         return bool(large.any())
 
@@ -93,6 +97,8 @@ class CameraMotions:
 
         Two cameras tell hardly more of a small motion than that there is one.
         """
+        if np.nanmax(self.effect, initial=0.0) > _FARTHEST_PX:
+            return False
         return len(self.cameras) > 2 or bool(np.nanmax(self.effect) > _FOLLOWED_BY_TWO_PX)
 
     @property
@@ -149,7 +155,7 @@ def find_moved_cameras(
 
 
 def _fewest_moved(fit: _Fit, still: Floats, known: Floats) -> _Fit:
-    """The fit that explains the points best with the fewest free cameras: at most half of them, or all.
+    """The fit that explains the points best with the fewest free cameras: at most three and half of them, or all.
 
     One camera after the other is freed, that which explains most. still : (C, 6, 6) information matrices of motions of
     cameras that stand still. known : (C, 6, 6) covariances of the poses.
@@ -166,7 +172,7 @@ def _fewest_moved(fit: _Fit, still: Floats, known: Floats) -> _Fit:
     moved = np.zeros(count, dtype=bool)
     best = freed(~moved, _ALL_FREE_PX)
     last = np.inf
-    while count > 2 and 2 * (moved.sum() + 1) <= count:
+    while count > 2 and moved.sum() < min(count // 2, _FEW):
         trials = [(c, *freed(moved | (np.arange(count) == c), _FREE_PX)) for c in np.flatnonzero(~moved)]
         c, price, trial = min(trials, key=lambda each: each[1])
         if price >= last:
