@@ -61,8 +61,11 @@ class RunImages:
 
     def _speckle(self) -> Iterator[Finding]:
         """Speckles that are too large for the subsets, or too small for the pixels, in the median of the cameras."""
-        size, width = float(np.median([one.speckle for one in self.references])), 2 * self.radius + 1
-        for sentence in coarse_speckle([one.speckle for one in self.references], self.radius):
+        sizes = [one.speckle for one in self.references if one.certain]  # those of the others may be the background's
+        if not sizes:
+            return
+        size, width = float(np.median(sizes)), 2 * self.radius + 1
+        for sentence in coarse_speckle(sizes, self.radius):
             yield Finding("coarse-speckle", sentence, value=round(size, 2), limit=_COARSE * width, unit="px")
         if size < _FINE:
             sentence = (

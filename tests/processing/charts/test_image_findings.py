@@ -140,6 +140,8 @@ def test_speckles_that_do_not_suit_the_subset_or_the_pixels_are_named(size: floa
     references = tuple(replace(one, speckle=size) for one in REFERENCES)
     finding = only(replace(run_images(), references=references))
     assert (finding.code, finding.value) == (code, size)
+    background = tuple(replace(one, certain=False) for one in references)
+    assert replace(run_images(), references=background).findings() == []
 
 
 def test_the_state_of_a_reference_survives_its_storage() -> None:
