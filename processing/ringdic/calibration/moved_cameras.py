@@ -161,19 +161,20 @@ def _fewest_moved(fit: _Fit, still: Floats, known: Floats) -> _Fit:
     cameras that stand still. known : (C, 6, 6) covariances of the poses.
     """
     count, scale = len(fit.cameras), fit.scale
+    loose, all_loose = (_inverses(known + fit.standing(px)) for px in (_FREE_PX, _ALL_FREE_PX))
 
-    def freed(which: Mask, px: float) -> tuple[float, _Fit]:
+    def freed(which: Mask, free: Floats) -> tuple[float, _Fit]:
         trial = fit.restarted()
-        prior = np.where(which[:, None, None], _inverses(known + fit.standing(px)), still)
+        prior = np.where(which[:, None, None], free, still)
         trial.settle(lambda: prior, still)
         unmoved = float(trial.squares(still)[~which].sum())
         return trial.cost() / scale**2 + unmoved + _PRICE * int(which.sum()), trial
 
     moved = np.zeros(count, dtype=bool)
-    best = freed(~moved, _ALL_FREE_PX)
+    best = freed(~moved, all_loose)
     last = np.inf
     while count > 2 and moved.sum() < min(count // 2, _FEW):
-        trials = [(c, *freed(moved | (np.arange(count) == c), _FREE_PX)) for c in np.flatnonzero(~moved)]
+        trials = [(c, *freed(moved | (np.arange(count) == c), loose)) for c in np.flatnonzero(~moved)]
         c, price, trial = min(trials, key=lambda each: each[1])
         if price >= last:
             break
@@ -204,7 +205,6 @@ class _Fit:
         self.motion, self.covariance = np.zeros((len(cameras), POSE)), np.zeros((POSE * len(cameras),) * 2)
         self.scale = 1.0
         self._first = self.xyz
-        self.before = _reprojection_rms(cameras, self.px)
         self.residuals = reprojection_residuals(cameras, self.xyz, self.px)
 
     def restarted(self) -> _Fit:
@@ -281,15 +281,14 @@ class _Fit:
         rows = zip(self.start, self.motion, self.cameras, strict=True)
         return [_after(first, each).camera(camera) for first, each, camera in rows]
 
-    def _gain(self, moved: Sequence[Camera], which: Mask) -> float:
+    def _gain(self, after: Pixels, which: Mask) -> float:
         """Decrease of the residuals' robust cost by the motions, for each observation of the points that they concern.
 
-        moved : the cameras after their motions. which : (C,) bool, those whose points count.
+        after : (C, n, 2) px, residuals with the motions. which : (C,) bool, cameras whose points count.
         """
         concerned = self.seen & self.seen[which].any(axis=0)
         if not concerned.any():
             return 0.0
-        after = reprojection_residuals(moved, triangulate(moved, self.px), self.px)
         spread = self.scale * self.sigma[concerned]
         before, now = (_huber_cost(r[concerned] / spread) for r in (self.residuals, after))
         return (before - now) / int(concerned.sum())
@@ -306,9 +305,8 @@ class _Fit:
                 square = np.sum((residuals[c, seen] / self.sigma[c, seen]) ** 2, axis=1)
                 misfit[c] = np.sqrt(np.median(square) / _MEDIAN_OF_CHI2)
         return CameraMotions(
-            self.cameras, self.motion, self.covariance, shift, effect, self.before,
-            _reprojection_rms(moved, self.px), misfit, self.scale, self._gain(moved, np.nan_to_num(effect) > MOVED_PX),
-            -1, len(self.xyz),
+            self.cameras, self.motion, self.covariance, shift, effect, _rms(self.residuals), _rms(residuals), misfit,
+            self.scale, self._gain(residuals, np.nan_to_num(effect) > MOVED_PX), -1, len(self.xyz),
         )  # fmt: skip
 
     def contradicting(self) -> int:
@@ -356,9 +354,8 @@ def _after(start: CameraParameters, motion: Floats) -> CameraParameters:
     return start.plus(np.concatenate([np.zeros(LENS), motion]))
 
 
-def _reprojection_rms(cameras: Sequence[Camera], px: Pixels) -> Floats:
-    """RMS reprojection error of each camera's points, (C,) px, after their triangulation. px : (C, n, 2)."""
-    residuals = reprojection_residuals(cameras, triangulate(cameras, px), px)
+def _rms(residuals: Pixels) -> Floats:
+    """RMS length of the residuals (C, n, 2) px of each camera, (C,) px, NaN for one without points."""
     squares = np.sum(residuals**2, axis=2)
     count = np.isfinite(squares).sum(axis=1)
     return np.sqrt(np.where(count > 0, np.nansum(squares, axis=1) / np.maximum(count, 1), np.nan))

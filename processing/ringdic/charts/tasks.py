@@ -129,7 +129,7 @@ class ChartsJob:
         return CameraMatches(step=int(arrays["step"]), **{name: arrays[name] for name in _MATCHES})
 
     def images(self, steps: Sequence[str], measured: Floats, radius: int) -> RunImages:
-        """The states of all images.
+        """Blur, light and digest of every camera's image of every step, beside its reference image.
 
         steps : ids of the F captures. measured : (F,) share of the surface's points that each measured. radius : px.
         """

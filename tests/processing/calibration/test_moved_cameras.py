@@ -132,7 +132,7 @@ def test_a_camera_of_six_that_moved_is_named_alone(size, way) -> None:
 
 
 def test_two_cameras_tell_of_their_motion_against_each_other() -> None:
-    """All but its scale, and not which of the two it was."""
+    """Relative motion is known but for its scale, and which of the two cameras moved is not."""
     before = ring(2)
     after = bumped(before, 1, 1.0, "rolled")
     xyz, px = speckles(after, 0.01, 22)
