@@ -19,6 +19,7 @@ from ringdic.cli.console import print_json, say, show_table
 from ringdic.cli.measuring import measure_app, strain_command
 from ringdic.cli.options import Accepted, AsJson, FamilyChoice, Session, spread_options
 from ringdic.cli.reporting import animate_command, overlay_command, report_command
+from ringdic.cli.rig import rig_app
 from ringdic.findings import DO_NOT_USE_EXIT, Verdict
 
 PLUGINS = "ringdic.commands"
@@ -52,6 +53,7 @@ def application() -> typer.Typer:
     app.command("animate")(animate_command)
     app.add_typer(measure_app)
     app.command("strain")(strain_command)
+    app.add_typer(rig_app)
     for entry in entry_points(group=PLUGINS):
         entry.load()(app)
     return app

@@ -1,0 +1,1 @@
+"""Sheets to print at true scale: the dots of the calibration cylinder, boards, speckle patterns."""
