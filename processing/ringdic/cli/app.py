@@ -15,6 +15,7 @@ from typing import Annotated
 import typer
 
 import ringdic
+from ringdic.cli.archive import archive_app
 from ringdic.cli.console import print_json, say, show_table
 from ringdic.cli.measuring import measure_app, strain_command
 from ringdic.cli.options import Accepted, AsJson, FamilyChoice, Session, spread_options
@@ -53,6 +54,7 @@ def application() -> typer.Typer:
     app.command("animate")(animate_command)
     app.add_typer(measure_app)
     app.command("strain")(strain_command)
+    app.add_typer(archive_app)
     app.add_typer(rig_app)
     for entry in entry_points(group=PLUGINS):
         entry.load()(app)

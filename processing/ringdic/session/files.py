@@ -6,13 +6,18 @@ is flushed too.
 
 from __future__ import annotations
 
+import errno
+import filecmp
+import hashlib
 import json
 import os
+import shutil
 import threading
 from pathlib import Path
 from typing import Any
 
 PARTIAL = ".partial-"  # how the names of files begin that are being written
+_PIECE = 1 << 20  # bytes copied at a time
 
 
 def place(path: Path, content: bytes) -> None:
@@ -37,6 +42,32 @@ def link(source: Path, path: Path) -> bool:
     except OSError:
         return False
     return True
+
+
+def checksum(path: Path) -> str:
+    """SHA-256 of a file in hexadecimal digits, read a piece at a time."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def copy_file(source: Path, path: Path) -> None:
+    """Copy a file with its times, durably, and read the copy back; a file of that name is replaced.
+
+    Raises OSError where the copy is not what was read.
+    """
+    aside = path.with_name(f"{PARTIAL}{path.name}-{os.getpid()}-{threading.get_ident()}")
+    try:
+        with open(source, "rb") as original, open(aside, "wb") as copy:
+            shutil.copyfileobj(original, copy, _PIECE)
+            copy.flush()
+            os.fsync(copy.fileno())
+        shutil.copystat(source, aside)
+        if not filecmp.cmp(source, aside, shallow=False):
+            raise OSError(errno.EIO, "what was read back is not what was written; check the disk")
+        os.replace(aside, path)
+    finally:
+        aside.unlink(missing_ok=True)
+    _flush_folder(path.parent)
 
 
 def replace_json(path: Path, document: dict[str, Any]) -> None:

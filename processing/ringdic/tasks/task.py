@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from ringdic.errors import ComputationError, InputError
+from ringdic.session.files import checksum
 from ringdic.session.records import CameraRecord
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -132,8 +133,7 @@ def file_digest(path: Path, record: CameraRecord | None = None) -> str:
     """SHA-256 of a file. record : its entry in the capture's record; that digest is used where the size agrees."""
     if record is not None and record.sha256 and record.bytes == path.stat().st_size:
         return record.sha256
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return checksum(path)
 
 
 def _write(path: Path, arrays: Arrays) -> None:
