@@ -14,8 +14,9 @@ States and what moves them (anything not listed leaves the state alone)::
     capturing   FrameLost                   idle        Report(failure); the camera must be locked anew
 
 Laws: a capture is taken at most once, however often its trigger arrives. A spooled image is published
-again and again, each time after a longer wait, until an acknowledgement with its own hash arrives; only then is it
-freed. An image that the controller declares unknown stays in the spool and is not published any more.
+again and again, each time after a longer wait, until an acknowledgement with its own hash arrives; only then may it
+be removed. As long as it is held it is listed and given, since the acknowledgement may not have come from the
+controller. An image that the controller declares unknown stays in the spool and is not published any more.
 """
 
 from __future__ import annotations
@@ -25,6 +26,30 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
+from ringdic_node.agent_events import (
+    Acknowledged,
+    Action,
+    AgentTick,
+    Answer,
+    AnswerImage,
+    ArmAsked,
+    CameraLocked,
+    CameraRefused,
+    Decline,
+    DeliveredRemoved,
+    Event,
+    FetchAsked,
+    FrameLost,
+    FrameSpooled,
+    Free,
+    InventoryAsked,
+    LockCamera,
+    Publish,
+    Report,
+    Sent,
+    TakeFrame,
+    Triggered,
+)
 from ringdic_node.clock import Instant
 from ringdic_node.wire import (
     Ack,
@@ -39,171 +64,7 @@ from ringdic_node.wire import (
 )
 
 REMEMBERED = 200  # failures and answers kept for repeated questions
-
-
-# Events ------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class ArmAsked:
-    """The controller asks this node to lock its camera. question : number of the query, which the answer names."""
-
-    message: Arm
-    question: int
-
-
-@dataclass(frozen=True)
-class CameraLocked:
-    """The camera is locked to the settings that were asked for; `reply` is the answer to all who asked."""
-
-    reply: ArmReply
-
-
-@dataclass(frozen=True)
-class CameraRefused:
-    """The camera could not be locked to the settings with this hash; `reason` says why."""
-
-    settings_hash: str
-    reason: str
-
-
-@dataclass(frozen=True)
-class Triggered:
-    """A trigger has arrived. question : number of the query, which the answer names."""
-
-    message: Trigger
-    question: int
-
-
-@dataclass(frozen=True)
-class FrameSpooled:
-    """The frame of the capture under way is in the spool, safe against a power cut."""
-
-    manifest: Manifest
-
-
-@dataclass(frozen=True)
-class FrameLost:
-    """The camera or the spool failed: there will be no image of this capture."""
-
-    key: CaptureKey
-    reason: str
-
-
-@dataclass(frozen=True)
-class Sent:
-    """An image has been handed to the network, or that failed; neither tells whether it arrived."""
-
-    key: CaptureKey
-
-
-@dataclass(frozen=True)
-class Acknowledged:
-    """The controller has acknowledged an image, or says that it does not know the capture."""
-
-    message: Ack
-
-
-@dataclass(frozen=True)
-class InventoryAsked:
-    """The controller asks what this node holds. question : number of the query, which the answer names."""
-
-    question: int
-
-
-@dataclass(frozen=True)
-class FetchAsked:
-    """The controller asks for the image of one capture. question : number of the query, which the answer names."""
-
-    key: CaptureKey
-    question: int
-
-
-@dataclass(frozen=True)
-class AgentTick:
-    """Time has passed."""
-
-
-Event = (
-    ArmAsked
-    | CameraLocked
-    | CameraRefused
-    | Triggered
-    | FrameSpooled
-    | FrameLost
-    | Sent
-    | Acknowledged
-    | InventoryAsked
-    | FetchAsked
-    | AgentTick
-)
-
-
-# Actions -----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class LockCamera:
-    """Lock the camera to these settings; the event CameraLocked or CameraRefused follows."""
-
-    settings: dict[str, Any]
-    settings_hash: str
-
-
-@dataclass(frozen=True)
-class TakeFrame:
-    """Capture the frame nearest to the trigger's moment and spool it."""
-
-    trigger: Trigger
-
-
-@dataclass(frozen=True)
-class Publish:
-    """Send the image of this manifest from the spool; the event Sent follows."""
-
-    manifest: Manifest
-
-
-@dataclass(frozen=True)
-class Free:
-    """Remove a delivered image from the spool; a small file (tombstone) remembers that it was delivered."""
-
-    key: CaptureKey
-    sha256: str
-
-
-@dataclass(frozen=True)
-class Report:
-    """Tell the controller that there is no image of a capture, and why."""
-
-    failure: Failure
-
-
-@dataclass(frozen=True)
-class Answer:
-    """Answer a question with a message."""
-
-    question: int
-    message: ArmReply | TriggerReply | Inventory
-
-
-@dataclass(frozen=True)
-class AnswerImage:
-    """Answer a question with the image of this manifest from the spool."""
-
-    question: int
-    manifest: Manifest
-
-
-@dataclass(frozen=True)
-class Decline:
-    """Answer a question with an error and its reason."""
-
-    question: int
-    reason: str
-
-
-Action = LockCamera | TakeFrame | Publish | Free | Report | Answer | AnswerImage | Decline
+LISTED_NEWEST, LISTED_IN_TURN = 16, 48  # delivered images in one inventory
 
 
 @dataclass
@@ -224,8 +85,12 @@ class Agent:
     ----------
     node : str
         This node's id.
-    spooled, freed
-        What the spool held when the process started: images to deliver, and captures delivered before.
+    spooled, delivered
+        What the spool held when the process started: images to deliver, and images delivered and still held.
+    freed
+        Captures delivered before, whether their images are held or not.
+    failures
+        Captures whose images the spool holds but cannot use, with the reason.
     now : Instant
         The moment of the start; the spooled images are due at once.
     resend_after_ns, resend_at_most_ns : int
@@ -238,7 +103,9 @@ class Agent:
         now: Instant,
         *,
         spooled: Iterable[Manifest] = (),
+        delivered: Iterable[Manifest] = (),
         freed: Iterable[CaptureKey] = (),
+        failures: Iterable[Failure] = (),
         resend_after_ns: int = 5_000_000_000,
         resend_at_most_ns: int = 60_000_000_000,
     ) -> None:
@@ -250,8 +117,10 @@ class Agent:
         self._waiting: list[tuple[int, str]] = []
         self._capturing: Trigger | None = None
         self._parcels = {m.key: _Parcel(m, now.monotonic_ns, resend_after_ns) for m in spooled}
-        self._freed: OrderedDict[CaptureKey, None] = OrderedDict.fromkeys(freed)
-        self._failures: OrderedDict[CaptureKey, Failure] = OrderedDict()
+        self._delivered: OrderedDict[CaptureKey, Manifest] = OrderedDict((m.key, m) for m in delivered)
+        self._listed = 0  # how far the delivered images have been listed
+        self._freed: OrderedDict[CaptureKey, None] = OrderedDict.fromkeys((*freed, *self._delivered))
+        self._failures: OrderedDict[CaptureKey, Failure] = OrderedDict((failure.key, failure) for failure in failures)
         self._verdicts: OrderedDict[CaptureKey, TriggerReply] = OrderedDict()
 
     @property
@@ -273,6 +142,11 @@ class Agent:
         """Number of images that wait for an acknowledgement."""
         return len(self._parcels)
 
+    @property
+    def unwanted(self) -> int:
+        """Number of images among them that the controller has declared unknown."""
+        return sum(parcel.unwanted for parcel in self._parcels.values())
+
     def handle(self, event: Event, now: Instant) -> list[Action]:
         """Take one event at the moment ``now``; return the actions to perform, in order."""
         match event:
@@ -292,6 +166,10 @@ class Agent:
                 return self._sent(event.key, now)
             case Acknowledged():
                 return self._acknowledged(event.message)
+            case DeliveredRemoved():
+                for key in event.keys:
+                    self._delivered.pop(key, None)
+                return []
             case InventoryAsked():
                 return [Answer(event.question, self.inventory())]
             case FetchAsked():
@@ -300,38 +178,39 @@ class Agent:
                 return self._due(now)
 
     def inventory(self) -> Inventory:
-        """The answer to an inventory query: images in the spool, failures, the capture under way."""
+        """The answer to an inventory query: images in the spool, failures, the capture under way.
+
+        Each call lists other delivered images beside the newest, until all have had their turn.
+        """
         return Inventory(
             node=self.node,
             manifests=tuple(parcel.manifest for parcel in self._parcels.values()),
             failures=tuple(self._failures.values()),
             capturing=self._capturing.key if self._capturing else None,
+            delivered=self._next_delivered(),
         )
+
+    def _next_delivered(self) -> tuple[Manifest, ...]:
+        manifests = list(self._delivered.values())
+        older, newest = manifests[:-LISTED_NEWEST], manifests[-LISTED_NEWEST:]
+        begin = self._listed if self._listed < len(older) else 0
+        self._listed = begin + LISTED_IN_TURN
+        return (*newest, *older[begin : self._listed])
 
     # Arming
 
     def _arm(self, event: ArmAsked) -> list[Action]:
-        wanted = event.message
+        wanted, obstacle = event.message, event.obstacle
         if self._capturing is not None:
-            reason = f"a capture is under way ({self._capturing.key})"
-            reply = ArmReply(self.node, armed=False, settings_hash=wanted.settings_hash, reason=reason)
+            obstacle = f"a capture is under way ({self._capturing.key})"
+        elif self._arming is not None and self._arming.settings_hash != wanted.settings_hash:
+            obstacle = "the camera is being locked to other settings; ask again"
+        if obstacle:
+            reply = ArmReply(self.node, armed=False, settings_hash=wanted.settings_hash, reason=obstacle)
             return [Answer(event.question, reply)]
-        if self._arming is not None:
-            # One lock at a time: the same settings share its answer, others are told to ask again.
-            if self._arming.settings_hash == wanted.settings_hash:
-                self._waiting.append((event.question, wanted.settings_hash))
-                return []
-            return [
-                Answer(
-                    event.question,
-                    ArmReply(
-                        self.node,
-                        armed=False,
-                        settings_hash=wanted.settings_hash,
-                        reason="the camera is being locked to other settings; ask again",
-                    ),
-                )
-            ]
+        if self._arming is not None:  # one lock at a time: the same settings share its answer
+            self._waiting.append((event.question, wanted.settings_hash))
+            return []
         if self._lock_reply is not None and self._lock_reply.settings_hash == wanted.settings_hash:
             return [Answer(event.question, self._lock_reply)]
         self._lock_reply = None
@@ -367,6 +246,13 @@ class Agent:
             return [Answer(event.question, TriggerReply(self.node, key, "accepted"))]
         if self.state != "armed":
             reason = f"the node is {self.state}"
+            return [Answer(event.question, TriggerReply(self.node, key, "not armed", reason))]
+        assert self._lock_reply is not None
+        if trigger.settings_hash not in ("", self._lock_reply.settings_hash):
+            reason = (
+                f"the camera is locked to other settings ({self._lock_reply.settings_hash[:8]}…) than the capture's "
+                f"({trigger.settings_hash[:8]}…), because somebody armed it in between; capture again"
+            )
             return [Answer(event.question, TriggerReply(self.node, key, "not armed", reason))]
         behind = now.wall_ns - key.fire_at_ns
         if behind > 0:
@@ -430,11 +316,14 @@ class Agent:
             parcel.unwanted = True
             return []
         del self._parcels[ack.key]
+        self._delivered[ack.key] = parcel.manifest
         self._remember(self._freed, ack.key, None)
         return [Free(ack.key, ack.sha256)]
 
     def _fetch(self, event: FetchAsked) -> list[Action]:
         parcel = self._parcels.get(event.key)
+        if parcel is None and event.key in self._delivered:
+            return [AnswerImage(event.question, self._delivered[event.key])]
         if parcel is None:
             return [Decline(event.question, f"node {self.node} holds no image of {event.key}")]
         if parcel.sending:

@@ -65,7 +65,7 @@ def _run(config: NodeConfig) -> int:
     from ringdic_node.service import NodeService, ServiceError
 
     clock = SystemClock()
-    spool = Spool(config.spool, reserve=config.spool_reserve_mb << 20)
+    spool = _spool_of(config)
     spool.claim()
     service = NodeService(config, make_camera(config, clock), spool, clock)
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -77,6 +77,11 @@ def _run(config: NodeConfig) -> int:
         sys.stderr.flush()
         os._exit(1)  # a thread that hangs in a driver must not keep the process
     return 0
+
+
+def _spool_of(config: NodeConfig) -> Spool:
+    mib = 1 << 20
+    return Spool(config.spool, reserve=round(config.spool_reserve_mb * mib), keep=round(config.spool_keep_mb * mib))
 
 
 def _check(config: NodeConfig) -> int:
@@ -114,7 +119,7 @@ def _probe_clock(_: NodeConfig) -> tuple[bool, str]:
 
 def _probe_spool(config: NodeConfig) -> tuple[bool, str]:
     try:
-        spool = Spool(config.spool, reserve=config.spool_reserve_mb << 20)
+        spool = _spool_of(config)
     except OSError as error:
         return False, f"{config.spool} cannot be used: {error}"
     return spool.free > 0, f"{config.spool}, {spool.free >> 20} MiB free, {len(spool.manifests())} images wait"

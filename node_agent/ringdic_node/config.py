@@ -59,8 +59,9 @@ class NodeConfig:
     """Configuration of a node.
 
     rig, id : names of the rig and of this camera. controller : Zenoh endpoint. camera : kind of camera, with
-    ``camera_settings``. spool_reserve_mb : MiB of the disk that images leave free. resend_s, status_s : seconds until
-    an unacknowledged image is sent again, and between two status messages.
+    ``camera_settings``. spool_reserve_mb : MiB of the disk that images leave free. spool_keep_mb : MiB of delivered
+    images that are kept while there is room. arm_captures : number of captures that must find room before the camera
+    arms. resend_s, status_s : seconds until an unacknowledged image is sent again, and between two status messages.
     """
 
     rig: str
@@ -70,6 +71,8 @@ class NodeConfig:
     camera: str
     camera_settings: Mapping[str, Any] = field(default_factory=dict)
     spool_reserve_mb: int = 64
+    spool_keep_mb: int = 1024
+    arm_captures: int = 10
     resend_s: float = 5.0
     status_s: float = 1.0
 
@@ -83,8 +86,10 @@ class NodeConfig:
             raise ConfigError(f"camera '{self.camera}' is none of {', '.join(_CAMERA_KEYS)}")
         if not re.fullmatch(r"(tcp|tls|quic)/\S+:\d+(#\S*)?", self.controller):
             raise ConfigError(f"controller '{self.controller}' is no endpoint; write it like tcp/192.168.1.10:7447")
-        if self.resend_s <= 0 or self.status_s <= 0 or self.spool_reserve_mb < 0:
-            raise ConfigError("resend_s and status_s must be positive, spool_reserve_mb not negative")
+        if self.resend_s <= 0 or self.status_s <= 0 or self.arm_captures < 1:
+            raise ConfigError("resend_s, status_s and arm_captures must be positive")
+        if self.spool_reserve_mb < 0 or self.spool_keep_mb < 0:
+            raise ConfigError("spool_reserve_mb and spool_keep_mb must not be negative")
         known = _CAMERA_KEYS[self.camera]
         for name, value in self.camera_settings.items():
             if name not in known:
@@ -118,7 +123,7 @@ def _parse(table: dict[str, Any], folder: Path) -> NodeConfig:
         if not isinstance(table.get(key), str):
             raise ConfigError(f"the key '{key}' is missing or not a text in quotes")
     numbers = {}
-    for key in ("spool_reserve_mb", "resend_s", "status_s"):
+    for key in ("spool_reserve_mb", "spool_keep_mb", "arm_captures", "resend_s", "status_s"):
         if key in table:
             if not isinstance(table[key], int | float) or isinstance(table[key], bool):
                 raise ConfigError(f"{key} must be a number, not {table[key]!r}")

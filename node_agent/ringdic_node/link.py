@@ -33,6 +33,8 @@ class NodeLink:
         Called from Zenoh's threads; must only enqueue. `question` is the number of the query, for `answer`.
     on_ack : callable (payload)
         Called from Zenoh's threads with an acknowledgement; must only enqueue.
+    instance : str
+        Name of this process, which is seen alive beside the node; empty for none.
     """
 
     def __init__(
@@ -42,12 +44,14 @@ class NodeLink:
         controller: str,
         on_query: Callable[[str, bytes, int], None],
         on_ack: Callable[[bytes], None],
+        instance: str = "",
     ) -> None:
         self._keys = keys
         self._node = node
         self._controller = controller
         self._on_query = on_query
         self._on_ack = on_ack
+        self._instance = instance
         self._questions: dict[int, zenoh.Query] = {}
         self._numbers = itertools.count(1)
         self._lock = threading.Lock()
@@ -61,7 +65,9 @@ class NodeLink:
         self._acks = self._session.declare_subscriber(
             self._keys.node(self._node, "ack"), lambda sample: self._on_ack(sample.payload.to_bytes())
         )
-        self._token = self._session.liveliness().declare_token(self._keys.alive(self._node))
+        keys = [self._keys.instance(self._node, self._instance)] if self._instance else []
+        keys.append(self._keys.alive(self._node))
+        self._tokens = [self._session.liveliness().declare_token(key) for key in keys]
         return self
 
     def __exit__(

@@ -11,6 +11,7 @@ import platform
 import queue
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
@@ -21,8 +22,11 @@ from ringdic_node.agent import Agent
 from ringdic_node.cameras.camera import CameraError, Frame, NodeCamera, Shot
 from ringdic_node.clock import Clock, clock_offset
 from ringdic_node.config import NodeConfig
+from ringdic_node.identity import Identity
+from ringdic_node.image_file import image_digest
 from ringdic_node.link import NodeLink
-from ringdic_node.spool import Spool, SpoolError, image_digest
+from ringdic_node.room import SpoolRoom
+from ringdic_node.spool import Spool, SpoolError
 from ringdic_node.wire import (
     Ack,
     Arm,
@@ -35,6 +39,7 @@ from ringdic_node.wire import (
     WireError,
     decode_as,
     encode,
+    hash_of_settings,
 )
 
 log = logging.getLogger(__name__)
@@ -61,11 +66,16 @@ class NodeService:
         self._preview: npt.NDArray[np.uint8] | None = None
         self._offset = clock_offset()
         self._versions = {**_versions(), **camera.versions()}
+        self._identity = Identity(config.controller)
+        self._locked_to = ""  # hash of the settings that the camera was locked to last; of the camera's thread
+        self._room = SpoolRoom(spool, config.id, config.arm_captures)
         self._agent = Agent(
             config.id,
             clock.now(),
-            spooled=spool.manifests(),
+            spooled=self._room.waiting,
+            delivered=self._room.delivered,
             freed=spool.tombstones(),
+            failures=self._room.failures,
             resend_after_ns=round(config.resend_s * 1e9),
         )
 
@@ -76,7 +86,9 @@ class NodeService:
     def run(self) -> None:
         """Serve until stopped. Raises ServiceError if one of its threads has died."""
         keys = Keys(self.config.rig)
-        with NodeLink(keys, self.config.id, self.config.controller, self._receive, self._receive_ack) as link:
+        with NodeLink(
+            keys, self.config.id, self.config.controller, self._receive, self._receive_ack, self._identity.instance
+        ) as link:
             self._link = link
             workers = [
                 threading.Thread(target=self._use_camera, name="camera", daemon=True),
@@ -100,11 +112,14 @@ class NodeService:
                 event = self._events.get(timeout=0.1)
             except queue.Empty:
                 event = steps.AgentTick()
+            if isinstance(event, steps.ArmAsked):
+                event = replace(event, obstacle=self._room.obstacle())
             if isinstance(event, steps.Event):
-                for action in self._agent.handle(event, self._clock.now()):
-                    self._perform(action)
+                self._handle(event)
             else:
                 event()
+            if removed := self._spool.take_removed():
+                self._handle(steps.DeliveredRemoved(tuple(removed)))
             now = self._clock.now().monotonic_ns
             state = (self._agent.state, self._agent.spooled)
             if state != published_state or now >= next_status:
@@ -113,6 +128,10 @@ class NodeService:
             for worker in workers:
                 if not worker.is_alive():
                     raise ServiceError(f"the node's {worker.name} thread has died; its traceback is above")
+
+    def _handle(self, event: steps.Event) -> None:
+        for action in self._agent.handle(event, self._clock.now()):
+            self._perform(action)
 
     def _status(self) -> NodeStatus:
         return NodeStatus(
@@ -124,6 +143,8 @@ class NodeService:
             spool_images=self._agent.spooled,
             versions=self._versions,
             clock_offset_ms=self._offset[0] if self._offset else None,
+            detail=self._room.detail(self._agent.unwanted),
+            **self._identity.fields(),
         )
 
     # Called from Zenoh's threads: decode and enqueue only
@@ -166,10 +187,7 @@ class NodeService:
             case steps.Publish() | steps.AnswerImage():
                 self._parcels.put(action)
             case steps.Free():
-                try:
-                    self._spool.remove(action.key, action.sha256)
-                except SpoolError as error:
-                    log.error("a delivered image stays in the spool: %s", error)
+                self._spool.deliver(action.key, action.sha256)
             case steps.Report():
                 log.error("capture %s failed: %s", action.failure.key, action.failure.reason)
                 self._link.publish_status(action.failure)
@@ -195,10 +213,19 @@ class NodeService:
                 self._events.put(self._take(work.trigger))
 
     def _lock(self, work: steps.LockCamera) -> steps.Event:
+        self._locked_to = ""
         try:
             lock = self._camera.lock(work.settings)
         except CameraError as error:
             return steps.CameraRefused(work.settings_hash, str(error))
+        self._locked_to = hash_of_settings(work.settings)
+        if self._locked_to != work.settings_hash:
+            return steps.CameraRefused(
+                work.settings_hash, "the hash that came with the settings is not theirs; ask again"
+            )
+        self._room.image_bytes = lock.image_bytes or self._room.image_bytes
+        if obstacle := self._room.obstacle():
+            return steps.CameraRefused(work.settings_hash, obstacle)
         self._offset = clock_offset()
         return steps.CameraLocked(
             ArmReply(
@@ -213,6 +240,7 @@ class NodeService:
                 frame_period_ns=lock.frame_period_ns,
                 spool_free=self._spool.free,
                 versions=self._versions,
+                **self._identity.fields(),
             )
         )
 
@@ -221,10 +249,11 @@ class NodeService:
         try:
             frame = self._camera.capture(shot)
             parts = frame.pgm()
-            manifest = make_manifest(self.config.id, trigger, frame, parts)
+            manifest = make_manifest(self.config.id, trigger, frame, parts, self._locked_to)
             self._spool.store(manifest, parts)
         except (CameraError, SpoolError, WireError) as error:
             return steps.FrameLost(trigger.key, str(error))
+        self._room.image_bytes = manifest.bytes
         self._preview = preview_image(frame)
         return steps.FrameSpooled(manifest)
 
@@ -248,8 +277,13 @@ class NodeService:
                 self._events.put(steps.Sent(key))
 
 
-def make_manifest(node: str, trigger: Trigger, frame: Frame, parts: tuple[bytes, bytes]) -> Manifest:
-    """The manifest of a frame of this node. parts : the bytes of its file, header and pixels."""
+def make_manifest(
+    node: str, trigger: Trigger, frame: Frame, parts: tuple[bytes, bytes], settings_hash: str = ""
+) -> Manifest:
+    """The manifest of a frame of this node.
+
+    parts : the bytes of its file, header and pixels. settings_hash : of the settings that the camera was locked to.
+    """
     sha256, length = image_digest(parts)
     return Manifest(
         node=node,
@@ -262,6 +296,7 @@ def make_manifest(node: str, trigger: Trigger, frame: Frame, parts: tuple[bytes,
         time_ns=frame.time_ns,
         exposure_us=frame.exposure_us,
         metadata=frame.metadata,
+        settings_hash=settings_hash,
     )
 
 

@@ -13,18 +13,22 @@ Keys
 ``rig/<rig>/node/<id>/status``     put by the node: Status or Failure; as a query: (empty) -> Status
 ``rig/<rig>/img/<id>``             put by the node: image bytes, Manifest as attachment
 ``rig/<rig>/alive/<id>``           liveliness token of the node
+``rig/<rig>/alive/<id>/<process>`` liveliness token of the process that speaks as this node
 
-Messages are JSON objects with ``schema`` and ``type``; image bytes travel raw. A message is checked when
-it is built, so an invalid one cannot exist on either side. All times are integers, ns since the Unix epoch.
+Messages are JSON objects with ``schema`` and ``type``; image bytes travel raw. A message is checked when it is built,
+so an invalid one cannot exist on either side. Fields that one side does not know are ignored by it. All times are
+integers, ns since the Unix epoch.
 """
 
 from __future__ import annotations
 
-import dataclasses
+import hashlib
 import json
 import re
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
+
+from ringdic_node.json_document import WireError, build, document_of, plain, read_document, shown
 
 SCHEMA = 1
 
@@ -53,15 +57,11 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _HASH = re.compile(r"[0-9a-f]{64}")
 
 
-class WireError(ValueError):
-    """A message that breaks the contract: the text says which field and why."""
-
-
 def valid_name(what: str, name: object) -> str:
     """Return `name` if it may stand in a key and in a file name, else raise WireError."""
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise WireError(
-            f"{what} {name!r} is not a name: use 1 to 64 letters, digits, dots, dashes or underscores, "
+            f"{what} {shown(name)} is not a name: use 1 to 64 letters, digits, dots, dashes or underscores, "
             "beginning with a letter or a digit"
         )
     return name
@@ -88,6 +88,10 @@ class Keys:
         """Key of the liveliness token of a node."""
         return f"rig/{self.rig}/alive/{node}"
 
+    def instance(self, node: str, instance: str) -> str:
+        """Key of the liveliness token of one process that speaks as a node."""
+        return f"rig/{self.rig}/alive/{node}/{instance}"
+
 
 @dataclass(frozen=True, order=True)
 class CaptureKey:
@@ -112,27 +116,40 @@ class CaptureKey:
 
 
 def _require_int(what: str, value: object, *, at_least: int) -> None:
-    if not isinstance(value, int) or isinstance(value, bool) or value < at_least:
-        raise WireError(f"{what} must be an integer of at least {at_least}, not {value!r}")
+    if not isinstance(value, int) or isinstance(value, bool) or not at_least <= value < 1 << 63:
+        raise WireError(f"{what} must be an integer of at least {at_least} and of 63 bits, not {shown(value)}")
 
 
 def _require_in(what: str, value: object, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
-        raise WireError(f"{what} {value!r} is none of {', '.join(allowed)}")
+        raise WireError(f"{what} {shown(value)} is none of {', '.join(allowed)}")
 
 
 def _require_hash(what: str, value: object) -> None:
     if not isinstance(value, str) or not _HASH.fullmatch(value):
-        raise WireError(f"{what} must be 64 hexadecimal digits (SHA-256), not {value!r}")
+        raise WireError(f"{what} must be 64 hexadecimal digits (SHA-256), not {shown(value)}")
+
+
+def _require_hash_if_given(what: str, value: object) -> None:
+    if value != "":
+        _require_hash(what, value)
 
 
 def _require_table(what: str, value: object) -> None:
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        raise WireError(f"{what} must be a table with text keys, not {value!r}")
-    try:
-        json.dumps(value)
-    except (TypeError, ValueError) as error:
-        raise WireError(f"{what} cannot be written as JSON: {error}") from error
+        raise WireError(f"{what} must be a table with text keys, not {shown(value)}")
+
+
+def _require_texts(what: str, value: object) -> None:
+    _require_table(what, value)
+    assert isinstance(value, dict)
+    if not all(isinstance(text, str) for text in value.values()):
+        raise WireError(f"{what} must be a table of texts, not {shown(value)}")
+
+
+def hash_of_settings(settings: dict[str, Any]) -> str:
+    """SHA-256 of camera settings in canonical JSON (sorted, without spaces), in hexadecimal."""
+    return hashlib.sha256(json.dumps(settings, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 class _Message:
@@ -143,7 +160,7 @@ class _Message:
 
 @dataclass(frozen=True)
 class Arm(_Message):
-    """Request to lock the camera for a session. `settings_hash` is sha256 of the canonical JSON of `settings`."""
+    """Request to lock the camera for a session. `settings_hash` is `hash_of_settings` of `settings`."""
 
     TYPE: ClassVar[str] = "arm"
     session: str
@@ -166,7 +183,7 @@ class ArmReply(_Message):
     """Answer to `Arm`: whether the camera is locked, and to what.
 
     `frame_time_ns` and `frame_period_ns` are the time of one frame and the period, ns, of a sensor that takes frames
-    continuously.
+    continuously. `instance`, `host` and `address` tell which process answers, and where it runs.
     """
 
     TYPE: ClassVar[str] = "arm-reply"
@@ -182,12 +199,15 @@ class ArmReply(_Message):
     frame_period_ns: int | None = None
     spool_free: int = 0
     versions: dict[str, str] = field(default_factory=dict)
+    instance: str = ""
+    host: str = ""
+    address: str = ""
 
     def __post_init__(self) -> None:
         valid_name("node", self.node)
         _require_hash("settings_hash", self.settings_hash)
         _require_table("locked", self.locked)
-        _require_table("versions", self.versions)
+        _require_texts("versions", self.versions)
         if not self.armed and not self.reason:
             raise WireError("an ArmReply that is not armed must give the reason")
 
@@ -196,15 +216,18 @@ class ArmReply(_Message):
 class Trigger(_Message):
     """Request to keep the frame nearest to `key.fire_at_ns`.
 
-    `scene` counts the captures of this kind, for simulated rigs.
+    `scene` counts the captures of this kind, for simulated rigs. `settings_hash` is that of the settings that the
+    camera must be locked to; empty from a controller that does not say.
     """
 
     TYPE: ClassVar[str] = "trigger"
     key: CaptureKey
     kind: str
     scene: int = 0
+    settings_hash: str = ""
 
     def __post_init__(self) -> None:
+        _require_hash_if_given("settings_hash", self.settings_hash)
         _require_in("kind", self.kind, CAPTURE_KINDS)
         _require_int("scene", self.scene, at_least=0)
 
@@ -228,7 +251,9 @@ class TriggerReply(_Message):
 class Manifest(_Message):
     """Description of one image file: capture, checksum, size, time, metadata.
 
-    `time_ns` is the measured wall-clock time of the frame.
+    `time_ns` is the measured wall-clock time of the frame. `settings_hash` is that of the settings that the camera was
+    locked to; empty from a node that does not say. `unknown` are fields that another release has added; they stay with
+    the manifest wherever it goes.
     """
 
     TYPE: ClassVar[str] = "manifest"
@@ -243,8 +268,11 @@ class Manifest(_Message):
     exposure_us: float | None = None
     format: str = "pgm"
     metadata: dict[str, Any] = field(default_factory=dict)
+    settings_hash: str = ""
+    unknown: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        _require_hash_if_given("settings_hash", self.settings_hash)
         valid_name("node", self.node)
         _require_in("kind", self.kind, CAPTURE_KINDS)
         _require_hash("sha256", self.sha256)
@@ -275,13 +303,17 @@ class Failure(_Message):
 
 @dataclass(frozen=True)
 class Inventory(_Message):
-    """List of what a node holds: images in its spool, failures it remembers, the capture under way."""
+    """List of what a node holds: images in its spool, failures it remembers, the capture under way.
+
+    `delivered` are images that were acknowledged and are still held: the newest, and in turn some of the others.
+    """
 
     TYPE: ClassVar[str] = "inventory"
     node: str
     manifests: tuple[Manifest, ...] = ()
     failures: tuple[Failure, ...] = ()
     capturing: CaptureKey | None = None
+    delivered: tuple[Manifest, ...] = ()
 
     def __post_init__(self) -> None:
         valid_name("node", self.node)
@@ -299,8 +331,8 @@ class Fetch(_Message):
 class Ack(_Message):
     """Acknowledgement of an image by the controller.
 
-    ``archived``: the image with this hash is safe, and the node frees it. ``unknown``: the archive has no such capture,
-    and the node stops sending.
+    ``archived``: the image with this hash is safe; the node stops sending it, and removes it when it needs the room.
+    ``unknown``: the archive has no such capture, and the node stops sending.
     """
 
     TYPE: ClassVar[str] = "ack"
@@ -317,7 +349,11 @@ class Ack(_Message):
 
 @dataclass(frozen=True)
 class NodeStatus(_Message):
-    """The node's state, sent at an interval and on change. `time_ns` is the node's clock when it was sent."""
+    """The node's state, sent at an interval and on change. `time_ns` is the node's clock when it was sent.
+
+    `detail` says what the operator should know. `instance`, `host` and `address` tell which process speaks, and where
+    it runs.
+    """
 
     TYPE: ClassVar[str] = "status"
     node: str
@@ -329,6 +365,9 @@ class NodeStatus(_Message):
     versions: dict[str, str] = field(default_factory=dict)
     clock_offset_ms: float | None = None
     detail: str = ""
+    instance: str = ""
+    host: str = ""
+    address: str = ""
 
     def __post_init__(self) -> None:
         valid_name("node", self.node)
@@ -336,7 +375,7 @@ class NodeStatus(_Message):
         _require_int("time_ns", self.time_ns, at_least=0)
         _require_int("spool_free", self.spool_free, at_least=0)
         _require_int("spool_images", self.spool_images, at_least=0)
-        _require_table("versions", self.versions)
+        _require_texts("versions", self.versions)
 
 
 Message = Arm | ArmReply | Trigger | TriggerReply | Manifest | Failure | Inventory | Fetch | Ack | NodeStatus
@@ -354,46 +393,41 @@ _NESTED: dict[tuple[str, str], type[Any]] = {
     ("ack", "key"): CaptureKey,
     ("inventory", "capturing"): CaptureKey,
     ("inventory", "manifests"): Manifest,
+    ("inventory", "delivered"): Manifest,
     ("inventory", "failures"): Failure,
-}
-_PLAIN: dict[str, type[Any] | tuple[type[Any], ...]] = {
-    "str": str,
-    "int": int,
-    "bool": bool,
-    "float | None": (int, float, type(None)),
-    "int | None": (int, type(None)),
-    "dict[str, Any]": dict,
-    "dict[str, str]": dict,
 }
 
 
 def encode(message: Message) -> bytes:
     """Return the message as JSON bytes with its schema version and type."""
-    document = {"schema": SCHEMA, "type": message.TYPE, **dataclasses.asdict(message)}
+    document = {"schema": SCHEMA, "type": message.TYPE, **plain(document_of(message))}
     return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
 
 
 def decode(payload: bytes) -> Message:
-    """Return the message in `payload`.
+    """Return the message in `payload`; fields that this release does not know are ignored, a manifest keeps them.
 
     Raises
     ------
     WireError
-        Not JSON, an unknown schema or type, a missing, unknown or wrong field.
+        Not JSON, no schema or an unknown type, a missing or wrong field. A message of another schema is understood
+        as far as it has the fields that are wanted here.
     """
-    try:
-        document = json.loads(payload)
-    except ValueError as error:
-        raise WireError(f"the message is not JSON: {error}") from error
-    if not isinstance(document, dict):
-        raise WireError(f"the message is not a JSON object: {document!r}")
+    document = read_document(payload)
     schema = document.pop("schema", None)
-    if schema != SCHEMA:
-        raise WireError(f"the message has schema {schema!r}; this side speaks schema {SCHEMA}: update the older side")
+    if not isinstance(schema, int) or isinstance(schema, bool) or schema < 1:
+        raise WireError(f"the message has schema {shown(schema)}, which is no version of a contract")
     kind = document.pop("type", None)
-    if not isinstance(kind, str) or kind not in _TYPES:
-        raise WireError(f"the message type {kind!r} is none of {', '.join(_TYPES)}")
-    return _build(_TYPES[kind], kind, document)
+    try:
+        if not isinstance(kind, str) or kind not in _TYPES:
+            raise WireError(f"the message type {shown(kind)} is none of {', '.join(_TYPES)}")
+        return build(_TYPES[kind], kind, document, _NESTED)  # type: ignore[no-any-return]
+    except WireError as error:
+        if schema == SCHEMA:
+            raise
+        raise WireError(
+            f"{error}; the message has schema {schema}, this side speaks schema {SCHEMA}: update the older side"
+        ) from error
 
 
 def decode_as(expected: type[Any], payload: bytes) -> Any:
@@ -402,47 +436,3 @@ def decode_as(expected: type[Any], payload: bytes) -> Any:
     if not isinstance(message, expected):
         raise WireError(f"expected a message of type {expected.TYPE!r}, got {message.TYPE!r}")
     return message
-
-
-def _build(cls: type[Any], kind: str, document: dict[str, Any]) -> Any:
-    fields = {f.name: f for f in dataclasses.fields(cls)}
-    for name in document:
-        if name not in fields:
-            raise WireError(f"{kind}: unknown field {name!r}")
-    values: dict[str, Any] = {}
-    for name, described in fields.items():
-        if name not in document:
-            if described.default is dataclasses.MISSING and described.default_factory is dataclasses.MISSING:
-                raise WireError(f"{kind}: field {name!r} is missing")
-            continue
-        values[name] = _field(kind, name, str(described.type), document[name])
-    return cls(**values)
-
-
-def _field(kind: str, name: str, annotation: str, value: Any) -> Any:
-    where = f"{kind}: field {name!r}"
-    nested = _NESTED.get((kind, name))
-    if nested is not None and value is None and annotation.endswith("| None"):
-        return None
-    if nested is not None and annotation.startswith("tuple"):
-        return tuple(_build_nested(where, nested, item) for item in _sequence(where, value))
-    if nested is not None:
-        return _build_nested(where, nested, value)
-    if annotation.startswith("tuple"):
-        return tuple(_sequence(where, value))
-    plain = _PLAIN[annotation]
-    if not isinstance(value, plain) or (isinstance(value, bool) and annotation != "bool"):
-        raise WireError(f"{where} must be {annotation}, not {value!r}")
-    return value
-
-
-def _sequence(where: str, value: Any) -> list[Any]:
-    if not isinstance(value, list):
-        raise WireError(f"{where} must be a list, not {value!r}")
-    return value
-
-
-def _build_nested(where: str, cls: type[Any], value: Any) -> Any:
-    if not isinstance(value, dict):
-        raise WireError(f"{where} must be an object, not {value!r}")
-    return _build(cls, cls.TYPE if hasattr(cls, "TYPE") else "capture key", value)

@@ -43,16 +43,20 @@ def change(path: Path, **fields: Any) -> None:
 # The session ------------------------------------------------------------------------------------
 
 
-def test_the_tables_name_the_fields_of_session_records(session: Path, named: Named) -> None:
+def test_the_tables_name_the_fields_of_session_records(session: Path, named: Named, table: Table) -> None:
     header = json.loads((session / "session.json").read_text(encoding="utf-8"))
     assert named("formats/session.md", "session.json") == list(header)
+    often = {row[0].strip("`") for row in table("formats/session.md", "capture.json") if "optional" in row[1]}
+    of_cameras = {row[0].strip("`") for row in table("formats/session.md", "Entry of a camera") if "optional" in row[1]}
     captures = sorted((session / "captures").glob("*/capture.json"))
     assert len(captures) == 6 + 1 + 3
     for path in captures:
         record = json.loads(path.read_text(encoding="utf-8"))
-        assert named("formats/session.md", "capture.json") == list(record), path
+        listed = [name for name in named("formats/session.md", "capture.json") if name in record or name not in often]
+        assert listed == list(record), path
         for entry in record["cameras"].values():
-            assert set(named("formats/session.md", "Entry of a camera")) == set(entry), path
+            wanted = set(named("formats/session.md", "Entry of a camera"))
+            assert wanted - of_cameras <= set(entry) <= wanted, path
 
 
 @pytest.mark.parametrize("name", ["session.json", "captures/0001-board/capture.json"])
@@ -179,12 +183,9 @@ def test_the_page_describes_every_message(pages: Path) -> None:
     assert described == [message.TYPE for message in MESSAGES]
 
 
-def test_messages_of_another_schema_and_with_unknown_fields_are_refused() -> None:
+def test_messages_of_another_schema_and_with_unknown_fields_are_understood() -> None:
     document = json.loads(wire.encode(wire.Fetch(KEY)))
-    with pytest.raises(wire.WireError, match="schema 99"):
-        wire.decode(json.dumps({**document, "schema": 99}).encode())
-    with pytest.raises(wire.WireError, match="unknown field 'operator'"):
-        wire.decode(json.dumps({**document, "operator": "somebody"}).encode())
+    assert wire.decode(json.dumps({**document, "schema": 99, "operator": "somebody"}).encode()) == wire.Fetch(KEY)
 
 
 def test_the_page_names_the_schemas(table: Table) -> None:

@@ -15,6 +15,7 @@ from ringdic_node.agent import (
     CameraLocked,
     CameraRefused,
     Decline,
+    DeliveredRemoved,
     FetchAsked,
     FrameLost,
     FrameSpooled,
@@ -193,3 +194,45 @@ def test_a_node_that_captures_does_not_change_its_camera():
     (answer,) = agent.handle(arm(TWO), NOW)
     assert answer.message.armed is False
     assert agent.state == "capturing"
+
+
+def test_a_delivered_image_is_listed_and_given_as_long_as_it_is_held():
+    agent = capturing_agent()
+    agent.handle(FrameSpooled(MANIFEST), at(1))
+    agent.handle(Acknowledged(Ack("n", KEY, ONE)), at(2))
+    assert agent.inventory().manifests == ()
+    assert agent.inventory().delivered == (MANIFEST,)
+    assert agent.handle(FetchAsked(KEY, 9), at(3)) == [AnswerImage(9, MANIFEST)]
+    agent.handle(DeliveredRemoved((KEY,)), at(4))
+    assert agent.inventory().delivered == ()
+    assert isinstance(agent.handle(FetchAsked(KEY, 9), at(5))[0], Decline)
+
+
+def test_all_delivered_images_have_their_turn_in_the_inventory():
+    held = [replace(MANIFEST, key=replace(KEY, fire_at_ns=n)) for n in range(300)]
+    agent = Agent("n", NOW, delivered=held)
+    lists = [agent.inventory().delivered for _ in range(7)]
+    assert max(map(len, lists)) <= 64
+    assert {manifest.key for each in lists for manifest in each} == {manifest.key for manifest in held}
+    assert all(held[-1] in each for each in lists), "the newest is always there"
+
+
+def test_a_trigger_for_other_settings_than_the_cameras_is_refused_with_both():
+    agent = armed_agent()
+    agent.handle(arm(TWO, 4), NOW)  # somebody else's
+    agent.handle(CameraLocked(ArmReply("n", True, TWO)), NOW)
+    (answer,) = agent.handle(Triggered(Trigger(KEY, "board", settings_hash=ONE), 7), NOW)
+    assert answer.message.verdict == "not armed"
+    assert "22222222" in answer.message.reason
+    assert "11111111" in answer.message.reason
+    assert agent.state == "armed"
+    taken = agent.handle(Triggered(Trigger(KEY, "board", settings_hash=TWO), 8), NOW)
+    assert [type(action) for action in taken] == [Answer, TakeFrame]
+
+
+def test_a_node_without_room_refuses_to_arm_though_its_camera_is_locked():
+    agent = armed_agent()
+    (answer,) = agent.handle(replace(arm(question=2), obstacle="no room"), NOW)
+    assert (answer.message.armed, answer.message.reason) == (False, "no room")
+    (answer,) = agent.handle(arm(question=3), NOW)
+    assert answer.message.armed is True

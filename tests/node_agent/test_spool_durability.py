@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 
 import pytest
-from ringdic_node.spool import Spool, SpoolError, image_digest
-from ringdic_node.wire import CaptureKey, Manifest
+from ringdic_node import spool as spool_module
+from ringdic_node.image_file import image_digest
+from ringdic_node.spool import Spool, SpoolError
+from ringdic_node.wire import CaptureKey, Manifest, encode
 
 PARTS = (b"P5\n3 2\n255\n", b"abcdef")
 
@@ -74,20 +78,76 @@ def test_a_power_cut_at_any_step_leaves_all_or_nothing(tmp_path, monkeypatch, st
         assert image_digest([again.read(manifest.key)]) == (manifest.sha256, manifest.bytes)
     committed = len(held)
     assert len([p for p in tmp_path.iterdir() if p.name != ".claim"]) == 2 * committed, "nothing half-written is left"
+    assert committed or steps < 2, "an image that reached the disk with its manifest is there again"
 
 
-def test_only_its_own_hash_frees_an_image_and_a_tombstone_stays(tmp_path):
-    spool, manifest = Spool(tmp_path), manifest_of()
+def test_only_its_own_hash_delivers_an_image_and_a_note_stays(tmp_path):
+    spool, manifest = Spool(tmp_path, keep=0), manifest_of()
     spool.store(manifest, PARTS)
-    assert spool.remove(manifest.key, "0" * 64) is False
+    assert spool.deliver(manifest.key, "0" * 64) is False
     assert spool.manifests() == [manifest]
-    assert spool.remove(manifest.key, manifest.sha256) is True
-    assert spool.remove(manifest.key, manifest.sha256) is False
+    assert spool.deliver(manifest.key, manifest.sha256) is True
+    assert spool.deliver(manifest.key, manifest.sha256) is False
+    assert spool.take_removed() == [manifest.key]
     again = Spool(tmp_path)
-    assert again.manifests() == []
+    assert again.contents().waiting == again.contents().delivered == ()
     assert again.tombstones() == [manifest.key]
     with pytest.raises(SpoolError, match="already"):
         again.store(manifest, PARTS)
+
+
+def test_a_delivered_image_is_held_until_its_room_is_needed(tmp_path, monkeypatch):
+    """An acknowledgement may be forged: what the controller asks for again is still there."""
+    disk = [10 << 20]
+    monkeypatch.setattr(spool_module.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(0, 0, disk[0]))
+    spool = Spool(tmp_path, reserve=0)
+    manifests = [manifest_of(f"{n:04d}-board") for n in (1, 2, 3)]
+    for manifest in manifests:
+        spool.store(manifest, PARTS)
+    for manifest in manifests[:2]:
+        spool.deliver(manifest.key, manifest.sha256)
+    again = claimed(tmp_path)
+    assert list(again.contents().delivered) == manifests[:2]
+    assert again.read(manifests[0].key) == b"".join(PARTS)
+
+    def shrinking(path, *_, unlink=os.unlink):
+        disk[0] += 40 << 10  # what a removal gives back
+        unlink(path)
+
+    spool, disk[0] = Spool(tmp_path, reserve=0), 0
+    monkeypatch.setattr(os, "unlink", shrinking)
+    free = spool.free
+    assert free == 2 * manifests[0].bytes, "its room counts as free"
+    monkeypatch.setattr(spool_module, "FILE_COST", 0)
+    spool.store(manifest_of("0004-board"), PARTS)
+    assert spool.take_removed() == [manifests[0].key], "the one that was delivered first"
+    assert [m.key.capture_id for m in spool.contents().delivered] == ["0002-board"]
+    assert manifests[0].key in spool.tombstones()
+
+
+def test_what_is_kept_of_delivered_images_is_bounded(tmp_path, monkeypatch):
+    monkeypatch.setattr(spool_module, "TOMBSTONES_KEPT", 3)
+    spool = Spool(tmp_path, keep=2 * manifest_of().bytes)
+    for n in range(10):
+        manifest = manifest_of(f"{n:04d}-board")
+        spool.store(manifest, PARTS)
+        assert spool.deliver(manifest.key, manifest.sha256)
+        assert len(list(tmp_path.iterdir())) <= 3 * 2 + 3, "while it runs, not only at the next start"
+    assert [m.key.capture_id for m in spool.contents().delivered] == ["0008-board", "0009-board"]
+
+
+def test_a_disk_that_fills_while_an_image_is_written_leaves_no_files(tmp_path, monkeypatch):
+    spool = claimed(tmp_path)
+
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    for fails in (1, 2):
+        calls = iter([lambda _: None] * (fails - 1) + [full] * 9)
+        monkeypatch.setattr(os, "fsync", lambda fd, calls=calls: next(calls)(fd))
+        with pytest.raises(SpoolError, match="No space"):
+            spool.store(manifest_of(), PARTS)
+        assert [path.name for path in tmp_path.iterdir()] == [".claim"]
 
 
 def test_a_second_image_of_a_capture_is_refused(tmp_path):
@@ -105,13 +165,76 @@ def test_a_full_disk_is_told_before_anything_is_written(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_damaged_image_is_set_aside_and_the_others_stay(tmp_path):
-    spool = Spool(tmp_path)
-    spool.store(manifest_of("0001-board"), PARTS)
-    spool.store(manifest_of("0002-board"), PARTS)
+def change(path, **fields) -> None:
+    path.write_text(json.dumps({**json.loads(path.read_text()), **fields}))
+
+
+def content(folder) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix in (".pgm", ".json")}
+
+
+def test_an_image_whose_manifest_cannot_be_read_stays_and_is_delivered_by_the_release_that_can(tmp_path):
+    Spool(tmp_path).store(manifest_of("0001-board"), PARTS)
+    Spool(tmp_path).store(manifest_of("0002-board"), PARTS)
+    manifest_path = tmp_path / "s~0001-board~5.json"
+    original = manifest_path.read_text()
+    change(manifest_path, schema=7, format="a format of later")
+    before = content(tmp_path)
+    for _ in range(3):  # as often as the node starts
+        spool = claimed(tmp_path)
+        contents = spool.contents()
+        assert [m.key.capture_id for m in contents.waiting] == ["0002-board"]
+        assert list(contents.unread) == ["s~0001-board~5.json"]
+        assert "schema 7" in contents.unread["s~0001-board~5.json"]
+        spool.release()
+    assert content(tmp_path) == before
+    manifest_path.write_text(original)  # what the other release makes of it
+    assert len(claimed(tmp_path).manifests()) == 2
+
+
+def test_a_manifest_with_fields_of_a_later_release_is_delivered(tmp_path):
+    Spool(tmp_path).store(manifest_of(), PARTS)
+    change(tmp_path / "s~0001-board~5.json", schema=2, lens="wide")
+    (manifest,) = claimed(tmp_path).manifests()
+    assert json.loads(encode(manifest))["lens"] == "wide"
+
+
+def test_a_manifest_that_the_release_before_has_set_aside_counts_again(tmp_path):
+    Spool(tmp_path).store(manifest_of(), PARTS)
+    (tmp_path / "s~0001-board~5.json").rename(tmp_path / "s~0001-board~5.damaged")
+    assert claimed(tmp_path).manifests() == [manifest_of()]
+
+
+def test_an_image_without_a_manifest_is_kept_and_counted(tmp_path):
+    (tmp_path / "s~0001-board~5.pgm").write_bytes(b"".join(PARTS))
+    (tmp_path / ".partial-s~0002-board~6.pgm").write_bytes(b"".join(PARTS))  # whole, but who knows of what
+    (tmp_path / ".partial-s~0003-board~7.pgm").write_bytes(b"".join(PARTS)[:-1])
+    (tmp_path / ".partial-s~0003-board~7.json").write_bytes(b"{")
+    for _ in range(2):
+        spool = claimed(tmp_path)
+        assert spool.aside == 2
+        spool.release()
+    assert {path.read_bytes() for path in (tmp_path / "aside").iterdir()} == {b"".join(PARTS)}
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".claim", "aside"], "what breaks off is removed"
+
+
+def test_a_damaged_image_is_told_and_the_others_stay(tmp_path):
+    Spool(tmp_path).store(manifest_of("0001-board"), PARTS)
+    Spool(tmp_path).store(manifest_of("0002-board"), PARTS)
     (tmp_path / "s~0001-board~5.pgm").write_bytes(b"short")
-    assert [m.key.capture_id for m in Spool(tmp_path).manifests()] == ["0002-board"]
-    assert (tmp_path / "s~0001-board~5.damaged").exists()
+    contents = claimed(tmp_path).contents()
+    assert [m.key.capture_id for m in contents.waiting] == ["0002-board"]
+    assert "5 bytes instead of 17" in contents.unread["s~0001-board~5.json"]
+    assert (tmp_path / "s~0001-board~5.pgm").exists()
+
+
+@pytest.mark.parametrize("name", ["x.freed", "a~b~c.freed", "x.json", "x.pgm", ".partial-", "x~y~5.freed"])
+def test_a_file_of_somebody_else_does_not_keep_the_node_from_starting(tmp_path, name):
+    Spool(tmp_path).store(manifest_of(), PARTS)
+    (tmp_path / name).write_bytes(b"{")
+    spool = claimed(tmp_path)
+    assert spool.manifests() == [manifest_of()]
+    assert all(isinstance(key, CaptureKey) for key in spool.tombstones())
 
 
 def test_a_missing_image_is_an_error_with_its_name(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -73,6 +74,7 @@ messages = st.one_of(
 )
 
 KEY = CaptureKey("s", "0001-board", 17)
+MANIFEST = Manifest("n", KEY, "board", "0" * 64, bytes=9, width=3, height=3, time_ns=17)
 
 
 @given(messages)
@@ -103,11 +105,11 @@ def damaged(change) -> bytes:
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (lambda d: d.update(schema=2), "schema 2"),
         (lambda d: d.pop("schema"), "schema None"),
+        (lambda d: d.update(schema="2"), "schema '2'"),
+        (lambda d: d.update(schema=2, kind="film"), "'film'.*schema 2.*update"),
         (lambda d: d.update(type="fire"), "'fire'"),
         (lambda d: d.pop("kind"), "'kind' is missing"),
-        (lambda d: d.update(colour="red"), "unknown field 'colour'"),
         (lambda d: d.update(kind="film"), "'film'"),
         (lambda d: d.update(scene=True), "'scene'"),
         (lambda d: d.update(scene=-1), "scene"),
@@ -121,7 +123,52 @@ def test_a_broken_message_is_refused_with_the_field_named(change, told):
         decode(damaged(change))
 
 
-@pytest.mark.parametrize("payload", [b"", b"\xff\xfe", b"[]", b'"x"', b"{"])
+def test_a_message_of_another_release_is_understood_as_far_as_it_goes():
+    newer = damaged(lambda d: (d.update(schema=2, colour="red"), d["key"].update(room=3)))
+    assert decode(newer) == Trigger(KEY, "board")
+    older = damaged(lambda d: (d.pop("settings_hash"), d.pop("scene")))
+    assert decode(older) == Trigger(KEY, "board")
+
+
+@given(st.dictionaries(st.from_regex(r"\Anew_[a-z]{1,5}\Z"), st.integers() | st.text(max_size=5), max_size=3))
+def test_a_manifest_keeps_the_fields_of_another_release_wherever_it_goes(more):
+    document = json.loads(encode(MANIFEST)) | more | {"schema": 3}
+    manifest = decode(json.dumps(document).encode())
+    assert manifest == replace(MANIFEST, unknown=manifest.unknown)
+    listed = json.loads(encode(Inventory("n", (manifest,), delivered=(manifest,))))
+    for sent in (json.loads(encode(manifest)), *listed["manifests"], *listed["delivered"]):
+        assert {name: sent[name] for name in more} == manifest.unknown
+
+
+HOSTILE = [
+    ('{"a":' * 100_000 + "1" + "}" * 100_000, "deep"),
+    ('{"a":' * 300 + "1" + "}" * 300, "nested as deep as json reads"),
+    ('{"a":NaN,"b":-Infinity,"c":1e999,"d":' + "9" * 400 + "}", "no finite number"),
+    ('{"a":"\\ud800","\\udfff":1}', "half characters"),
+    ('{"a":"' + "x" * 100_000 + '"}', "long"),
+]
+
+
+@pytest.mark.parametrize("table", [table for table, _ in HOSTILE], ids=[name for _, name in HOSTILE])
+def test_whatever_is_decoded_can_be_stored_and_sent_on(table):
+    payload = encode(MANIFEST).replace(b'"metadata":{}', b'"metadata":' + table.encode())
+    if table.count("{") > 1000:
+        with pytest.raises(WireError, match="nested"):
+            decode(payload)
+        return
+    manifest = decode(payload)
+    written = json.dumps(manifest.metadata, allow_nan=False, ensure_ascii=False).encode()
+    assert len(written) < 10_000
+    assert decode(encode(manifest)) == manifest
+
+
+def test_what_a_camera_says_never_costs_its_image():
+    odd = Manifest(**{**vars(MANIFEST), "metadata": {"Lux": float("nan"), "Gains": (1, 2), "n": 1 << 999}})
+    metadata = decode(encode(odd)).metadata
+    assert (metadata["Lux"], metadata["Gains"], metadata["n"]) == (None, [1, 2], None)
+
+
+@pytest.mark.parametrize("payload", [b"", b"\xff\xfe", b"[]", b'"x"', b"{", b"[" * 10**6, b"1" * 10**6, b"NaN"])
 def test_what_is_no_message_is_refused(payload):
     with pytest.raises(WireError):
         decode(payload)

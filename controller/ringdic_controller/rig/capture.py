@@ -16,7 +16,7 @@ and turns the camera's status to late; `ringdic_controller.rig.judgement` decide
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from ringdic_node.wire import (
@@ -111,6 +111,14 @@ class NodeBack:
 
 
 @dataclass(frozen=True)
+class NodeDoubled:
+    """Two processes speak as one camera's node, or no longer: `reason` says which; empty if it is one again."""
+
+    camera: str
+    reason: str
+
+
+@dataclass(frozen=True)
 class RoundTick:
     """Time has passed."""
 
@@ -124,6 +132,7 @@ Event = (
     | InventoryAnswered
     | NodeGone
     | NodeBack
+    | NodeDoubled
     | RoundTick
 )
 
@@ -140,10 +149,14 @@ class SendArm:
 
 @dataclass(frozen=True)
 class OpenCapture:
-    """Create the capture's record; CaptureOpened follows. unarmed : by camera, why it takes no part."""
+    """Create the capture's record; CaptureOpened follows.
+
+    unarmed : by camera, why it takes no part. armed : by camera, what it answered when it armed.
+    """
 
     fire_at_ns: int
     unarmed: dict[str, str]
+    armed: dict[str, ArmReply]
 
 
 @dataclass(frozen=True)
@@ -220,8 +233,12 @@ class CaptureRound:
         Present time, ns, on the clock of every later call.
     absent
         Ids of those cameras that are not connected as the round begins.
+    doubled
+        By camera, the sentence about two processes that speak as its node.
     override
         Fire although cameras are not armed; those end as failed with their reason.
+    settings_hash
+        Hash of the settings that the cameras must be locked to; a camera that is locked to others is not armed.
 
     Raises ValueError if there is no camera or one is named twice.
     """
@@ -233,7 +250,9 @@ class CaptureRound:
         now: int,
         *,
         absent: Iterable[str] = (),
+        doubled: Mapping[str, str] | None = None,
         override: bool = False,
+        settings_hash: str | None = None,
     ) -> None:
         self.cameras = tuple(cameras)
         if not self.cameras or len(set(self.cameras)) != len(self.cameras):
@@ -243,6 +262,8 @@ class CaptureRound:
         self.key: CaptureKey | None = None
         self.outcomes = {camera: CameraOutcome() for camera in self.cameras}
         self._override = override
+        self._settings_hash = settings_hash
+        self._doubled = dict(doubled or {})
         self._arm_deadline = now + timing.arm
         self._next_send = now
         self._armed: dict[str, ArmReply] = {}
@@ -289,6 +310,8 @@ class CaptureRound:
                 self._absent_since.setdefault(event.camera, now)
             case NodeBack():
                 self._absent_since.pop(event.camera, None)
+            case NodeDoubled():
+                self._doubled[event.camera] = event.reason
             case RoundTick():
                 pass
         return actions + self._advance(now)
@@ -315,21 +338,24 @@ class CaptureRound:
     def _note_arm(self, reply: ArmReply) -> None:
         if reply.node not in self.outcomes or self.state != "arming":
             return
-        if reply.armed:
+        if reply.armed and self._settings_hash not in (None, reply.settings_hash):
+            self._armed.pop(reply.node, None)
+            self._refusals[reply.node] = f"the camera is locked to other settings ({reply.settings_hash[:8]}…)"
+        elif reply.armed:
             self._armed[reply.node] = reply
             self._refusals.pop(reply.node, None)
         elif reply.node not in self._armed:
             self._refusals[reply.node] = reply.reason
 
     def _advance_arming(self, now: int) -> list[Action]:
-        missing = tuple(camera for camera in self.cameras if camera not in self._armed)
-        # A camera that is not connected cannot arm; one that refused may still do so before the deadline.
-        all_absent = all(self._is_absent(camera, now) for camera in missing)
-        if missing and not all_absent and now < self._arm_deadline:
+        missing = tuple(c for c in self.cameras if c not in self._armed or self._doubled.get(c))
+        # A camera that is not connected, or twice, cannot arm; one that refused may still do so before the deadline.
+        awaited = tuple(c for c in missing if not self._is_absent(c, now) and not self._doubled.get(c))
+        if awaited and now < self._arm_deadline:
             if now < self._next_send:
                 return []
             self._next_send = now + self.timing.arm_retry
-            return [SendArm(missing)]
+            return [SendArm(tuple(camera for camera in missing if not self._doubled.get(camera)))]
         reasons = {camera: self._why_not_armed(camera) for camera in missing}
         if missing and (not self._override or len(missing) == len(self.cameras)):
             self.state = "refused"
@@ -338,9 +364,12 @@ class CaptureRound:
         notes: list[Action] = []
         for camera, reason in reasons.items():
             notes += self._settle(camera, CameraOutcome("failed", reason))
-        return [*notes, OpenCapture(self._moment(now), reasons)]
+        armed = {camera: reply for camera, reply in self._armed.items() if camera not in reasons}
+        return [*notes, OpenCapture(self._moment(now), reasons, armed)]
 
     def _why_not_armed(self, camera: str) -> str:
+        if self._doubled.get(camera):
+            return f"not armed: {self._doubled[camera]}"
         if camera in self._refusals:
             return f"not armed: {self._refusals[camera]}"
         if camera in self._absent_since:
@@ -404,7 +433,7 @@ class CaptureRound:
         key, camera = self.key, inventory.node
         if key is None or camera not in self.outcomes or self.outcomes[camera].status == "ok":
             return []
-        for manifest in inventory.manifests:
+        for manifest in (*inventory.manifests, *inventory.delivered):
             if manifest.key == key:
                 return [FetchImage(manifest)]
         for failure in inventory.failures:

@@ -130,7 +130,7 @@ class Intake:
             sha256,
             len(image),
             record.fire_at_ns if record else None,
-            {camera: entry.sha256 for camera, entry in record.cameras.items()} if record else {},
+            {camera: entry.archived_as(sha256) for camera, entry in record.cameras.items()} if record else {},
         )
         if judgement.verdict == "corrupt":
             log.error("image of %s from %s refused: %s", manifest.key, manifest.node, judgement.reason)
@@ -141,22 +141,28 @@ class Intake:
             return
         new = judgement.verdict == "archive"
         if new:
-            capture.store(manifest.node, description_of(manifest), image, sha256=sha256)
+            stored = capture.store(manifest.node, description_of(manifest), image, sha256=sha256)
+            if stored.verdict == "conflict":
+                log.error("%s: %s", manifest.key, capture.record().cameras[manifest.node].reason)
         self._acknowledge(manifest, "archived")
         self._on_archived(manifest)
         if new:  # last: whoever watches must not keep the node waiting
             self._on_event(capture_event(capture.record()))
 
-    def wants(self, manifest: Manifest) -> bool:
-        """Whether an image that a node holds should be pulled; acknowledges it if it is archived already."""
+    def wants(self, manifest: Manifest, *, delivered: bool = False) -> bool:
+        """Whether an image that a node holds should be pulled; acknowledges it if it is archived already.
+
+        delivered : whether the node has had an acknowledgement, which may have come from somebody else.
+        """
         capture = self._archive.capture(manifest.key.session, manifest.key.capture_id)
         if capture is None:
             return False
         record = capture.record()
         if record.fire_at_ns != manifest.key.fire_at_ns or manifest.node not in record.cameras:
             return False
-        if record.cameras[manifest.node].sha256 == manifest.sha256:
-            self._acknowledge(manifest, "archived")  # the first acknowledgement was lost
+        if record.cameras[manifest.node].archived_as(manifest.sha256) == manifest.sha256:
+            if not delivered:
+                self._acknowledge(manifest, "archived")  # the first acknowledgement was lost
             return False
         # While a capture is open, its round pulls the images; a second transfer would compete with that.
         return record.state == "closed"
@@ -185,6 +191,7 @@ def description_of(manifest: Manifest) -> ImageDescription:
         manifest.exposure_us,
         manifest.metadata,
         manifest.format,
+        manifest.settings_hash or None,
     )
 
 

@@ -12,15 +12,14 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
 from types import TracebackType
 from typing import Any
 
 import zenoh
 from ringdic.errors import ComputationError, InputError
 from ringdic.session.records import CaptureRecord
-from ringdic.session.writer import Archive, SessionWriter
+from ringdic.session.writer import Archive, CaptureWriter, SessionWriter
 from ringdic_node.wire import (
     NETWORK,
     Ack,
@@ -43,7 +42,10 @@ from ringdic_node.wire import (
 from ringdic_controller.rig import capture as steps
 from ringdic_controller.rig.capture import Timing
 from ringdic_controller.rig.intake import Intake
+from ringdic_controller.rig.presence import NodePresence
 from ringdic_controller.rig.rounds import run_round
+from ringdic_controller.rig.unclosed import UnclosedCaptures
+from ringdic_controller.rig.visits import NodeVisits
 
 log = logging.getLogger(__name__)
 
@@ -53,23 +55,6 @@ FETCH_TIMEOUT = 30.0
 
 class RigBusyError(ComputationError):
     """A capture is under way already."""
-
-
-@dataclass
-class _Node:
-    """Present state of one camera's node."""
-
-    alive: bool = False
-    status: NodeStatus | None = None
-    seen_ns: int = 0
-    offset_ms: float | None = None
-    quickest_ns: int = 0
-
-    def note_offset(self, round_trip_ns: int, offset_ns: int) -> None:
-        """Take over the node's clock offset, ns, if its round trip, ns, was quick: half of that bounds the error."""
-        if self.offset_ms is None or round_trip_ns <= 1.5 * self.quickest_ns:
-            self.offset_ms = offset_ns / 1e6
-            self.quickest_ns = min(round_trip_ns, self.quickest_ns or round_trip_ns)
 
 
 class RigLink:
@@ -115,15 +100,14 @@ class RigLink:
         self._on_event = on_event
         self._timing = timing or Timing()
         self._tolerance_ns = tolerance_ns
-        self._reconcile_s = reconcile_s
         self._lock = threading.Lock()  # guards the two below
-        self._nodes = {camera: _Node() for camera in self.cameras}
+        self._nodes = {camera: NodePresence() for camera in self.cameras}
         self._round_events: queue.Queue[steps.Event] | None = None  # of the capture that is under way
         self._intake = Intake(
             archive, self._acknowledge, lambda manifest: self._pass_to_round(steps.ImageArchived(manifest)), on_event
         )
-        self._visits: queue.Queue[str | None] = queue.Queue()
-        self._stop = threading.Event()
+        self._unclosed = UnclosedCaptures(on_event)
+        self._visits = NodeVisits(self._visit, self._alive, self._unclosed.close, reconcile_s)
 
     def __enter__(self) -> RigLink:
         for name in self._archive.close_unfinished("the controller was restarted before the image arrived"):
@@ -141,19 +125,21 @@ class RigLink:
             self._session.declare_subscriber(keys.image("*"), self._receive_image),
             self._session.declare_subscriber(keys.node("*", "status"), self._receive_status),
             self._session.liveliness().declare_subscriber(keys.alive("*"), self._receive_alive, history=True),
+            self._session.liveliness().declare_subscriber(
+                keys.instance("*", "*"), self._receive_instance, history=True
+            ),
         ]
-        self._reconciler = threading.Thread(target=self._reconcile, name="reconciler", daemon=True)
         self._intake.start()
-        self._reconciler.start()
+        self._visits.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._stop.set()
-        self._visits.put(None)
+        self._visits.end()
         self._intake.stop(timeout=INVENTORY_TIMEOUT)
-        self._reconciler.join(timeout=INVENTORY_TIMEOUT)
+        self._visits.join(timeout=INVENTORY_TIMEOUT)
+        self._unclosed.close()
         self._session.close()
 
     # The roster
@@ -161,23 +147,11 @@ class RigLink:
     def roster(self) -> list[dict[str, Any]]:
         """One dictionary for each expected camera, in ring order, with the present state of its node."""
         with self._lock:
-            return [self._entry(camera, node) for camera, node in self._nodes.items()]
+            return [node.entry(camera) for camera, node in self._nodes.items()]
 
-    @staticmethod
-    def _entry(camera: str, node: _Node) -> dict[str, Any]:
-        status = node.status
-        own = status.clock_offset_ms if status else None
-        return {
-            "id": camera,
-            "alive": node.alive,
-            "state": (status.state if status else "starting") if node.alive else "absent",
-            "armed": bool(node.alive and status and status.armed),
-            "spool_free": status.spool_free if status else None,
-            "spool_images": status.spool_images if status else None,
-            "versions": status.versions if status else {},
-            "clock_offset_ms": own if own is not None else node.offset_ms,
-            "last_seen": node.seen_ns / 1e9 if node.seen_ns else None,
-        }
+    def _alive(self) -> list[str]:
+        with self._lock:
+            return [camera for camera, node in self._nodes.items() if node.alive]
 
     def wait_for_nodes(self, timeout: float) -> list[str]:
         """Wait until every expected node is alive, at most ``timeout`` seconds; ids of those that are not."""
@@ -199,18 +173,42 @@ class RigLink:
     def _receive_alive(self, sample: zenoh.Sample) -> None:
         camera = str(sample.key_expr).rsplit("/", 1)[1]
         alive = sample.kind == zenoh.SampleKind.PUT
+        self._note_presence(camera, lambda node: setattr(node, "token", alive))
+
+    def _receive_instance(self, sample: zenoh.Sample) -> None:
+        camera, instance = str(sample.key_expr).split("/")[-2:]
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._note_presence(camera, lambda node: node.processes.appeared(instance, time.monotonic_ns()))
+            self._visits.ask_for(camera)  # whoever else speaks as this node is heard then
+        else:
+            self._note_presence(camera, lambda node: node.processes.gone(instance))
+
+    def _note_presence(self, camera: str, change: Callable[[NodePresence], None]) -> None:
+        """Change what is known of a node's presence, and report what follows from it."""
         with self._lock:
             node = self._nodes.get(camera)
             if node is None:
                 return
-            node.alive = alive
-            node.seen_ns = time.time_ns()
-            entry = self._entry(camera, node)
-        log.info("node %s %s", camera, "appeared" if alive else "disappeared")
-        self._pass_to_round(steps.NodeBack(camera) if alive else steps.NodeGone(camera))
-        if alive:
-            self._visits.put(camera)
-        self._on_event({"type": "node", "node": entry})
+            before, contradiction = node.alive, node.processes.contradiction(camera)
+            change(node)
+            alive, contradicts = node.alive, node.processes.contradiction(camera)
+            if alive != before:
+                node.seen_ns = time.time_ns()
+            entry = node.entry(camera)
+        if alive != before:
+            log.info("node %s %s", camera, "appeared" if alive else "disappeared")
+            self._pass_to_round(steps.NodeBack(camera) if alive else steps.NodeGone(camera))
+            if alive:
+                self._visits.ask_for(camera)
+        if contradicts != contradiction:
+            log.error("node %s: %s", camera, contradicts or "there is one of this id again")
+            self._pass_to_round(steps.NodeDoubled(camera, contradicts))
+        if (alive, contradicts) != (before, contradiction):
+            self._on_event({"type": "node", "node": entry})
+
+    def _note_heard(self, message: NodeStatus | ArmReply) -> None:
+        instance, host, address, now = message.instance, message.host, message.address, time.monotonic_ns()
+        self._note_presence(message.node, lambda node: node.processes.heard(instance, host, address, now))
 
     def _receive_status(self, sample: zenoh.Sample) -> None:
         try:
@@ -218,20 +216,23 @@ class RigLink:
         except WireError as error:
             log.warning("a status on %s breaks the contract: %s", sample.key_expr, error)
             return
+        if not isinstance(message, Failure | NodeStatus) or not _speaks_for_itself(message, sample, -2):
+            return
         if isinstance(message, Failure):
             self._pass_to_round(steps.FailureReported(message))
-        elif isinstance(message, NodeStatus):
+        else:
             self._note_status(message)
 
     def _note_status(self, status: NodeStatus) -> None:
+        self._note_heard(status)
         with self._lock:
             node = self._nodes.get(status.node)
             if node is None:
                 return
-            before = self._entry(status.node, node)
+            before = node.entry(status.node)
             node.status, node.seen_ns = status, time.time_ns()
-            entry = self._entry(status.node, node)
-        shown = ("alive", "state", "armed", "spool_images")
+            entry = node.entry(status.node)
+        shown = ("alive", "state", "armed", "spool_images", "detail")
         if any(before[name] != entry[name] for name in shown):
             self._on_event({"type": "node", "node": entry})
 
@@ -242,6 +243,8 @@ class RigLink:
             manifest = decode_as(Manifest, sample.attachment.to_bytes() if sample.attachment else b"")
         except WireError as error:
             log.warning("an image on %s has no usable manifest: %s", sample.key_expr, error)
+            return
+        if not _speaks_for_itself(manifest, sample, -1):
             return
         if self._intake.has_room(len(sample.payload)) and not self._intake.holds(manifest):
             self._intake.put(manifest, sample.payload.to_bytes())
@@ -260,30 +263,12 @@ class RigLink:
 
     # Reconciliation
 
-    def _reconcile(self) -> None:
-        due = time.monotonic() + self._reconcile_s
-        while not self._stop.is_set():
-            try:
-                camera = self._visits.get(timeout=max(due - time.monotonic(), 0.0))
-            except queue.Empty:
-                due = time.monotonic() + self._reconcile_s
-                with self._lock:
-                    alive = [name for name, node in self._nodes.items() if node.alive]
-                for name in alive:
-                    if self._stop.is_set():
-                        return
-                    self._visit(name)
-            else:
-                if camera is None:
-                    return
-                self._visit(camera)
-
     def _visit(self, camera: str) -> None:
         """Reconcile one node; an error with it is logged, so that the others have their turn."""
         try:
             self._reconcile_node(camera)
         except (OSError, ValueError, zenoh.ZError) as error:
-            if not self._stop.is_set():
+            if not self._visits.stopped:
                 log.error("node %s could not be reconciled: %s", camera, error)
 
     def _reconcile_node(self, camera: str) -> None:
@@ -299,6 +284,15 @@ class RigLink:
                 self._intake.note_failure(failure)
             for manifest in inventory.manifests:
                 if self._intake.wants(manifest):
+                    self.fetch(manifest)
+            for manifest in inventory.delivered:
+                if self._intake.wants(manifest, delivered=True):
+                    log.error(
+                        "node %s was told that %s is archived, which it is not: somebody else acknowledges images on "
+                        "this network, or the archive has lost it; it is fetched from the node",
+                        camera,
+                        manifest.key,
+                    )
                     self.fetch(manifest)
 
     def fetch(self, manifest: Manifest) -> None:
@@ -369,6 +363,7 @@ class RigLink:
                 raise RigBusyError("a capture is under way; wait until it has closed")
             self._round_events = events
             absent = [camera for camera, node in self._nodes.items() if not node.alive]
+            doubled = {camera: node.processes.contradiction(camera) for camera, node in self._nodes.items()}
         try:
             return run_round(
                 self,
@@ -377,6 +372,7 @@ class RigLink:
                 kind,
                 cameras=self.cameras,
                 absent=absent,
+                doubled=doubled,
                 timing=self._timing,
                 tolerance_ns=self._tolerance_ns,
                 override=override,
@@ -386,6 +382,10 @@ class RigLink:
         finally:
             with self._lock:
                 self._round_events = None
+
+    def close_later(self, writer: CaptureWriter, reasons: Mapping[str, str]) -> None:
+        """Close a capture's record, which the disk did not take, at the next reconciliation, or the one after it."""
+        self._unclosed.add(writer, reasons)
 
     def _pass_to_round(self, event: steps.Event) -> None:
         """Hand an event to the capture that is under way, if there is one."""
@@ -410,6 +410,8 @@ class RigLink:
         def receive(reply: zenoh.Reply) -> None:
             message = _decoded(reply, answer)
             if message is not None and message.node == camera:
+                if isinstance(message, ArmReply):
+                    self._note_heard(message)
                 on_answer(message)
 
         urgent = isinstance(question, Trigger)
@@ -426,6 +428,14 @@ class RigLink:
 
 
 _ANSWERS: dict[type[Any], tuple[str, type[Any]]] = {Arm: ("arm", ArmReply), Trigger: ("trigger", TriggerReply)}
+
+
+def _speaks_for_itself(message: Failure | NodeStatus | Manifest, sample: zenoh.Sample, place: int) -> bool:
+    """Whether the node in a message is the one in its key, at `place` of its parts; a line in the log if not."""
+    if str(sample.key_expr).split("/")[place] == message.node:
+        return True
+    log.error("a message on %s speaks for node %s and is ignored", sample.key_expr, message.node)
+    return False
 
 
 def _decoded(reply: zenoh.Reply, answer: type[Any]) -> Any | None:

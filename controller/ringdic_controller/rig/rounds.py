@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
+import dataclasses
+import logging
 import queue
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 from ringdic.errors import ComputationError
 from ringdic.session.records import CaptureRecord
 from ringdic.session.writer import CaptureWriter, SessionWriter
-from ringdic_node.wire import Arm, CaptureKey, Manifest, Trigger
+from ringdic_node.wire import Arm, ArmReply, CaptureKey, Manifest, Trigger, hash_of_settings
 
 from ringdic_controller.rig import capture as steps
 from ringdic_controller.rig.capture import SECOND, CaptureRound, Timing
+
+log = logging.getLogger(__name__)
 
 TRIGGER_ANSWER_TIMEOUT = 5.0
 INVENTORY_TIMEOUT = 5.0
@@ -45,6 +47,9 @@ class NodeQueries(Protocol):
     def fetch(self, manifest: Manifest) -> None:
         """Pull an image that a node holds into the intake; returns at once."""
 
+    def close_later(self, writer: CaptureWriter, reasons: Mapping[str, str]) -> None:
+        """Close a capture's record, which the disk did not take, as soon as it does; returns at once."""
+
 
 def run_round(
     nodes: NodeQueries,
@@ -54,6 +59,7 @@ def run_round(
     *,
     cameras: Sequence[str],
     absent: Sequence[str],
+    doubled: Mapping[str, str],
     timing: Timing,
     tolerance_ns: int,
     override: bool,
@@ -73,6 +79,8 @@ def run_round(
         Writer of the session, and kind of the capture.
     cameras, absent
         Ids of the expected cameras, and of those whose node is not connected.
+    doubled
+        By camera, the sentence about two processes that speak as its node.
     timing, tolerance_ns
         Waits of the round; largest skew that is not flagged, ns.
     override
@@ -86,7 +94,10 @@ def run_round(
 
     Raises CaptureRefusedError if cameras are not armed and ``override`` is not given, or none is armed.
     """
-    machine = CaptureRound(cameras, timing, wall_ns(), absent=absent, override=override)
+    wanted = hash_of_settings(settings)
+    machine = CaptureRound(
+        cameras, timing, wall_ns(), absent=absent, doubled=doubled, override=override, settings_hash=wanted
+    )
     performer = _Performer(nodes, events, session, kind, tuple(cameras), timing, tolerance_ns, settings, on_event)
     performer.report_without_record("arming")
     event: steps.Event = steps.RoundTick()
@@ -127,8 +138,7 @@ class _Performer:
         self._on_event = on_event
         self._scene = session.count(kind)
         self._writer: CaptureWriter | None = None
-        canonical = json.dumps(settings, sort_keys=True, separators=(",", ":")).encode()
-        self._arm = Arm(session.name, kind, settings, hashlib.sha256(canonical).hexdigest(), cameras)
+        self._arm = Arm(session.name, kind, settings, hash_of_settings(settings), cameras)
 
     def record(self) -> CaptureRecord:
         """The capture's record as it stands."""
@@ -143,7 +153,7 @@ class _Performer:
             case steps.OpenCapture():
                 self._open(action)
             case steps.SendTrigger():
-                trigger = Trigger(action.key, self._kind, self._scene)
+                trigger = Trigger(action.key, self._kind, self._scene, self._arm.settings_hash)
                 self._ask(action.cameras, trigger, steps.TriggerAnswered, TRIGGER_ANSWER_TIMEOUT)
             case steps.AskInventory():
                 self._ask(action.cameras, None, steps.InventoryAnswered, INVENTORY_TIMEOUT)
@@ -156,8 +166,7 @@ class _Performer:
                 raise CaptureRefusedError(action.reasons)
             case steps.CloseCapture():
                 assert self._writer is not None
-                reasons = {camera: outcome.reason or "" for camera, outcome in action.outcomes.items()}
-                self._on_event(capture_event(self._writer.close(reasons)))
+                self._close({camera: outcome.reason or "" for camera, outcome in action.outcomes.items()})
 
     def _ask(
         self,
@@ -171,24 +180,54 @@ class _Performer:
             self._nodes.ask(camera, question, lambda answer: self._events.put(event(answer)), timeout)
 
     def _open(self, action: steps.OpenCapture) -> None:
-        self._writer = self._session.begin_capture(
-            self._kind,
-            self._cameras,
-            fire_at_ns=action.fire_at_ns,
-            tolerance_ns=self._tolerance_ns,
-            override=bool(action.unarmed),
-        )
+        try:
+            self._writer = self._session.begin_capture(
+                self._kind,
+                self._cameras,
+                fire_at_ns=action.fire_at_ns,
+                tolerance_ns=self._tolerance_ns,
+                override=bool(action.unarmed),
+                settings=self._arm.settings,
+                settings_hash=self._arm.settings_hash,
+                armed={camera: armed_state(reply) for camera, reply in action.armed.items()},
+            )
+        except OSError as error:
+            raise ComputationError(
+                f"not captured, because the archive takes no record ({error.strerror or error}); "
+                "make room on its disk, or make it writable"
+            ) from error
         self._events.put(
             steps.CaptureOpened(CaptureKey(self._session.name, self._writer.capture_id, action.fire_at_ns))
         )
         for camera, reason in action.unarmed.items():
-            self._writer.fail(camera, reason)
+            self._fail(camera, reason)
         self._on_event(capture_event(self._writer.record()))
+
+    def _fail(self, camera: str, reason: str) -> None:
+        assert self._writer is not None
+        try:
+            self._writer.fail(camera, reason)
+        except OSError as error:  # a full disk; the close writes all reasons once more
+            log.warning("capture %s: the failure of %s is not written: %s", self._writer.capture_id, camera, error)
+
+    def _close(self, reasons: dict[str, str]) -> None:
+        """Close the record; where the archive's disk takes nothing, later, as soon as there is room."""
+        assert self._writer is not None
+        writer = self._writer
+        try:
+            record = writer.close(reasons)
+        except OSError as error:
+            self._nodes.close_later(writer, reasons)
+            raise ComputationError(
+                f"the record of capture {writer.capture_id} could not be closed ({error.strerror or error}): make room "
+                "on the archive's disk; it is closed then, and the images are fetched from their nodes"
+            ) from error
+        self._on_event(capture_event(record))
 
     def _note(self, action: steps.NoteOutcome) -> None:
         if self._writer is None or action.outcome.status != "failed":
             return  # the intake reports an image's arrival
-        self._writer.fail(action.camera, action.outcome.reason or "")
+        self._fail(action.camera, action.outcome.reason or "")
         self._on_event(capture_event(self._writer.record()))
 
     def report_without_record(self, state: str, reasons: dict[str, str] | None = None) -> None:
@@ -211,6 +250,15 @@ class _Performer:
                 },
             }
         )
+
+
+def armed_state(reply: ArmReply) -> dict[str, Any]:
+    """What a node answered when it armed, as the capture's record keeps it: all fields but those that only say so."""
+    return {
+        name: value
+        for name, value in dataclasses.asdict(reply).items()
+        if name not in ("node", "armed", "reason") and value not in (None, "")
+    }
 
 
 def capture_event(record: CaptureRecord) -> dict[str, Any]:

@@ -37,12 +37,14 @@ class Lock:
 
     metadata : of its frames. sync : state of the sensors' synchronisation. frame_time_ns, frame_period_ns : time of one
     frame, and the period, ns, of a sensor that takes frames continuously; None for a camera that exposes on demand.
+    image_bytes : size of an image, without its header; None where only the images tell.
     """
 
     metadata: dict[str, Any] = field(default_factory=dict)
     sync: str = "none"
     frame_time_ns: int | None = None
     frame_period_ns: int | None = None
+    image_bytes: int | None = None
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ class PatternCamera:
         """Check the settings and note the exposure; the pattern does not depend on them."""
         check_settings(settings)
         self._exposure_us = float(settings.get("exposure_us", self._exposure_us))
-        return Lock(metadata=dict(settings), sync="simulated")
+        return Lock(metadata=dict(settings), sync="simulated", image_bytes=self._size[0] * self._size[1])
 
     def capture(self, shot: Shot) -> Frame:
         """The pattern of this capture, at the moment of the shot."""

@@ -162,7 +162,8 @@ class PiCamera:
             metadata = self._hold()
         sync = self._sync if self._sync != "client" else "client, locked"
         period_ns = round(1000 * float(metadata.get("FrameDuration", self._period_us)))
-        return Lock(recorded(metadata), sync, frame_time(metadata, self._clock), period_ns)
+        image_bytes = self._size[0] * self._size[1] * (2 if self._raw else 1)
+        return Lock(recorded(metadata), sync, frame_time(metadata, self._clock), period_ns, image_bytes)
 
     def _start(self) -> None:
         try:

@@ -34,7 +34,8 @@ class PlaybackCamera:
     def lock(self, settings: Mapping[str, Any]) -> Lock:
         """Check the settings; they do not change the images."""
         check_settings(settings)
-        return Lock(metadata=dict(settings), sync="simulated")
+        size = None if self._pixels is None else self._pixels.nbytes
+        return Lock(metadata=dict(settings), sync="simulated", image_bytes=size)
 
     def capture(self, shot: Shot) -> Frame:
         """The image for this shot, returned at its moment. Raises CameraError if its file cannot be read."""

@@ -71,7 +71,11 @@ class VirtualNodeCamera:
         """Check the settings and note the exposure; the rendered brightness does not depend on them."""
         check_settings(settings)
         self._exposure_us = float(settings.get("exposure_us", self._exposure_us))
-        return Lock(metadata={"ExposureTime": self._exposure_us, **settings}, sync="simulated")
+        return Lock(
+            metadata={"ExposureTime": self._exposure_us, **settings},
+            sync="simulated",
+            image_bytes=self._lens.width * self._lens.height,
+        )
 
     def capture(self, shot: Shot) -> Frame:
         """Render the scene of this shot. Raises CameraError if it cannot be rendered."""

@@ -73,16 +73,24 @@ def copy_file(source: Path, path: Path) -> None:
 def replace_json(path: Path, document: dict[str, Any]) -> None:
     """Replace a JSON file atomically: a reader sees either the old file or the new one."""
     aside = _write_aside(path, json.dumps(document, indent=1).encode() + b"\n")
-    os.replace(aside, path)
+    try:
+        os.replace(aside, path)
+    except OSError:
+        aside.unlink(missing_ok=True)
+        raise
     _flush_folder(path.parent)
 
 
 def _write_aside(path: Path, content: bytes) -> Path:
     aside = path.with_name(f"{PARTIAL}{path.name}-{os.getpid()}-{threading.get_ident()}")
-    with open(aside, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
+    try:
+        with open(aside, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError:  # a full disk, mostly
+        aside.unlink(missing_ok=True)
+        raise
     return aside
 
 

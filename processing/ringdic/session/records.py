@@ -21,6 +21,7 @@ _STATUSES = ("pending", "ok", "late", "failed")
 #: What to do about a damaged session.
 REMEDY = "copy it back, or import the session again"
 _UNKNOWN = "unknown"
+_OMITTED = ("settings", "settings_hash", "armed", "conflicts")  # are left out of the file where there is nothing to say
 
 R = TypeVar("R", bound="_Record")
 
@@ -61,7 +62,8 @@ class _Record:
 
     def _fields(self) -> dict[str, Any]:
         names = [each.name for each in fields(self) if each.name != _UNKNOWN]
-        return {**{name: getattr(self, name) for name in names}, **self.unknown}
+        values = {name: getattr(self, name) for name in names}
+        return {**{name: value for name, value in values.items() if value or name not in _OMITTED}, **self.unknown}
 
 
 _TYPES: dict[str, tuple[str, tuple[type, ...]]] = {
@@ -109,7 +111,8 @@ class ImageDescription:
     """Description of an image that comes from a camera: checksum, size, time of exposure, metadata.
 
     sha256 : hexadecimal digits. width, height : px. time_ns : measured time of the exposure. exposure_us : µs.
-    metadata : JSON values from the camera. format : extension of the file, without the dot.
+    metadata : JSON values from the camera. format : extension of the file, without the dot. settings_hash : of the
+    settings that the camera was locked to.
     """
 
     sha256: str
@@ -119,6 +122,7 @@ class ImageDescription:
     exposure_us: float | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
     format: str = "pgm"
+    settings_hash: str | None = None
 
 
 @dataclass(frozen=True)
@@ -126,9 +130,11 @@ class CameraRecord(_Record):
     """One camera's entry in the record of a capture.
 
     status : "pending" while the image is awaited, "ok", "late" where it came after the close, "failed".
-    reason : why it is late or failed. file : name of the image in the capture's folder. sha256, bytes : of that file.
-    width, height : px. time_ns : measured time of the exposure. exposure_us : µs. metadata : JSON values from
-    the camera. original : the file that was imported.
+    reason : why it is late or failed, or what speaks against the image. file : name of the image in the capture's
+    folder. sha256, bytes : of that file. width, height : px. time_ns : measured time of the exposure. exposure_us : µs.
+    metadata : JSON values from the camera. original : the file that was imported. settings_hash : of the settings that
+    the camera was locked to. armed : what the camera's node answered when it armed. conflicts : checksums of other
+    images that came for this camera, by the names of their files.
     """
 
     status: str = "pending"
@@ -142,6 +148,9 @@ class CameraRecord(_Record):
     exposure_us: float | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
     original: str | None = None
+    settings_hash: str | None = None
+    armed: Mapping[str, Any] = field(default_factory=dict)
+    conflicts: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -154,6 +163,13 @@ class CameraRecord(_Record):
     def lacks_image(self) -> bool:
         """Whether no image of this camera has been archived."""
         return self.status in ("pending", "failed")
+
+    def archived_as(self, sha256: str) -> str | None:
+        """`sha256` if an image with this checksum is archived, as the camera's or beside it; else that of the camera's.
+
+        None where there is none.
+        """
+        return sha256 if sha256 in self.conflicts.values() else self.sha256
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> CameraRecord:
@@ -173,7 +189,7 @@ class CaptureRecord(_Record):
     opened_at, closed_at : ISO 8601. fire_at_ns : planned moment of the exposure. skew_ns : spread of the cameras'
     measured times, None where fewer than two measured one. tolerance_ns : skew that is not flagged. skew_exceeded :
     whether it is larger. override : captured although cameras were missing. cameras : an entry for each camera that
-    an image is expected of.
+    an image is expected of. settings, settings_hash : camera settings that were asked for, and their hash.
     """
 
     capture_id: str
@@ -189,6 +205,8 @@ class CaptureRecord(_Record):
     skew_exceeded: bool | None = None
     override: bool = False
     cameras: Mapping[str, CameraRecord] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    settings_hash: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -222,6 +240,42 @@ class CaptureRecord(_Record):
         changed = replace(self, cameras={**self.cameras, camera: entry})
         return changed._with_skew() if self.state == "closed" else changed
 
+    def with_image(self, camera: str, image: CameraRecord) -> CaptureRecord:
+        """The record with a camera's image, which is late after the close; what the camera was armed to is kept.
+
+        image : entry with all that is known of the image. Its reason says if the camera held other settings than those
+        that were asked for.
+        """
+        before, late = self.cameras[camera], self.state == "closed"
+        reasons = [f"the image arrived after the close at {self.closed_at}"] if late else []
+        if image.settings_hash and self.settings_hash and image.settings_hash != self.settings_hash:
+            exposure = "" if image.exposure_us is None else f", exposure {image.exposure_us:g} µs"
+            reasons.append(
+                f"taken with other settings ({image.settings_hash[:8]}…{exposure}) than the capture's "
+                f"({self.settings_hash[:8]}…), because somebody armed the camera in between; capture again"
+            )
+        if before.conflicts:
+            reasons.append(_conflict_sentence(before.conflicts))
+        entry = replace(
+            image,
+            status="late" if late else "ok",
+            reason="; ".join(reasons) or None,
+            armed=before.armed,
+            conflicts=before.conflicts,
+            unknown=before.unknown,
+        )
+        return self.with_entry(camera, entry)
+
+    def with_conflict(self, camera: str, file: str, sha256: str) -> CaptureRecord:
+        """The record with another image of a camera that has one: both are named, the first stays the camera's."""
+        entry = self.cameras[camera]
+        if sha256 in (entry.sha256, *entry.conflicts.values()):
+            return self
+        conflicts = {**entry.conflicts, file: sha256}
+        other = (entry.reason or "").removesuffix(_conflict_sentence(entry.conflicts)).removesuffix("; ")
+        reason = "; ".join(part for part in (other, _conflict_sentence(conflicts)) if part)
+        return self.with_entry(camera, replace(entry, conflicts=conflicts, reason=reason))
+
     def with_failure(self, camera: str, reason: str) -> CaptureRecord:
         """The record with the reason why a camera has no image; unchanged where its image is archived."""
         entry = self.cameras[camera]
@@ -252,6 +306,11 @@ class CaptureRecord(_Record):
         skew = max(times) - min(times)
         exceeded = None if self.tolerance_ns is None else skew > self.tolerance_ns
         return replace(self, skew_ns=skew, skew_exceeded=exceeded)
+
+
+def _conflict_sentence(conflicts: Mapping[str, Any]) -> str:
+    files = ", ".join(conflicts)
+    return f"a different image of this camera came as well and is kept as {files}; look at both" if files else ""
 
 
 def read_session_record(path: Path) -> SessionRecord:

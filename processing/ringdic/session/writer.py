@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import shutil
 import threading
 import time
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -101,11 +102,14 @@ class Archive:
             for left in path.parent.glob(f"{PARTIAL}*"):
                 left.unlink(missing_ok=True)
             capture = CaptureWriter(path.parent, self._wall_ns, self._lock)
-            record = capture.record()
-            if record.state == "open":
-                pending = [camera for camera, entry in record.cameras.items() if entry.status == "pending"]
-                capture.close(dict.fromkeys(pending, reason))
-                closed.append(f"{record.session}/{record.capture_id}")
+            try:
+                record = capture.record()
+                if record.state == "open":
+                    pending = [camera for camera, entry in record.cameras.items() if entry.status == "pending"]
+                    capture.close(dict.fromkeys(pending, reason))
+                    closed.append(f"{record.session}/{record.capture_id}")
+            except (SessionError, OSError) as error:  # damaged, or the disk is full: the other captures go on
+                log.error("%s is left as it is: %s", path, error)
         return closed
 
 
@@ -156,9 +160,13 @@ class SessionWriter:
             raise SessionError(f"the rig file of session '{name}' has no readable [rig] name: {error}") from error
         record = SessionRecord(name, str(rig_name), _iso(wall_ns()), source)
         path.mkdir(parents=True)
-        (path / "captures").mkdir()
-        place(path / "rig.toml", rig_toml.encode())
-        replace_json(path / "session.json", record.to_json())
+        try:
+            (path / "captures").mkdir()
+            place(path / "rig.toml", rig_toml.encode())
+            replace_json(path / "session.json", record.to_json())
+        except OSError:  # a full disk: the name must not stay taken by half a session
+            shutil.rmtree(path, ignore_errors=True)
+            raise
         return cls(path, wall_ns, lock)
 
     def captures(self) -> list[CaptureRecord]:
@@ -186,6 +194,9 @@ class SessionWriter:
         fire_at_ns: int | None = None,
         tolerance_ns: int | None = None,
         override: bool = False,
+        settings: Mapping[str, Any] | None = None,
+        settings_hash: str | None = None,
+        armed: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> CaptureWriter:
         """Begin a capture: a folder with an open record in which every camera is pending.
 
@@ -196,6 +207,8 @@ class SessionWriter:
         fire_at_ns : planned moment of the exposure, ns since the Unix epoch.
         tolerance_ns : skew between the cameras that is not flagged, ns.
         override : whether it is captured although cameras are missing.
+        settings, settings_hash : camera settings that were asked for, and their hash.
+        armed : by camera, what its node answered when it armed.
         """
         if kind not in CAPTURE_KINDS:
             raise InputError(f"the capture kind '{kind}' is none of {', '.join(CAPTURE_KINDS)}")
@@ -212,11 +225,17 @@ class SessionWriter:
                 fire_at_ns=fire_at_ns,
                 tolerance_ns=tolerance_ns,
                 override=override,
-                cameras={camera: CameraRecord() for camera in expected},
+                cameras={camera: CameraRecord(armed=(armed or {}).get(camera, {})) for camera in expected},
+                settings=settings or {},
+                settings_hash=settings_hash,
             )
             path = self.path / "captures" / record.capture_id
             path.mkdir()
-            replace_json(path / "capture.json", record.to_json())
+            try:
+                replace_json(path / "capture.json", record.to_json())
+            except OSError:  # a full disk: a folder without a record would be no capture
+                path.rmdir()
+                raise
         return CaptureWriter(path, self._wall_ns, self._lock)
 
 
@@ -285,6 +304,7 @@ class CaptureWriter:
             time_ns=description.time_ns,
             exposure_us=description.exposure_us,
             metadata=description.metadata,
+            settings_hash=description.settings_hash,
         )
         return self._store(camera, entry, image)
 
@@ -333,10 +353,7 @@ class CaptureWriter:
             before = record.cameras[camera]
             if before.sha256 == entry.sha256:
                 return ArchivedImage("repeat", path.name)
-            late = record.state == "closed"
-            reason = f"the image arrived after the close at {record.closed_at}" if late else None
-            entry = replace(entry, status="late" if late else "ok", reason=reason, unknown=before.unknown)
-            self._replace(record.with_entry(camera, entry))
+            self._replace(record.with_image(camera, entry))
         return ArchivedImage(verdict, path.name)
 
     def _keep_aside(self, camera: str, path: Path, image: bytes) -> ArchivedImage:
@@ -353,7 +370,12 @@ class CaptureWriter:
                 number += 1
                 continue
             break
-        log.error("camera %s of %s sent another image; kept as %s", camera, self.capture_id, aside.name)
+        with self._lock:
+            record = self.record()
+            changed = record.with_conflict(camera, aside.name, sha256)
+            if changed is not record:
+                log.error("camera %s of %s sent another image; kept as %s", camera, self.capture_id, aside.name)
+                self._replace(changed)
         return ArchivedImage("conflict", aside.name)
 
     def fail(self, camera: str, reason: str) -> None:

@@ -90,6 +90,44 @@ def test_a_second_image_of_a_camera_is_kept_aside_and_safe(recorded):
     assert (recorded.capture.path / "201.conflict-1.pgm").read_bytes() == b"other"
 
 
+def test_a_second_image_of_a_camera_is_shown_in_record_and_event(recorded):
+    recorded.intake.take(manifest_of(), IMAGE)
+    for _ in range(2):
+        recorded.intake.take(manifest_of(b"other"), b"other")
+    entry = recorded.capture.record().cameras["201"]
+    assert entry.conflicts == {"201.conflict-1.pgm": hashlib.sha256(b"other").hexdigest()}
+    assert "201.conflict-1.pgm" in entry.reason
+    assert recorded.events[-1]["cameras"]["201"] == {"status": "ok", "reason": entry.reason}
+    recorded.intake.take(manifest_of(b"third"), b"third")
+    assert recorded.capture.record().cameras["201"].reason.count("different image") == 1
+    recorded.capture.close()
+    recorded.acks.clear()
+    assert not recorded.intake.wants(manifest_of(b"other")), "it is archived, though under another name"
+    assert recorded.acks == [("201", "archived")]
+
+
+def test_an_image_taken_with_other_settings_is_named_in_the_record(recorded):
+    capture = recorded.session.begin_capture("board", ["201", "202"], fire_at_ns=70, settings_hash="a" * 64)
+    for camera, settings_hash in (("201", "a" * 64), ("202", "b" * 64)):
+        key = CaptureKey("s", capture.capture_id, 70)
+        manifest = replace(
+            manifest_of(camera=camera), key=key, settings_hash=settings_hash, exposure_us=77.0, unknown={"lens": 1}
+        )
+        recorded.intake.take(manifest, IMAGE)
+    one, two = (capture.record().cameras[camera] for camera in ("201", "202"))
+    assert (one.status, one.reason, one.settings_hash) == ("ok", None, "a" * 64)
+    assert "other settings (bbbbbbbb…, exposure 77 µs) than the capture's (aaaaaaaa…)" in two.reason
+
+
+def test_an_image_that_was_acknowledged_but_is_not_archived_is_wanted_again(recorded):
+    recorded.capture.close()
+    assert recorded.intake.wants(manifest_of(), delivered=True)
+    recorded.intake.take(manifest_of(), IMAGE)
+    recorded.acks.clear()
+    assert not recorded.intake.wants(manifest_of(), delivered=True)
+    assert recorded.acks == [], "it was acknowledged before"
+
+
 def test_what_a_node_still_holds_is_wanted_only_if_the_closed_capture_lacks_it(recorded):
     assert not recorded.intake.wants(manifest_of()), "the open round pulls by itself"
     recorded.capture.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from typing import Any
@@ -102,3 +103,46 @@ def test_records_and_their_writer_load_without_the_packages_of_the_processing() 
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert output.strip() == "[]"
+
+
+def test_what_was_armed_and_asked_for_is_written_where_there_is_something_to_say(tmp_path) -> None:
+    session = Archive(tmp_path).create_session("first", '[rig]\nname = "ring"\n[[cameras]]\nid = "201"\n')
+    plain = session.begin_capture("board", ["201"])
+    assert not {"settings", "settings_hash"} & set(json.loads((plain.path / "capture.json").read_text()))
+    armed = {"201": {"settings_hash": "ab", "locked": {"ExposureTime": 4000}, "sync": "client, locked"}}
+    capture = session.begin_capture("board", ["201"], settings={"exposure_us": 4000}, settings_hash="ab", armed=armed)
+    capture.fail("201", "no light")
+    capture.close()
+    document = json.loads((capture.path / "capture.json").read_text())
+    assert document["settings"] == {"exposure_us": 4000}
+    assert document["cameras"]["201"]["armed"] == armed["201"]
+    assert CaptureRecord.from_json(document).to_json() == document
+
+
+def test_a_disk_without_room_leaves_neither_half_a_capture_nor_half_a_session(tmp_path, monkeypatch) -> None:
+    archive = Archive(tmp_path)
+    rig = '[rig]\nname = "ring"\n[[cameras]]\nid = "201"\n'
+    session = archive.create_session("first", rig)
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match="No space"):
+            session.begin_capture("board", ["201"])
+        with pytest.raises(OSError, match="No space"):
+            archive.create_session("second", rig)
+    assert list((session.path / "captures").iterdir()) == []
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["first"]
+    archive.create_session("second", rig)
+    assert session.begin_capture("board", ["201"]).capture_id == "0001-board"
+
+
+def test_a_damaged_record_keeps_no_other_capture_open(tmp_path) -> None:
+    archive = Archive(tmp_path)
+    session = archive.create_session("first", '[rig]\nname = "ring"\n[[cameras]]\nid = "201"\n')
+    damaged, sound = (session.begin_capture("board", ["201"]) for _ in range(2))
+    (damaged.path / "capture.json").write_text("{")
+    assert archive.close_unfinished("restarted") == ["first/0002-board"]
+    assert sound.record().state == "closed"

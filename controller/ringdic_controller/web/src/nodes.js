@@ -26,6 +26,7 @@ function tile(node) {
     `camera ${node.id}`,
     node.azimuth_deg === undefined ? null : `azimuth ${node.azimuth_deg}°`,
     Number.isFinite(node.clock_offset_ms) ? `clock offset ${node.clock_offset_ms.toFixed(2)} ms` : null,
+    node.detail,
     last?.reason,
   ].filter(Boolean);
   return element(
@@ -35,6 +36,7 @@ function tile(node) {
     element("span", { class: "node-state" }, word),
     element("span", { class: `node-last ${last?.status ?? ""}` }, last ? `last: ${last.status}` : "no capture"),
     element("span", { class: "node-spool" }, spool.join(", ") || " "),
+    node.detail ? element("span", { class: "node-spool" }, node.detail) : null,
   );
 }
 
