@@ -158,6 +158,11 @@ class CameraRecord(_Record):
             raise SessionError(f"'status' is one of {', '.join(_STATUSES)}, not {self.status!r}")
         if self.file is not None and not is_file_name(self.file):
             raise SessionError(f"'file' must be a name in the capture's folder, not {self.file!r}")
+        for name, sha256 in self.conflicts.items():
+            if not is_file_name(name) or not isinstance(sha256, str):
+                raise SessionError(
+                    f"'conflicts' must have a checksum by the name of each file, not {name!r}: {sha256!r}"
+                )
 
     @property
     def lacks_image(self) -> bool:

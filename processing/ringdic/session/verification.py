@@ -61,10 +61,8 @@ def verify_session(session: Path) -> Verification:
         except SessionError as error:
             faults[folder / "capture.json"] = str(error)
             continue
-        for camera, entry in record.cameras.items():
-            if entry.file is None:
-                continue
-            image = folder / entry.file
+        for camera, entry in _images(record):
+            image = folder / (entry.file or "")
             fault = _image_fault(image, entry)
             if fault is None:
                 images, size = images + 1, size + image.stat().st_size
@@ -84,6 +82,15 @@ def capture_folders(session: Path) -> tuple[Path, ...]:
     return tuple(sorted(each for each in captures.iterdir() if split_capture_id(each.name) and not each.is_symlink()))
 
 
+def _images(record: CaptureRecord) -> Iterator[tuple[str, CameraRecord]]:
+    """Entries of the images that a record names, by their cameras: the cameras' own, and others that came for them."""
+    for camera, entry in record.cameras.items():
+        if entry.file is not None:
+            yield camera, entry
+        for name, sha256 in entry.conflicts.items():
+            yield camera, CameraRecord(file=name, sha256=sha256)
+
+
 def _image_fault(image: Path, entry: CameraRecord) -> str | None:
     """What is wrong with an image, as the end of a sentence; None where it is as its record says."""
     if image.is_symlink() or not image.is_file():
@@ -97,7 +104,7 @@ def _image_fault(image: Path, entry: CameraRecord) -> str | None:
 
 
 def _strays(folder: Path, record: CaptureRecord) -> Iterator[str]:
-    named = {entry.file for entry in record.cameras.values()} | {"capture.json"}
+    named = {entry.file for _, entry in _images(record)} | {"capture.json"}
     for path in sorted(folder.iterdir()):
         if path.name.startswith(PARTIAL):
             yield f"{path}: left by an interrupted write; the controller removes it"

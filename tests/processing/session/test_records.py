@@ -58,6 +58,8 @@ def test_fields_of_a_later_version_survive_what_the_writer_changes(tmp_path) -> 
     [
         ({"schema": None}, "schema None"),
         ({"number": 1.0}, "'number' must be a whole number, not 1.0"),
+        ({"cameras": {"201": {**ENTRY, "conflicts": {"../x": "ab"}}}}, "'conflicts' must have a checksum"),
+        ({"cameras": {"201": {**ENTRY, "conflicts": {"x": 7}}}}, "'conflicts' must have a checksum"),
         ({"number": 2}, "'capture_id' '0001-board' is not that of number 2"),
         ({"override": 1}, "'override' must be true or false, not 1"),
         ({"state": "ajar"}, "'state' is 'open' or 'closed', not 'ajar'"),

@@ -206,3 +206,14 @@ def test_the_commands_end_with_the_code_that_scripts_read(archive: Path, tmp_pat
     assert code("verify", archive) == code("backup", archive, backup) == 3
     assert code("prune", archive, backup, "--older-than", 0, "--yes") == 0
     assert sorted(path.name for path in archive.iterdir()) == ["first"]
+
+
+def test_a_second_image_that_a_record_names_is_verified_like_the_first(archive: Path) -> None:
+    capture = Archive(archive).open("first").capture("0001-specimen")
+    other = b"another"
+    capture.store("201", ImageDescription(hashlib.sha256(other).hexdigest(), 4, 3, 1), other)
+    verified = verify_session(archive / "first")
+    assert (verified.images, verified.faults, verified.notes) == (5, {}, ())
+    aside = capture.path / "201.conflict-1.pgm"
+    aside.write_bytes(b"anothe!")
+    assert list(verify_session(archive / "first").faults) == [aside]
