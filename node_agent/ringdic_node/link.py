@@ -111,7 +111,7 @@ class NodeLink:
         if query is None:
             return
         try:
-            query.reply_err(reason.encode())
+            query.reply_err(reason.encode("utf-8", "replace"))
         except zenoh.ZError as error:
             log.warning("a refusal on %s could not be sent: %s", query.key_expr, error)
         finally:

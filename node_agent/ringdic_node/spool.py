@@ -195,6 +195,8 @@ class Spool:
             try:
                 manifest = _manifest_at(path)
             except (WireError, OSError) as error:
+                if path.stem in self._delivered:
+                    continue  # it is archived, and leaves when its room is needed
                 unread[path.name] = str(error)
                 log.error("spool: %s stays in %s, but cannot be used: %s", path.name, self.folder, error)
                 continue

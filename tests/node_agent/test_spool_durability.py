@@ -192,6 +192,15 @@ def test_an_image_whose_manifest_cannot_be_read_stays_and_is_delivered_by_the_re
     assert len(claimed(tmp_path).manifests()) == 2
 
 
+def test_a_delivered_image_whose_manifest_cannot_be_read_is_no_fault(tmp_path):
+    spool = Spool(tmp_path)
+    spool.store(manifest_of(), PARTS)
+    spool.deliver(manifest_of().key, manifest_of().sha256)
+    change(tmp_path / "s~0001-board~5.json", format="a format of later")
+    contents = claimed(tmp_path).contents()
+    assert (contents.waiting, contents.delivered, contents.unread) == ((), (), {})
+
+
 def test_a_manifest_with_fields_of_a_later_release_is_delivered(tmp_path):
     Spool(tmp_path).store(manifest_of(), PARTS)
     change(tmp_path / "s~0001-board~5.json", schema=2, lens="wide")

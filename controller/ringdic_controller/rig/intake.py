@@ -114,6 +114,8 @@ class Intake:
                 self.take(manifest, image)
             except (OSError, ValueError) as error:  # a full disk, a damaged record: the node keeps the image
                 log.error("the image of %s from %s is not archived: %s", manifest.key, manifest.node, error)
+            except Exception:
+                log.exception("after the image of %s from %s", manifest.key, manifest.node)
             finally:
                 with self._lock:
                     self._waiting_bytes -= len(image)

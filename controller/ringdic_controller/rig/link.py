@@ -25,6 +25,7 @@ from ringdic_node.wire import (
     Ack,
     Arm,
     ArmReply,
+    CaptureKey,
     Failure,
     Fetch,
     Inventory,
@@ -281,19 +282,32 @@ class RigLink:
             self._note_status(status)
         for inventory in self._answers(camera, "inventory", Inventory):
             for failure in inventory.failures:
-                self._intake.note_failure(failure)
+                self._attempt(failure.key, self._intake.note_failure, failure)
             for manifest in inventory.manifests:
-                if self._intake.wants(manifest):
-                    self.fetch(manifest)
+                self._attempt(manifest.key, self._pull, manifest, False)
             for manifest in inventory.delivered:
-                if self._intake.wants(manifest, delivered=True):
-                    log.error(
-                        "node %s was told that %s is archived, which it is not: somebody else acknowledges images on "
-                        "this network, or the archive has lost it; it is fetched from the node",
-                        camera,
-                        manifest.key,
-                    )
-                    self.fetch(manifest)
+                self._attempt(manifest.key, self._pull, manifest, True)
+
+    @staticmethod
+    def _attempt(key: CaptureKey, act: Callable[..., None], *arguments: Any) -> None:
+        """Do something for one capture; what is wrong with its record must not keep the others from their turn."""
+        try:
+            act(*arguments)
+        except (OSError, ValueError) as error:
+            log.error("capture %s could not be reconciled: %s", key, error)
+
+    def _pull(self, manifest: Manifest, delivered: bool) -> None:
+        """Fetch an image if the archive lacks it. delivered : whether its node was told that the archive has it."""
+        if not self._intake.wants(manifest, delivered=delivered):
+            return
+        if delivered:
+            log.error(
+                "node %s was told that %s is archived, which it is not: somebody else acknowledges images on this "
+                "network, or the archive has lost it; it is fetched from the node",
+                manifest.node,
+                manifest.key,
+            )
+        self.fetch(manifest)
 
     def fetch(self, manifest: Manifest) -> None:
         """Pull an image that a node holds; it enters the intake like a pushed one. Returns at once."""

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 import time
 from collections.abc import Callable
+
+log = logging.getLogger(__name__)
 
 
 class NodeVisits:
@@ -14,7 +17,7 @@ class NodeVisits:
     Parameters
     ----------
     visit : callable (camera)
-        Visits the node of a camera; must not raise.
+        Visits the node of a camera.
     alive : callable ()
         Ids of the cameras whose nodes are connected.
     before_round : callable ()
@@ -67,11 +70,18 @@ class NodeVisits:
                 camera = self._wanted.get(timeout=max(due - time.monotonic(), 0.0))
             except queue.Empty:
                 due = time.monotonic() + self._interval
-                self._before_round()
+                self._guarded(self._before_round)
                 for name in self._alive():
                     if self._stop.is_set():
                         return
-                    self._visit(name)
+                    self._guarded(self._visit, name)
             else:
                 if camera is not None:
-                    self._visit(camera)
+                    self._guarded(self._visit, camera)
+
+    def _guarded(self, act: Callable[..., None], *arguments: str) -> None:
+        try:
+            act(*arguments)
+        except Exception:
+            if not self.stopped:
+                log.exception("a visit to the nodes failed: %s", arguments)

@@ -205,3 +205,18 @@ def test_a_nodes_own_reason_replaces_a_general_one(recorded):
     cameras = recorded.capture.record().cameras
     assert cameras["201"].reason == "the camera timed out"
     assert cameras["202"].reason == "no image arrived"
+
+
+def test_a_bug_in_whoever_watches_ends_no_archivist(recorded):
+    def fail(_):
+        raise KeyError("somebody else's")
+
+    recorded.intake._on_event = fail
+    recorded.capture.close()
+    for n in range(6):  # more than there are archivists
+        capture = recorded.session.begin_capture("board", ["201"], fire_at_ns=70 + n)
+        key = CaptureKey("s", capture.capture_id, 70 + n)
+        recorded.intake.put(replace(manifest_of(), key=key), IMAGE)
+    recorded.intake.start()
+    recorded.intake.stop(timeout=10)
+    assert recorded.acks == [("201", "archived")] * 6

@@ -25,7 +25,7 @@ from ringdic_node.clock import SystemClock
 from ringdic_node.config import NodeConfig
 from ringdic_node.service import NodeService
 from ringdic_node.spool import Spool
-from ringdic_node.wire import Ack, Keys, Manifest, NodeStatus, decode_as, encode
+from ringdic_node.wire import Ack, CaptureKey, Keys, Manifest, NodeStatus, decode_as, encode
 
 CAMERAS = ["a", "b"]
 KEYS = Keys("ring")
@@ -165,6 +165,23 @@ def test_a_forged_acknowledgement_loses_no_image(rig: Rig, monkeypatch: pytest.M
     for camera in CAMERAS:
         content = (rig.session.path / f"captures/0001-board/{camera}.pgm").read_bytes()
         assert hashlib.sha256(content).hexdigest() == records().cameras[camera].sha256
+
+
+def test_a_damaged_record_keeps_no_other_image_from_the_archive(rig: Rig) -> None:
+    """The node lists an image of a capture whose record is unreadable before one that the archive lacks."""
+    records = [rig.session.begin_capture("board", CAMERAS, fire_at_ns=n) for n in (1, 2)]
+    (records[0].path / "capture.json").write_text("{")
+    records[1].close()
+    image = b"P5\n1 1\n255\n!"
+    spool = Spool(rig.folder / "spool-a")
+    for capture in records:
+        key = CaptureKey(rig.session.name, capture.capture_id, records.index(capture) + 1)
+        manifest = Manifest("a", key, "board", hashlib.sha256(image).hexdigest(), len(image), 1, 1, 1)
+        spool.store(manifest, [image])
+        spool.deliver(key, manifest.sha256)
+    rig.stop(rig.node("a"))
+    rig.start("a")
+    assert until(lambda: records[1].record().cameras["a"].status == "late")
 
 
 def test_two_nodes_of_one_id_are_refused_and_shown_and_a_restarted_one_is_not(rig: Rig) -> None:
