@@ -6,23 +6,19 @@ The folders are the truth; the tables are rebuilt from them and never written to
 from __future__ import annotations
 
 import json
-import logging
 import sqlite3
-from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 from threading import RLock
-from typing import Any, TypeVar
+from typing import Any
 
+from ringdic.session.files import leads_out
 from ringdic.session.folder import live_results
-from ringdic.session.records import CaptureRecord, read_capture_record, read_session_record
+from ringdic.session.records import CaptureRecord
 
-T = TypeVar("T")
-
-logger = logging.getLogger(__name__)
+from ringdic_controller.archive.reading import FolderReader
 
 _SCHEMA = """
-create table sessions (name text primary key, rig text, created text, source text, signature text);
+create table sessions (name text primary key, rig text, created text, source text, damaged text, signature text);
 create table captures (session text, id text, number integer, kind text, record text, primary key (session, id));
 create table runs (session text, run text, finished_at text, summary text, primary key (session, run));
 """
@@ -36,6 +32,7 @@ class Catalogue:
 
     def __init__(self, root: Path) -> None:
         self.root = Path(root)
+        self._folders = FolderReader(self.root)
         self._lock = RLock()  # guards the tables; reading the folders with it held keeps them consistent
         self._db = sqlite3.connect(":memory:", check_same_thread=False)
         self._db.row_factory = sqlite3.Row
@@ -52,12 +49,12 @@ class Catalogue:
 
         Returns whether there were any of either.
         """
-        folders = {path.name: path for path in self._folders()}
+        folders = [path.name for path in self._folders.folders()]
         with self._lock:
-            rows = self._db.execute("select name, signature from sessions")
-            signatures = {row["name"]: row["signature"] for row in rows}
-            obsolete = signatures.keys() - folders.keys()
-            outdated = [name for name, path in folders.items() if signatures.get(name) != _signature(path)]
+            rows = self._db.execute("select name, damaged, signature from sessions")
+            known = {row["name"]: (row["signature"], json.loads(row["damaged"])) for row in rows}
+            obsolete = known.keys() - set(folders)
+            outdated = [name for name in folders if name not in known or self._is_outdated(name, *known[name])]
             for name in obsolete:
                 with self._db:
                     self._delete(name)
@@ -67,19 +64,18 @@ class Catalogue:
 
     def refresh(self, name: str) -> None:
         """Read one session folder again, whether it seems changed or not; a folder that is no session is dropped."""
-        path = self.root / name
         with self._lock, self._db:
             self._delete(name)
-            header = _read(path / "session.json", read_session_record)
-            if header is None:
+            if not (self.root / name / "session.json").is_file():
                 return
-            self._db.execute(
-                "insert into sessions values (?, ?, ?, ?, ?)",
-                (name, header.rig, header.created, header.source, _signature(path)),
-            )
-            for record in _captures(path):
+            found = self._folders.session(name)
+            header = (found.header.rig, found.header.created, found.header.source) if found.header else (None,) * 3
+            signature = self._folders.signature(name, found.damaged)
+            row = (name, *header, json.dumps(found.damaged), signature)
+            self._db.execute("insert into sessions values (?, ?, ?, ?, ?, ?)", row)
+            for record in found.captures:
                 self._insert(name, record)
-            for run, finished_at, summary in _runs(path):
+            for run, finished_at, summary in found.runs:
                 self._db.execute("insert into runs values (?, ?, ?, ?)", (name, run, finished_at, json.dumps(summary)))
 
     def refresh_capture(self, name: str, capture_id: str) -> dict[str, Any] | None:
@@ -87,19 +83,24 @@ class Catalogue:
         with self._lock, self._db:
             if self._db.execute("select 1 from sessions where name = ?", (name,)).fetchone() is None:
                 self.refresh(name)
-            record = _record(self.root / name / "captures" / capture_id / "capture.json")
+            record = self._folders.capture(name, capture_id)
             if record is not None:
                 self._insert(name, record)
             return None if record is None else record.to_json()
 
     def sessions(self) -> list[dict[str, Any]]:
-        """One dictionary for each session, newest first.
+        """One dictionary for each session, newest first; those whose ``session.json`` is damaged last.
 
-        Its keys are name, rig, created, source, captures (the number of each kind) and runs (their number).
+        Its keys are name, rig, created, source, captures (the number of each kind), runs (their number) and damaged (a
+        sentence for each file that is not readable).
         """
+        columns = "name, rig, created, source, damaged"
         with self._lock:
-            rows = self._db.execute("select name, rig, created, source from sessions order by created desc, name desc")
-            return [dict(row) | self._counts(row["name"]) for row in rows.fetchall()]
+            rows = self._db.execute(f"select {columns} from sessions order by created desc, name desc")
+            return [
+                dict(row) | self._counts(row["name"]) | {"damaged": list(json.loads(row["damaged"]).values())}
+                for row in rows.fetchall()
+            ]
 
     def session(self, name: str) -> dict[str, Any]:
         """One session as a dictionary, with the keys that `sessions` lists."""
@@ -115,6 +116,14 @@ class Catalogue:
         if row is None:
             raise KeyError(name)
         return self.root / name
+
+    def file(self, name: str, *parts: str) -> Path | None:
+        """The path of a file in a session's folder; None where there is none, or a link that leads out of the archive.
+
+        parts : names of the folders in it, and of the file.
+        """
+        path = self.path(name).joinpath(*parts)
+        return path if path.is_file() and not leads_out(self.root, path) else None
 
     def captures(self, name: str) -> list[dict[str, Any]]:
         """The capture records of a session in order of their number; none for an unknown session."""
@@ -156,6 +165,9 @@ class Catalogue:
         (runs,) = self._db.execute("select count(*) from runs where session = ?", (name,)).fetchone()
         return {"captures": counts, "runs": runs}
 
+    def _is_outdated(self, name: str, signature: str, damaged: dict[str, str]) -> bool:
+        return signature != self._folders.signature(name, damaged)
+
     def _insert(self, name: str, record: CaptureRecord) -> None:
         row = (name, record.capture_id, record.number, record.kind, json.dumps(record.to_json()))
         self._db.execute("insert or replace into captures values (?, ?, ?, ?, ?)", row)
@@ -164,61 +176,3 @@ class Catalogue:
         self._db.execute("delete from sessions where name = ?", (name,))
         self._db.execute("delete from captures where session = ?", (name,))
         self._db.execute("delete from runs where session = ?", (name,))
-
-    def _folders(self) -> Iterator[Path]:
-        if self.root.is_dir():
-            for path in self.root.iterdir():
-                if not path.name.startswith(".") and (path / "session.json").is_file():
-                    yield path
-
-
-def _captures(path: Path) -> Iterator[CaptureRecord]:
-    for file in (path / "captures").glob("*/capture.json"):
-        record = _record(file)
-        if record is not None:
-            yield record
-
-
-def _record(file: Path) -> CaptureRecord | None:
-    """The record of a capture; None if it is not readable or names another capture than its folder does."""
-    record = _read(file, read_capture_record)
-    return record if record is not None and record.capture_id == file.parent.name else None
-
-
-def _runs(path: Path) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    results = path / "results"
-    for folder in sorted(results.iterdir()) if results.is_dir() else ():
-        if folder.name.isdigit() and (folder / "results.h5").is_file():
-            finished = datetime.fromtimestamp((folder / "results.h5").stat().st_mtime, UTC)
-            yield (
-                folder.name,
-                finished.isoformat(timespec="seconds"),
-                _read(folder / "summary.json", _read_summary) or {},
-            )
-
-
-def _read(file: Path, read: Callable[[Path], T]) -> T | None:
-    """What a file holds, or None, with a warning where it is damaged: it must not hide the other sessions."""
-    if not file.is_file():
-        return None
-    try:
-        return read(file)
-    except (ValueError, OSError) as error:
-        logger.warning("%s is not readable and is left out of the catalogue: %s", file, error)
-        return None
-
-
-def _read_summary(file: Path) -> dict[str, Any]:
-    summary = json.loads(file.read_text(encoding="utf-8"))
-    return summary if isinstance(summary, dict) else {}
-
-
-def _signature(path: Path) -> str:
-    """Text that changes when a capture or a run is added to a session folder, or its header is replaced."""
-    parts = []
-    for name in ("session.json", "captures", "results"):
-        try:
-            parts.append(str((path / name).stat().st_mtime_ns))
-        except FileNotFoundError:
-            parts.append("-")
-    return " ".join(parts)

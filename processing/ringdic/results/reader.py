@@ -5,7 +5,9 @@ The layout of the file is drawn in `ringdic.results.layout`.
 
 from __future__ import annotations
 
-import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from ringdic.results.fields import field as field_of
 from ringdic.results.layout import SCHEMA
 from ringdic.results.results import MATCH_ARRAYS, Matches, Results
 from ringdic.results.unmeasured import UnmeasuredPlaces
+from ringdic.session.json_text import parse_json
 from ringdic.strain.rigid_motion import RigidMotion
 
 
@@ -34,7 +37,7 @@ def read_results(path: Path, matches: bool = True) -> Results:
     """
     with _open(path) as file:
         own, group = file["ringdic"], file["VTKHDF"]
-        steps = tuple(json.loads(own.attrs["steps"]))
+        steps = tuple(parse_json(own.attrs["steps"]))
         F, N = len(steps), len(own["reference"])
         measured = group["PointData/measured"][:].reshape(F, N).astype(bool)
         optional: dict[str, Any] = {
@@ -43,7 +46,7 @@ def read_results(path: Path, matches: bool = True) -> Results:
         return Results(
             rig=str(own.attrs["rig"]),
             steps=steps,
-            cameras=tuple(_read_camera(own["cameras"], name) for name in json.loads(own.attrs["cameras"])),
+            cameras=tuple(_read_camera(own["cameras"], name) for name in parse_json(own.attrs["cameras"])),
             pairs=_pairs(own),
             vertices_ref=own["reference"][:],
             vertices=np.where(measured[..., None], group["Points"][:].reshape(F, N, 3), np.nan),
@@ -55,8 +58,8 @@ def read_results(path: Path, matches: bool = True) -> Results:
             status=group["PointData/status"][:].reshape(F, N),
             matches=_read_matches(own["matches"]) if matches else (),
             settings=_text(own, "settings"),
-            calibration=json.loads(_text(own, "calibration")),
-            summary=json.loads(_text(own, "summary")),
+            calibration=parse_json(_text(own, "calibration")),
+            summary=parse_json(_text(own, "summary")),
             unmeasured=_read_unmeasured(own),
             **optional,
         )
@@ -74,13 +77,13 @@ def read_summary(path: Path) -> dict[str, Any]:
         return {
             "schema": int(own.attrs["schema"]),
             "rig": str(own.attrs["rig"]),
-            "steps": json.loads(own.attrs["steps"]),
-            "cameras": json.loads(own.attrs["cameras"]),
-            "pairs": json.loads(own.attrs["pairs"]),
+            "steps": parse_json(own.attrs["steps"]),
+            "cameras": parse_json(own.attrs["cameras"]),
+            "pairs": parse_json(own.attrs["pairs"]),
             "points": len(own["reference"]),
             "faces": len(own["faces"]),
-            "fields": json.loads(own.attrs["fields"]),
-            "summary": json.loads(_text(own, "summary")),
+            "fields": parse_json(own.attrs["fields"]),
+            "summary": parse_json(_text(own, "summary")),
         }
 
 
@@ -157,7 +160,9 @@ def _field_in(path: Path, group: h5py.Group, name: str) -> Field:
     raise InputError(f"{path}: no field '{name}': the run did not find it")
 
 
-def _open(path: Path) -> h5py.File:
+@contextmanager
+def _open(path: Path) -> Iterator[h5py.File]:
+    """Context with an open results file. InputError names the file where it is missing, damaged or of another kind."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such results file; process the session first")
@@ -165,12 +170,31 @@ def _open(path: Path) -> h5py.File:
         file = h5py.File(path, "r")
     except OSError as error:
         raise InputError(f"{path}: not readable as HDF5 ({error})") from error
-    try:
-        _check_schema(path, file)
-    except InputError:
-        file.close()
-        raise
-    return file
+    with file:
+        try:
+            state = path.stat()
+            _check_that_it_stands_alone(path, state.st_mtime_ns, state.st_size)
+            _check_schema(path, file)
+            yield file
+        except InputError:
+            raise
+        except (LookupError, ValueError, TypeError, AttributeError, OSError, RuntimeError, MemoryError) as error:
+            raise InputError(f"{path}: the results are damaged ({error}); process the session again") from error
+
+
+@lru_cache(maxsize=64)
+def _check_that_it_stands_alone(path: Path, _changed_ns: int, _size: int) -> None:
+    """Refuse a file whose data lie in other files, which HDF5 would read whatever they are. Nothing of ours does so."""
+
+    def elsewhere(name: str, link: object) -> str | None:
+        item = file[name] if isinstance(link, h5py.HardLink) else link
+        apart = isinstance(item, h5py.Dataset) and (item.is_virtual or item.external)
+        return name if apart or isinstance(item, h5py.ExternalLink) else None
+
+    with h5py.File(path, "r") as file:
+        name = file.visititems_links(elsewhere)  # the first of which it returns something
+    if name is not None:
+        raise InputError(f"{path}: '{name}' lies in another file, as no results of RingDIC do; it is not read")
 
 
 def _check_schema(path: Path, file: h5py.File) -> None:
@@ -186,13 +210,13 @@ def _check_schema(path: Path, file: h5py.File) -> None:
 
 
 def _check_step(path: Path, own: h5py.Group, step: int) -> None:
-    count = len(json.loads(own.attrs["steps"]))
+    count = len(parse_json(own.attrs["steps"]))
     if not 0 <= step < count:
         raise InputError(f"{path}: no step {step}; there are {count}, from 0, the reference")
 
 
 def _pairs(own: h5py.Group) -> tuple[tuple[str, str], ...]:
-    return tuple((first, second) for first, second in json.loads(own.attrs["pairs"]))
+    return tuple((first, second) for first, second in parse_json(own.attrs["pairs"]))
 
 
 def _text(own: h5py.Group, name: str) -> str:
@@ -214,7 +238,7 @@ def _read_unmeasured(own: h5py.Group) -> tuple[UnmeasuredPlaces, ...]:
             name, groups[name]["px"][:].astype(float), float(groups[name].attrs["spacing"]),
             groups[name]["status"][:], groups[name]["area"][:],
         )
-        for name in json.loads(own.attrs["cameras"])
+        for name in parse_json(own.attrs["cameras"])
         if name in groups
     )  # fmt: skip
 
@@ -225,6 +249,6 @@ def _read_matches(groups: h5py.Group) -> tuple[Matches, ...]:
     for name in sorted(filter(str.isdigit, groups), key=int):
         group = groups[name]
         arrays = {array: group[array][:] for array in ("xy", "vertex", *MATCH_ARRAYS)}
-        cameras = tuple(json.loads(group.attrs["cameras"]))
-        matches.append(Matches(cameras=cameras, seconds=json.loads(group.attrs["seconds"]), **arrays))
+        cameras = tuple(parse_json(group.attrs["cameras"]))
+        matches.append(Matches(cameras=cameras, seconds=parse_json(group.attrs["seconds"]), **arrays))
     return tuple(matches)

@@ -13,6 +13,7 @@ import json
 import os
 import shutil
 import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -81,15 +82,26 @@ def replace_json(path: Path, document: dict[str, Any]) -> None:
     _flush_folder(path.parent)
 
 
+def leads_out(folder: Path, path: Path) -> bool:
+    """Whether a path leads, through symbolic links in it, to a place outside a folder.
+
+    A session folder comes from elsewhere at times, and a link in it could name any file of this PC.
+    """
+    whole = os.path.realpath(folder)
+    return os.path.commonpath([whole, os.path.realpath(path)]) != whole
+
+
 def _write_aside(path: Path, content: bytes) -> Path:
+    """Write a file under a temporary name; nothing is left of one that the disk does not take."""
     aside = path.with_name(f"{PARTIAL}{path.name}-{os.getpid()}-{threading.get_ident()}")
     try:
         with open(aside, "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-    except OSError:  # a full disk, mostly
-        aside.unlink(missing_ok=True)
+    except OSError:
+        with suppress(OSError):
+            aside.unlink(missing_ok=True)
         raise
     return aside
 

@@ -33,6 +33,7 @@ from shutil import rmtree
 from uuid import uuid4
 
 from ringdic.errors import InputError
+from ringdic.session.files import leads_out
 from ringdic.session.names import CAPTURE_KINDS, split_capture_id
 from ringdic.session.records import REMEDY, CaptureRecord, SessionError, read_capture_record, read_session_record
 from ringdic.session.rig import Rig, read_rig
@@ -75,6 +76,7 @@ class Session:
     def mask(self, camera_id: str) -> Path | None:
         """Image file of the region of interest on a camera's reference image; None where none was drawn."""
         path = self.path / "mask" / f"{camera_id}.png"
+        _refuse_link_elsewhere(self.path, path)
         return path if path.is_file() else None
 
     def runs(self) -> tuple[Path, ...]:
@@ -99,7 +101,12 @@ def runs(path: Path) -> tuple[Path, ...]:
     results = Path(path) / "results"
     if not results.is_dir():
         return ()
-    return tuple(sorted(p for p in results.iterdir() if p.is_dir() and p.name.isdigit()))
+    return tuple(sorted(p for p in results.iterdir() if p.is_dir() and is_run_name(p.name)))
+
+
+def is_run_name(name: str) -> bool:
+    """Whether a folder of results has the name of a finished processing run: its number."""
+    return name.isascii() and name.isdigit() and len(name) < 10
 
 
 def newest_results(path: Path, run: int | None = None) -> Path:
@@ -224,12 +231,19 @@ def _captures(folder: Path) -> Iterator[Capture]:
         record = read_capture_record(path / "capture.json")
         images = {camera: path / entry.file for camera, entry in record.cameras.items() if entry.file}
         for camera, image in images.items():
+            _refuse_link_elsewhere(folder / "..", image)
             if not image.is_file():
                 raise SessionError(
                     f"{image}: the record of {path.name} names this image of camera {camera}, but it is not there; "
                     f"{REMEDY}"
                 )
         yield Capture(path.name, *parts, path, images, record)
+
+
+def _refuse_link_elsewhere(session: Path, file: Path) -> None:
+    """SessionError for a file that is a link to a place outside the archive, the folder that the session lies in."""
+    if leads_out(session / "..", file):
+        raise SessionError(f"{file}: a link that leads out of the archive; copy the file itself there")
 
 
 def _capture_of(folder: Path) -> tuple[int, str] | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import cv2
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from ringdic.arrays import Mask
 from ringdic.errors import InputError
+from ringdic.session.image_headers import jpeg_segments, stated_size
 
 # OpenCV would print lines about a damaged file that do not name it; an InputError does.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -20,9 +20,9 @@ _RED, _GREEN, _BLUE = 298936, 587043, 114021
 _MILLION = 1_000_000
 # So many rows of sums stay in the processor's cache: seven times faster than a whole image at a time.
 _ROWS = 32
-# Inside compressed JPEG data 0xFF is followed by 0x00 or a restart marker; anything else ends the scan.
-_JPEG_MARKER = re.compile(rb"\xff+([^\x00\xd0-\xd7\xff])", re.DOTALL)
 _PNG_END = b"IEND\xaeB`\x82"
+#: Bytes of the largest image that is decoded: 250 megapixels of 16 bits, 170 of colour.
+LARGEST_IMAGE = 512 << 20
 
 
 def read_gray(path: Path) -> NDArray:
@@ -37,10 +37,14 @@ def read_gray(path: Path) -> NDArray:
     Raises
     ------
     InputError
-        The file is missing, truncated or no image; the sentence names it.
+        The file is missing, truncated, too large or no image; the sentence names it.
     """
     path = Path(path)
     try:
+        if path.stat().st_size > LARGEST_IMAGE:
+            raise InputError(
+                f"{path}: larger than {LARGEST_IMAGE >> 20} MB, which no image may be; store it compressed"
+            )
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
@@ -48,6 +52,14 @@ def read_gray(path: Path) -> NDArray:
         raise InputError(f"{path}: the image file is empty; copy or capture it again")
     if not _is_whole(data):
         raise InputError(f"{path}: the image file is truncated; copy or capture it again")
+    size = stated_size(data)
+    if size is None:
+        raise InputError(f"{path}: truncated or not an image; use JPEG, PNG, PGM or TIFF and copy it again")
+    if size.bytes > LARGEST_IMAGE:
+        raise InputError(
+            f"{path}: {size.width} x {size.height} px would take {size.bytes / 2**30:.1f} GB of memory, and an image "
+            f"may take {LARGEST_IMAGE >> 20} MB; use smaller images"
+        )
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -116,22 +128,5 @@ def _is_whole(data: bytes) -> bool:
     if data.startswith(b"\x89PNG"):
         return _PNG_END in data
     if data.startswith(b"\xff\xd8"):
-        return _jpeg_has_end(data)
+        return any(marker == 0xD9 for marker, _ in jpeg_segments(data))
     return True
-
-
-def _jpeg_has_end(data: bytes) -> bool:
-    """Whether the segments of a JPEG file lead to its end-of-image marker; raw sensor data may follow it."""
-    at = 2
-    while True:
-        match = _JPEG_MARKER.search(data, at)
-        if match is None:
-            return False
-        marker, at = match[1][0], match.end()
-        if marker == 0xD9:
-            return True
-        if marker == 0x01:
-            continue
-        if at + 2 > len(data):
-            return False
-        at += int.from_bytes(data[at : at + 2], "big")

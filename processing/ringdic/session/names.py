@@ -18,7 +18,7 @@ CaptureKind = Literal["board", "target", "specimen", "static"]
 CAPTURE_KINDS: tuple[CaptureKind, ...] = get_args(CaptureKind)
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-_CAPTURE_ID = re.compile(r"(\d{4,})-([a-z]+)")
+_CAPTURE_ID = re.compile(r"([0-9]{4,9})-([a-z]+)")
 
 
 def checked_name(what: str, name: object) -> str:

@@ -6,13 +6,13 @@ preserved when it is written again. Times are integers, ns since the Unix epoch,
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from ringdic.errors import InputError
+from ringdic.session.json_text import read_json
 from ringdic.session.names import capture_id, is_file_name
 
 SCHEMA = 1
@@ -330,7 +330,7 @@ def read_capture_record(path: Path) -> CaptureRecord:
 
 def _read(path: Path, from_json: Callable[[Mapping[str, Any]], R]) -> R:
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = read_json(path)
     except OSError as error:
         raise SessionError(f"{path}: cannot be read ({error.strerror}); {REMEDY}") from error
     except ValueError as error:

@@ -22,9 +22,10 @@ from pathlib import Path
 from typing import Any
 
 from ringdic.errors import InputError
-from ringdic.session.files import PARTIAL, link, place, replace_json
+from ringdic.session.files import PARTIAL, leads_out, link, place, replace_json
 from ringdic.session.names import CAPTURE_KINDS, capture_id, checked_name, split_capture_id
 from ringdic.session.records import (
+    REMEDY,
     CameraRecord,
     CaptureRecord,
     ImageDescription,
@@ -95,22 +96,30 @@ class Archive:
     def close_unfinished(self, reason: str) -> list[str]:
         """Close captures that an earlier process left open; pending cameras end as failed with `reason`.
 
-        Their images are archived all the same when a node still holds them. Returns ``session/capture`` names.
+        Their images are archived all the same when a node still holds them. A capture whose record is damaged, or
+        cannot be written, is left as it is and told in the log. Returns ``session/capture`` names.
         """
         closed = []
         for path in sorted(self.root.glob("*/captures/*/capture.json")):
-            for left in path.parent.glob(f"{PARTIAL}*"):
-                left.unlink(missing_ok=True)
-            capture = CaptureWriter(path.parent, self._wall_ns, self._lock)
             try:
-                record = capture.record()
-                if record.state == "open":
-                    pending = [camera for camera, entry in record.cameras.items() if entry.status == "pending"]
-                    capture.close(dict.fromkeys(pending, reason))
-                    closed.append(f"{record.session}/{record.capture_id}")
-            except (SessionError, OSError) as error:  # damaged, or the disk is full: the other captures go on
-                log.error("%s is left as it is: %s", path, error)
+                if not leads_out(self.root, path) and self._close_unfinished(path.parent, reason):
+                    closed.append(f"{path.parents[2].name}/{path.parent.name}")
+            except (SessionError, OSError) as error:
+                log.error("a capture is left as it is: %s", error)
         return closed
+
+    def _close_unfinished(self, path: Path, reason: str) -> bool:
+        """Close the capture of a folder if it is open; whether it was."""
+        for left in path.glob(f"{PARTIAL}*"):
+            left.unlink(missing_ok=True)
+        capture = CaptureWriter(path, self._wall_ns, self._lock)
+        record = capture.record()
+        if record.state != "open":
+            return False
+        capture.close(
+            dict.fromkeys((name for name, entry in record.cameras.items() if entry.status == "pending"), reason)
+        )
+        return True
 
 
 class SessionWriter:
@@ -124,9 +133,12 @@ class SessionWriter:
         self._wall_ns = wall_ns
         self._lock = lock or threading.RLock()
         self.name = read_session_record(self.path / "session.json").session
-        rig = tomllib.loads((self.path / "rig.toml").read_text(encoding="utf-8"))
-        self.cameras: tuple[str, ...] = tuple(str(camera["id"]) for camera in rig.get("cameras", []))
-        self.camera_settings: dict[str, Any] = dict(rig.get("capture", {}))
+        try:
+            rig = tomllib.loads((self.path / "rig.toml").read_text(encoding="utf-8"))
+            self.cameras: tuple[str, ...] = tuple(str(camera["id"]) for camera in rig.get("cameras", []))
+            self.camera_settings: dict[str, Any] = dict(rig.get("capture", {}))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise SessionError(f"{self.path / 'rig.toml'}: not readable as a rig file ({error}); {REMEDY}") from error
 
     @classmethod
     def create(
@@ -164,7 +176,7 @@ class SessionWriter:
             (path / "captures").mkdir()
             place(path / "rig.toml", rig_toml.encode())
             replace_json(path / "session.json", record.to_json())
-        except OSError:  # a full disk: the name must not stay taken by half a session
+        except OSError:  # a full disk: the name stays free
             shutil.rmtree(path, ignore_errors=True)
             raise
         return cls(path, wall_ns, lock)
@@ -233,7 +245,7 @@ class SessionWriter:
             path.mkdir()
             try:
                 replace_json(path / "capture.json", record.to_json())
-            except OSError:  # a full disk: a folder without a record would be no capture
+            except OSError:  # a full disk: the number stays free
                 path.rmdir()
                 raise
         return CaptureWriter(path, self._wall_ns, self._lock)

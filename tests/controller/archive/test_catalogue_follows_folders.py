@@ -67,14 +67,17 @@ def test_captures_come_by_number_beyond_four_digits(tmp_path: Path) -> None:
     assert numbers == [2, 9999, 10000]
 
 
-def test_a_damaged_record_hides_nothing_else(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_damaged_record_is_named_and_hides_nothing_else(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     folder = a_session(tmp_path, "limb", ("board", "target"))
     (folder / "captures" / "0001-board" / "capture.json").write_text("{ torn")
     (tmp_path / "torn").mkdir()
     (tmp_path / "torn" / "session.json").write_bytes(b"\xff\xfe")
     (tmp_path / "no-session").mkdir()
     catalogue = Catalogue(tmp_path)
-    assert [session["name"] for session in catalogue.sessions()] == ["limb"]
+    limb, torn = catalogue.sessions()
+    assert (limb["name"], torn["name"], torn["rig"]) == ("limb", "torn", None)
+    assert "0001-board" in limb["damaged"][0]
+    assert "session.json" in torn["damaged"][0]
     assert [record["capture_id"] for record in catalogue.captures("limb")] == ["0002-target"]
     assert "0001-board" in caplog.text
 

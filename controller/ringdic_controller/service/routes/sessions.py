@@ -11,7 +11,10 @@ router = APIRouter(prefix="/sessions", tags=["sessions"])
 
 
 class SessionBody(BaseModel):
-    """One session, with the number of its captures of each kind and of its processing runs."""
+    """One session, with the number of its captures of each kind and of its processing runs.
+
+    ``damaged`` has a sentence for each file in its folder that is not readable, which is left as it is.
+    """
 
     name: str
     rig: str | None
@@ -19,6 +22,7 @@ class SessionBody(BaseModel):
     source: str | None
     captures: dict[str, int]
     runs: int
+    damaged: list[str] = []
 
 
 class SessionList(BaseModel):
