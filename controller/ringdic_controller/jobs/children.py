@@ -1,14 +1,17 @@
 """Child processes that run the processing: one for every job, or a warm one that serves order after order.
 
 A child prints messages, which are JSON objects about progress, outcome or readiness (`ringdic.jobs.__main__` lists
-them), and lines of log.
+them), and lines of log. Each has a guardian (`ringdic_controller.jobs.guardian`), so that no child outlives the
+controller, however that ends.
 """
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +22,8 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Lock, Thread
 from typing import Any, Protocol
+
+from ringdic_controller.jobs import guardian
 
 logger = logging.getLogger(__name__)
 
@@ -186,7 +191,10 @@ class _OneOrderChild:
         return _lines(self._process)
 
     def wait(self) -> int:
-        return self._process.wait()
+        assert self._process.stdin is not None
+        code = self._process.wait()
+        self._process.stdin.close()
+        return code
 
     def end(self) -> None:
         _end(self._process)
@@ -315,9 +323,13 @@ def serving_command() -> list[str]:
 
 
 def _start(command: list[str], orders: bool = False) -> subprocess.Popen[str]:
+    """Start a command with a guardian, which holds the pipe to its standard input. Raises OSError."""
+    if shutil.which(command[0]) is None:
+        raise FileNotFoundError(errno.ENOENT, "no such program", command[0])
+    guarded = [sys.executable, "-I", "-S", guardian.__file__, *(["--orders"] if orders else []), *command]
     return subprocess.Popen(
-        command,
-        stdin=subprocess.PIPE if orders else subprocess.DEVNULL,
+        guarded,
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -362,10 +374,11 @@ def _end(child: subprocess.Popen[str]) -> None:
 
 
 def _signal(child: subprocess.Popen[str], number: int) -> None:
-    try:
-        if os.name == "posix":
+    if os.name == "posix":
+        with suppress(ProcessLookupError):  # it has ended meanwhile
             os.killpg(child.pid, number)
-        else:
-            child.terminate()
-    except ProcessLookupError:  # it has ended meanwhile
-        return
+    elif child.stdin is not None and not child.stdin.closed:  # the guardian ends the child
+        with suppress(OSError):
+            child.stdin.close()
+    else:
+        child.terminate()

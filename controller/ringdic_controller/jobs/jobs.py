@@ -17,15 +17,18 @@ import json
 import logging
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from queue import SimpleQueue
 from shutil import rmtree
 from threading import Condition, Thread
-from typing import Any, TextIO
+from typing import Any
 
+from pydantic import TypeAdapter
 from ringdic.findings import DO_NOT_USE_EXIT
+from ringdic.session.json_text import read_json
 
 from ringdic_controller.jobs.children import ChildPerJob, Command, Order, Processing, Work, message_of
 
@@ -67,6 +70,9 @@ class Job:
         return self.state in FINISHED
 
 
+_JOB = TypeAdapter(Job)
+
+
 class Jobs:
     """Job queue with the thread that runs the jobs; safe to use from several threads.
 
@@ -88,11 +94,12 @@ class Jobs:
         self._folder = Path(folder)
         self._processing: Processing = ChildPerJob(processing) if callable(processing) else processing
         self._on_change = on_change
-        # Guards the five attributes below and the job folders. Neither on_change nor the processing is called with it
+        # Guards the attributes below and the job folders. Neither on_change nor the processing is called with it
         # held. Whoever waits for a change of the queue waits on it.
         self._lock = Condition()
         self._jobs: dict[str, Job] = {}
         self._paths: dict[str, Path] = {}
+        self._last_id = 0
         self._due: dict[str, float] = {}  # earliest start of a queued job, s of the monotonic clock
         self._current_work: Work | None = None
         self._closing = False
@@ -172,6 +179,8 @@ class Jobs:
             Id of the capture to process alone; None for the whole session.
         after
             Seconds before the job may start.
+
+        Raises OSError, and queues nothing, where the job's record cannot be written.
         """
         with self._lock:
             alike = [
@@ -182,6 +191,7 @@ class Jobs:
             job = Job(self._new_id(), session, reason, automatic, _now(), step=step)
             if after > 0:
                 job = replace(job, message=f"begins {after:.0f} s after the last capture")
+            self._write(job)  # first: a job that cannot be recorded is not queued
             self._paths[job.id], self._due[job.id] = Path(path), time.monotonic() + after
             self._store(job)
             for old in alike:
@@ -218,7 +228,10 @@ class Jobs:
     def _report(self) -> None:
         """Pass every change on, until the queue of changes is closed."""
         while (job := self._changes.get()) is not None:
-            self._on_change(job)
+            try:
+                self._on_change(job)
+            except Exception:  # the changes of all other jobs are to be reported
+                logger.exception("a change of job %s could not be reported", job.id)
 
     def _work(self) -> None:
         """Run the queued jobs one after the other, until the queue of jobs is closed."""
@@ -239,7 +252,7 @@ class Jobs:
 
     def _run(self, job: Job) -> None:
         """Start the processing of a job, follow its lines to the end and settle the outcome."""
-        with (self._folder / job.id / "log.txt").open("a", encoding="utf-8") as log:
+        with _JobLog(self._folder / job.id / "log.txt") as log:
             work = self._processing.begin(Order(self._paths[job.id], job.step))
             with self._lock:
                 self._current_work = work
@@ -257,7 +270,7 @@ class Jobs:
                 self._current_work = None
         self._settle(job.id, code, outcome)
 
-    def _follow(self, job_id: str, work: Work, log: TextIO) -> dict[str, Any]:
+    def _follow(self, job_id: str, work: Work, log: _JobLog) -> dict[str, Any]:
         """Record progress and log until the work ends; return its last message about a state, {} without one."""
         outcome: dict[str, Any] = {}
         last_stage = ""
@@ -273,7 +286,6 @@ class Jobs:
                 if stage != last_stage:
                     log.write(f"{datetime.now():%H:%M:%S} {stage}\n")
                     last_stage = stage
-            log.flush()
         return outcome
 
     def _settle(self, job_id: str, code: int, outcome: dict[str, Any]) -> None:
@@ -328,13 +340,16 @@ class Jobs:
 
     def _update(self, job_id: str, **changes: Any) -> Job:
         job = replace(self._jobs[job_id], **changes)
+        try:
+            self._write(job)
+        except OSError as error:  # a full disk: the job goes on, and is told as it is
+            logger.warning("the record of job %s cannot be written: %s", job_id, error)
         self._store(job)
         return job
 
     def _store(self, job: Job) -> None:
-        """Put a new or changed job into the list and on disk, wake whoever waits, and have the change reported."""
+        """Put a new or changed job into the list, wake whoever waits, and have the change reported."""
         self._jobs[job.id] = job
-        self._write(job)
         self._lock.notify_all()
         self._changes.put(job)
 
@@ -358,7 +373,8 @@ class Jobs:
         rmtree(self._folder / job_id, ignore_errors=True)
 
     def _new_id(self) -> str:
-        return f"{1 + max((int(name) for name in self._jobs), default=0):04d}"
+        self._last_id += 1
+        return f"{self._last_id:04d}"
 
     def _write(self, job: Job) -> None:
         """Replace a job's record on disk as a whole."""
@@ -371,16 +387,39 @@ class Jobs:
     def _load(self) -> None:
         """Read the jobs of earlier runs of the controller; those that it left unfinished become failed."""
         for path in sorted(self._folder.glob("[0-9]*/job.json")):
+            if not path.parent.name.isdecimal():
+                continue
+            self._last_id = max(self._last_id, int(path.parent.name))  # of one that is damaged, too: it stays as it is
             try:
-                job = Job(**json.loads(path.read_text(encoding="utf-8")))
-            except (json.JSONDecodeError, TypeError, UnicodeDecodeError) as error:
+                job = _JOB.validate_python(read_json(path))
+                if job.id != path.parent.name:
+                    raise ValueError(f"it is the record of job {job.id}")
+            except (ValueError, OSError) as error:
                 logger.warning("%s is not readable and is left out: %s", path, error)
                 continue
             if not job.finished:
                 sentence = "The controller ended before this job did; start it again."
                 job = replace(job, state="failed", error=sentence, finished_at=_now(), left_s=None)
-                self._write(job)
+                with suppress(OSError):  # an archive that cannot be written can still be shown
+                    self._write(job)
             self._jobs[job.id] = job
+
+
+class _JobLog:
+    """Log of a job; where the disk is full the job goes on without. A context manager."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("ab", buffering=0)
+
+    def __enter__(self) -> _JobLog:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def write(self, text: str) -> None:
+        with suppress(OSError):
+            self._file.write(text.encode("utf-8", "replace"))
 
 
 def _now() -> str:

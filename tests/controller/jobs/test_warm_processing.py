@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 import threading
 import time
@@ -200,3 +201,46 @@ def test_the_real_processing_serves_failures_without_ending_and_ends_with_its_or
     finally:
         watchdog.cancel()
         child.close()
+
+
+CONTROLLER = """
+import sys, time
+from pathlib import Path
+from ringdic_controller.jobs.children import ChildPerJob, Order, WarmChild
+
+folder, child, stubborn = Path(sys.argv[1]), sys.argv[2], sys.argv[3]
+warm = WarmChild([sys.executable, "-c", stubborn])
+work = [each.begin(Order(folder)) for each in (warm, ChildPerJob(lambda _: [sys.executable, "-c", child]))]
+for each in work: print(next(each.lines()), end="", flush=True)
+time.sleep(60)
+"""
+# Starts a process of its own, tells both numbers, and sleeps; the stubborn one does not even notice signals.
+SLEEPER = """
+import subprocess, sys, os, time
+other = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+print(os.getpid(), other.pid, flush=True)
+time.sleep(60)
+"""
+STUBBORN = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)" + SLEEPER
+
+
+@pytest.mark.skipif(os.name != "posix", reason="kill of POSIX")
+def test_no_child_and_nothing_that_it_started_outlives_a_controller_that_is_killed(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", CONTROLLER, str(tmp_path), SLEEPER, STUBBORN]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as controller:
+        assert controller.stdout is not None
+        children = [int(number) for _ in range(2) for number in controller.stdout.readline().split()]
+        assert len(children) == 4
+        controller.kill()
+    deadline = time.monotonic() + 20
+    while any(is_running(number) for number in children):
+        assert time.monotonic() < deadline, [number for number in children if is_running(number)]
+        time.sleep(0.05)
+
+
+def is_running(number: int) -> bool:
+    """Whether a process runs (one that has ended and that nobody waits for does not)."""
+    try:
+        return Path(f"/proc/{number}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
