@@ -105,5 +105,5 @@ def nodes(desk: Desk) -> StandInNodes:
 @pytest.fixture
 def client(desk: Desk) -> Iterator[TestClient]:
     """The HTTP interface over the desk."""
-    with TestClient(create_app(desk)) as client:
+    with TestClient(create_app(desk), base_url="http://127.0.0.1") as client:
         yield client

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 from fastapi import APIRouter, FastAPI, Request
@@ -12,8 +13,11 @@ from ringdic.errors import RingdicError
 from starlette.types import Scope
 
 from ringdic_controller.service.desk import Desk
-from ringdic_controller.service.refusals import NotFoundError, RefusedError
+from ringdic_controller.service.guard import OWN_FILES_RUN, SAFE_HEADERS, GuardRules, RequestGuard
+from ringdic_controller.service.refusals import NO_ROOM, BusyError, NotFoundError, RefusedError, disk_sentence
 from ringdic_controller.service.routes import captures, events, jobs, live_step, results, rig, sessions
+
+logger = logging.getLogger(__name__)
 
 STATIC = Path(__file__).parents[1] / "web" / "static"
 _NO_PAGE = (
@@ -23,7 +27,7 @@ _NO_PAGE = (
 )
 
 
-def create_app(desk: Desk, static: Path = STATIC) -> FastAPI:
+def create_app(desk: Desk, static: Path = STATIC, rules: GuardRules | None = None) -> FastAPI:
     """Create the web application that serves a desk over HTTP, and the bundled page.
 
     Parameters
@@ -32,6 +36,8 @@ def create_app(desk: Desk, static: Path = STATIC) -> FastAPI:
         Answers the requests.
     static
         Folder of the page's files.
+    rules
+        Which requests pass; None lets those pass that come to an address of this PC.
     """
     app = FastAPI(
         title="RingDIC controller",
@@ -42,6 +48,7 @@ def create_app(desk: Desk, static: Path = STATIC) -> FastAPI:
         redoc_url=None,
     )
     app.state.desk = desk
+    app.add_middleware(RequestGuard, rules=rules or GuardRules())
     api = APIRouter(prefix="/api/v1", responses={404: {"description": "Not found"}, 409: {"description": "Refused"}})
     for resource in (rig, sessions, captures, jobs, results, live_step, events):
         api.include_router(resource.router)
@@ -52,10 +59,11 @@ def create_app(desk: Desk, static: Path = STATIC) -> FastAPI:
 
 
 def _answer_errors(app: FastAPI) -> None:
-    """Answer every error that a client can correct with a status and one sentence."""
+    """Answer every error with a status and one sentence: what the client, the disk or this program is at fault for."""
 
     def answer(status: int, sentence: str) -> JSONResponse:
-        return JSONResponse({"detail": sentence}, status)
+        # A name in it may hold half a character, which JSON in UTF-8 cannot.
+        return JSONResponse({"detail": sentence.encode("utf-8", "replace").decode()}, status)
 
     @app.exception_handler(RefusedError)
     def refused(_: Request, error: RefusedError) -> Response:
@@ -65,6 +73,10 @@ def _answer_errors(app: FastAPI) -> None:
     def not_found(_: Request, error: NotFoundError) -> Response:
         return answer(404, str(error))
 
+    @app.exception_handler(BusyError)
+    def busy(_: Request, error: BusyError) -> Response:
+        return answer(503, str(error))
+
     @app.exception_handler(RingdicError)
     def bad_input(_: Request, error: RingdicError) -> Response:
         return answer(422, str(error))
@@ -73,6 +85,17 @@ def _answer_errors(app: FastAPI) -> None:
     def bad_request(_: Request, error: RequestValidationError) -> Response:
         faults = [f"{'.'.join(str(part) for part in fault['loc'][1:])}: {fault['msg']}" for fault in error.errors()]
         return answer(422, "The request is not understood: " + "; ".join(faults))
+
+    @app.exception_handler(OSError)
+    def disk_failed(_: Request, error: OSError) -> Response:
+        logger.error("a request failed at the disk: %s", error)
+        return answer(507 if error.errno in NO_ROOM else 503, disk_sentence(error))
+
+    @app.exception_handler(Exception)
+    def failed(_: Request, error: Exception) -> Response:
+        response = answer(500, "The request failed through a fault of the controller's own; see the controller's log.")
+        response.headers.update(SAFE_HEADERS)  # it does not pass the guard
+        return response
 
 
 class _HashedFiles(StaticFiles):
@@ -92,6 +115,6 @@ def _serve_page(app: FastAPI, static: Path) -> None:
     def index() -> Response:
         if not page.is_file():
             return HTMLResponse(_NO_PAGE, 503)
-        return FileResponse(page, headers={"Cache-Control": "no-cache"})
+        return FileResponse(page, headers={"Cache-Control": "no-cache", "Content-Security-Policy": OWN_FILES_RUN})
 
     app.mount("/assets", _HashedFiles(directory=static / "assets", check_dir=False), name="assets")

@@ -10,6 +10,7 @@
     [http]
     host = "127.0.0.1"               # the page has no password: another address opens it to that network
     port = 8000                      # 0: a free port
+    hosts = ["lab-pc"]               # further names that the page is opened by; others are refused
 
     [zenoh]
     endpoint = "tcp/127.0.0.1:7447"  # where the nodes connect
@@ -46,8 +47,13 @@ def _tcp_endpoint(endpoint: str) -> str:
     return endpoint
 
 
+def _lower_case(name: str) -> str:
+    return name.lower()
+
+
 Host = Annotated[str, AfterValidator(_named_host)]
 Port = Annotated[int, Strict(), AfterValidator(_tcp_port)]
+HostName = Annotated[Host, AfterValidator(_lower_case)]
 Endpoint = Annotated[str, AfterValidator(_tcp_endpoint)]
 
 
@@ -57,7 +63,7 @@ class ControllerConfig:
 
     archive : folder of the sessions. rig : the rig file; None for a controller that only shows sessions. settings :
     settings file of the processing. live : whether each step is processed as soon as it is archived. host, port : of
-    the page. endpoint : where the nodes connect.
+    the page. endpoint : where the nodes connect. hosts : further names by which the page may be opened, in lower case.
     """
 
     archive: Path = Path("ringdic-archive")
@@ -67,6 +73,7 @@ class ControllerConfig:
     host: Host = "127.0.0.1"
     port: Port = 8000
     endpoint: Endpoint = "tcp/127.0.0.1:7447"
+    hosts: tuple[HostName, ...] = ()
 
 
 @dataclass(frozen=True, config=TABLE)
@@ -75,6 +82,7 @@ class _Http:
 
     host: Host = ControllerConfig.host
     port: Port = ControllerConfig.port
+    hosts: tuple[HostName, ...] = ControllerConfig.hosts
 
 
 @dataclass(frozen=True, config=TABLE)
@@ -121,6 +129,7 @@ def read_controller_config(path: Path | None) -> ControllerConfig:
         live=file.live,
         host=file.http.host,
         port=file.http.port,
+        hosts=file.http.hosts,
         endpoint=file.zenoh.endpoint,
     )
     if file.rig is not None:

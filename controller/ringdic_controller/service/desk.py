@@ -147,10 +147,14 @@ class Desk:
             self.processing.submit_step(closed.session, capture_id)
 
     def _watch(self, interval: float) -> None:
-        """Show sessions and runs that other programs make while the controller is open."""
+        """Show what other programs make while the controller is open; close captures that a full disk left open."""
         while not self._closing.wait(interval):
             try:
+                for session, capture_id in self.rounds.close_left_open():
+                    self.state.publish_capture(session, capture_id)
                 if self.catalogue.sync():
                     self.state.events.publish_snapshot()
             except OSError as error:  # a folder on a network drive may go and come back
                 logger.warning("the archive's folder cannot be read: %s", error)
+            except Exception:  # the next look may do better, and there is nobody else who looks
+                logger.exception("a look for changes in the archive failed")

@@ -11,7 +11,7 @@ from typing import Any
 from ringdic.errors import InputError
 from ringdic.session.names import CAPTURE_KINDS
 
-from ringdic_controller.service.refusals import NotFoundError, RefusedError
+from ringdic_controller.service.refusals import NotFoundError, RefusedError, disk_sentence
 from ringdic_controller.service.roster import NodeRoster
 from ringdic_controller.service.sessions import Sessions
 
@@ -62,8 +62,9 @@ class Rounds:
         self._roster = roster
         self._on_change = on_change
         self._on_archived = on_archived
-        self._lock = Lock()  # guards the rounds
+        self._lock = Lock()  # guards the two below
         self._rounds: dict[str, Round] = {}  # oldest first
+        self._left_open: list[tuple[str, str]] = []  # session and id of captures whose record could not be closed
 
     def get(self, round_id: str) -> Round:
         """The round of this id. Raises NotFoundError."""
@@ -140,7 +141,11 @@ class Rounds:
         try:
             writer = self._sessions.archive.open(new.session)
             record = self._roster.nodes.capture(writer, new.kind, override=new.override)
-        except (RuntimeError, ValueError, OSError) as error:
+        except OSError as error:
+            logger.error("capture %s was broken off: %s", new.id, error)
+            self._note_broken_off(new, disk_sentence(error))
+            return
+        except (RuntimeError, ValueError) as error:
             logger.warning("capture %s was not taken: %s", new.id, error)
             self._change(new.id, state="refused", error=str(error))
             return
@@ -150,8 +155,48 @@ class Rounds:
             raise
         try:
             self._on_archived(new, record.capture_id)
+        except OSError as error:
+            logger.error("the processing of capture %s cannot be queued: %s", record.capture_id, error)
         finally:  # whatever became of its processing, the capture has closed
             self._change(new.id, state="closed", capture_id=record.capture_id)
+
+    def close_left_open(self) -> list[tuple[str, str]]:
+        """Close the captures whose record a disk did not take when their round ended, if it takes it now.
+
+        Their images, which stay with the nodes until then, are archived afterwards. Returns session and capture id of
+        each that has been closed.
+        """
+        with self._lock:
+            waiting = list(self._left_open) if self._running() is None else []
+        closed = []
+        for session, capture_id in waiting:
+            try:
+                self._close(session, capture_id)
+            except OSError as error:
+                logger.warning("capture %s of session %s is still open: %s", capture_id, session, error)
+                continue
+            except ValueError as error:  # its record is damaged meanwhile, or its session was taken away
+                logger.error("capture %s of session %s is left as it is: %s", capture_id, session, error)
+            else:
+                closed.append((session, capture_id))
+            with self._lock:
+                self._left_open.remove((session, capture_id))
+        return closed
+
+    def _close(self, session: str, capture_id: str) -> None:
+        assert self._sessions.archive is not None
+        capture = self._sessions.archive.open(session).capture(capture_id)
+        entries = capture.record().cameras.items()
+        reason = "the archive could not be written when the capture ended"
+        capture.close({camera: reason for camera, entry in entries if entry.status == "pending"})
+
+    def _note_broken_off(self, new: Round, sentence: str) -> None:
+        """End a round that the disk broke off, and remember its capture, if its record is there."""
+        with self._lock:
+            capture_id = self._rounds[new.id].capture_id
+            if capture_id is not None:
+                self._left_open.append((new.session, capture_id))
+        self._change(new.id, state="refused", error=sentence)
 
     def _change(self, round_id: str, **changes: Any) -> None:
         """Change a round, unless it has ended."""

@@ -23,6 +23,7 @@ from ringdic_controller.rig.link import RigLink
 from ringdic_controller.service.app import create_app
 from ringdic_controller.service.config import ControllerConfig
 from ringdic_controller.service.desk import Desk
+from ringdic_controller.service.guard import GuardRules
 
 logger = logging.getLogger(__name__)
 
@@ -81,8 +82,9 @@ def serve_page(desk: Desk, config: ControllerConfig, on_ready: Callable[[str], N
     listener = _listen(config)
     host = f"[{config.host}]" if ":" in config.host else config.host
     address = f"http://{host}:{listener.getsockname()[1]}"
+    rules = GuardRules(hosts=frozenset({config.host.lower(), *config.hosts}))
     server = uvicorn.Server(
-        uvicorn.Config(create_app(desk), log_level="warning", timeout_graceful_shutdown=SHUTDOWN_LIMIT)
+        uvicorn.Config(create_app(desk, rules=rules), log_level="warning", timeout_graceful_shutdown=SHUTDOWN_LIMIT)
     )
     logger.info("the page is at %s", address)
     with listener, _ended_by_signal(server):

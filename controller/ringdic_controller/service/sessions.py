@@ -55,10 +55,13 @@ class Sessions:
             raise NotFoundError(f"There is no session '{name}'.") from error
 
     def current(self) -> str | None:
-        """Name of the session that captures go to: the selected one, else the newest; None if there is no session."""
+        """Name of the session that captures go to: the selected one, else the newest; None if there is no session.
+
+        A session whose ``session.json`` is damaged is not taken by itself.
+        """
         with self._lock:
             selection = self._selection
-        names = [session["name"] for session in self._catalogue.sessions()]
+        names = [session["name"] for session in self._catalogue.sessions() if session["rig"] is not None]
         return selection if selection in names else (names[0] if names else None)
 
     def select(self, name: str) -> None:
@@ -89,9 +92,12 @@ class Sessions:
             try:
                 ready = datetime.fromtimestamp((folder / "results.h5").stat().st_mtime, UTC)
                 archived_at = self._catalogue.capture(session, folder.name).get("closed_at")
-            except (FileNotFoundError, KeyError):  # it is being replaced, or its capture was taken away
+            except (OSError, KeyError):  # it is being replaced, or its capture was taken away
                 continue
-            seconds = (ready - datetime.fromisoformat(archived_at)).total_seconds() if archived_at else None
+            try:
+                seconds = (ready - datetime.fromisoformat(archived_at)).total_seconds() if archived_at else None
+            except (ValueError, TypeError):  # a record of another program: no time, or one without its zone
+                seconds = None
             return {
                 "session": session,
                 "capture_id": folder.name,

@@ -17,12 +17,13 @@ def test_paths_are_taken_from_the_folder_of_the_file(tmp_path: Path) -> None:
     file = tmp_path / "controller.toml"
     file.write_text(
         'archive = "sessions"\nrig = "/etc/rig.toml"\nsettings = "fine.toml"\nlive = false\n'
-        '[http]\nhost = "::1"\nport = 0\n[zenoh]\nendpoint = "tcp/0.0.0.0:7448"\n'
+        '[http]\nhost = "::1"\nport = 0\nhosts = ["Lab-PC"]\n[zenoh]\nendpoint = "tcp/0.0.0.0:7448"\n'
     )
     config = read_controller_config(file)
     assert config == ControllerConfig(
-        tmp_path / "sessions", Path("/etc/rig.toml"), tmp_path / "fine.toml", False, "::1", 0, "tcp/0.0.0.0:7448"
-    )
+        tmp_path / "sessions", Path("/etc/rig.toml"), tmp_path / "fine.toml", False, "::1", 0, "tcp/0.0.0.0:7448",
+        ("lab-pc",),
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -33,6 +34,7 @@ def test_paths_are_taken_from_the_folder_of_the_file(tmp_path: Path) -> None:
         ("[http]\nport = 70000", "70000"),
         ('[http]\nport = "80"', "port"),
         ("[http]\nport = true", "port"),
+        ("[http]\nhosts = [1]", "hosts"),
         ("http = 3", "http"),
         ("live = 1", "true or false"),
         ('[zenoh]\nendpoint = "localhost"', "endpoint"),

@@ -269,7 +269,7 @@ def test_without_a_bundled_page_the_reason_is_told(desk, tmp_path) -> None:
     from fastapi.testclient import TestClient
     from ringdic_controller.service.app import create_app
 
-    with TestClient(create_app(desk, static=tmp_path / "nothing")) as client:
+    with TestClient(create_app(desk, static=tmp_path / "nothing"), base_url="http://127.0.0.1") as client:
         answer = client.get("/")
         assert answer.status_code == 503
         assert "RINGDIC_SKIP_PAGE" in answer.text

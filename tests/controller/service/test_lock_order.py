@@ -113,7 +113,7 @@ def test_a_session_takes_locks_in_one_order_only(
     record: LockRecord, desk_of: Callable[..., Desk], warm_stand_in: WarmChild
 ) -> None:
     desk = desk_of(warm_stand_in, quiet=0.3, watch=0.05)
-    with TestClient(create_app(desk)) as client, readers(client):
+    with TestClient(create_app(desk), base_url="http://127.0.0.1") as client, readers(client):
         client.post(f"{API}/sessions", json={"name": "limb"})
         for kind in ("board", "target", "specimen", "specimen", "specimen"):
             begun = client.post(f"{API}/captures", json={"kind": kind}).json()["id"]

@@ -1,6 +1,7 @@
 """Captures: begin one, follow it, read its record and images."""
 
 from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response, status
@@ -14,8 +15,10 @@ from ringdic_controller.service.refusals import NotFoundError
 from ringdic_controller.service.rounds import Round
 from ringdic_controller.service.routes.desk import TheDesk
 from ringdic_controller.service.routes.etag import cache_headers, client_has
+from ringdic_controller.service.turns import Turns
 
 router = APIRouter(tags=["captures"])
+_PREVIEWS = Turns("previews are asked for", at_once=2, waiting=24)  # each holds a whole image in memory
 
 
 class NewCapture(BaseModel):
@@ -65,11 +68,14 @@ def read_capture(session: str, capture_id: str, desk: TheDesk) -> dict[str, Any]
 )
 def send_image(session: str, capture_id: str, camera: str, desk: TheDesk) -> FileResponse:
     """Original file of an image; its SHA-256 is the one in the capture's record."""
-    file, sha256 = _image(desk, session, capture_id, camera)
-    path = desk.catalogue.path(session) / "captures" / capture_id / file
-    if not path.is_file():
-        raise NotFoundError(f"The image {file} of capture '{capture_id}' is not in its folder any more.")
-    return FileResponse(path, filename=f"{session}-{capture_id}-{file}", headers={"X-SHA256": sha256})
+    path, sha256 = _image(desk, session, capture_id, camera)
+    # As nothing that a browser would show by itself: the record of a foreign session names the file.
+    return FileResponse(
+        path,
+        media_type="application/octet-stream",
+        filename=f"{session}-{capture_id}-{path.name}",
+        headers={"X-SHA256": sha256},
+    )
 
 
 @router.get(
@@ -87,20 +93,21 @@ def send_preview(
     width: Annotated[int, Query(ge=16, le=2048)] = 320,
 ) -> Response:
     """Small picture of an image as a JPEG, at most ``width`` px wide."""
-    file, sha256 = _image(desk, session, capture_id, camera)
+    path, sha256 = _image(desk, session, capture_id, camera)
     headers = cache_headers(f"{sha256[:32]}-{width}")
     if client_has(request, headers):
         return Response(status_code=304, headers=headers)
-    path = desk.catalogue.path(session) / "captures" / capture_id / file
-    return Response(preview_jpeg(path, width), media_type="image/jpeg", headers=headers)
+    with _PREVIEWS.take():
+        jpeg = preview_jpeg(path, width)
+    return Response(jpeg, media_type="image/jpeg", headers=headers)
 
 
-def _image(desk: Desk, session: str, capture_id: str, camera: str) -> tuple[str, str]:
-    """File name and checksum of an archived image, from the capture's record: no other file can be asked for."""
+def _image(desk: Desk, session: str, capture_id: str, camera: str) -> tuple[Path, str]:
+    """Path and checksum of an archived image, from the capture's record: no other file can be asked for."""
     entry = read_capture(session, capture_id, desk).get("cameras", {}).get(camera)
     if entry is None or not entry.get("file"):
         raise NotFoundError(f"Capture '{capture_id}' has no image of camera '{camera}'.")
-    file = str(entry["file"])
-    if "/" in file or "\\" in file or file.startswith("."):
-        raise NotFoundError(f"Capture '{capture_id}' names no usable file for camera '{camera}'.")
-    return file, str(entry.get("sha256") or "")
+    path = desk.catalogue.file(session, "captures", capture_id, str(entry["file"]))
+    if path is None:
+        raise NotFoundError(f"The image {entry['file']} of capture '{capture_id}' is not in its folder any more.")
+    return path, str(entry.get("sha256") or "")

@@ -16,9 +16,10 @@ router = APIRouter(prefix="/sessions/{session}/live", tags=["live"])
 
 def _locate(session: str, capture_id: str, desk: TheDesk) -> Path:
     """The results file of a live step."""
-    for folder in desk.catalogue.live_steps(session):
-        if folder.name == capture_id and (folder / "results.h5").is_file():
-            return folder / "results.h5"
+    if capture_id in (folder.name for folder in desk.catalogue.live_steps(session)):
+        path = desk.catalogue.file(session, "live", capture_id, "results.h5")
+        if path is not None:
+            return path
     raise NotFoundError(f"Session '{session}' has no live results of capture '{capture_id}'; newer ones replace them.")
 
 

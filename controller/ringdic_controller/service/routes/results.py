@@ -7,23 +7,27 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Query, Response
 from fastapi.responses import FileResponse, HTMLResponse
 from ringdic.results.reader import read_summary, read_unmeasured
-from ringdic.session.folder import open_session
+from ringdic.session.folder import is_run_name, open_session
 
+from ringdic_controller.service.guard import PICTURES_ALONE
 from ringdic_controller.service.preview import picture_jpeg
 from ringdic_controller.service.refusals import NotFoundError
 from ringdic_controller.service.routes.arrays import add_arrays, version_of
 from ringdic_controller.service.routes.desk import TheDesk
+from ringdic_controller.service.turns import Turns
 
 router = APIRouter(prefix="/sessions/{session}/results", tags=["results"])
+_REPORTS = Turns("reports are asked for", at_once=1, waiting=4)
+_PICTURES = Turns("pictures are asked for", at_once=2, waiting=8)
 
 
 def _locate(session: str, run: str, desk: TheDesk) -> Path:
     """The results file of a run."""
     try:
-        path = desk.catalogue.path(session) / "results" / run / "results.h5"
+        path = desk.catalogue.file(session, "results", run, "results.h5") if is_run_name(run) else None
     except KeyError as error:
         raise NotFoundError(f"There is no session '{session}'.") from error
-    if not (run.isascii() and run.isdigit() and path.is_file()):
+    if path is None:
         raise NotFoundError(f"Session '{session}' has no results of a run '{run}'.")
     return path
 
@@ -55,11 +59,14 @@ def send_run_file(session: str, run: str, path: RunFile) -> FileResponse:
 def read_report(session: str, run: str, results: RunFile, desk: TheDesk) -> Response:
     """The report of a run as HTML; the first request writes it beside the results, which takes a while."""
     path = results.with_name("report.html")
-    if not path.is_file() or path.stat().st_mtime_ns < results.stat().st_mtime_ns:
+    written = desk.catalogue.file(session, "results", run, path.name)
+    if written is None or written.stat().st_mtime_ns < results.stat().st_mtime_ns:
         from ringdic.report import write_report  # loads the drawing library, which nothing else here needs
 
-        write_report(desk.catalogue.path(session), path, int(run))
-    return FileResponse(path, media_type="text/html", headers={"Cache-Control": "no-cache"})
+        with _REPORTS.take():
+            write_report(desk.catalogue.path(session), path, int(run))
+    headers = {"Cache-Control": "no-cache", "Content-Security-Policy": PICTURES_ALONE}
+    return FileResponse(path, media_type="text/html", headers=headers)
 
 
 @router.get("/{run}/unmeasured", summary="Texture that was not measured: areas by reason, and the cameras that show it")
@@ -90,8 +97,10 @@ def send_unmeasured_picture(
     places = next((one for one in read_unmeasured(path) if one.camera == camera), None)
     if places is None:
         raise NotFoundError(f"The run does not tell what camera '{camera}' shows that was not measured.")
-    image = photograph(open_session(desk.catalogue.path(session)), read_summary(path)["steps"][0], camera)
-    return Response(picture_jpeg(unmeasured_picture(image, places), width), media_type="image/jpeg")
+    with _PICTURES.take():
+        image = photograph(open_session(desk.catalogue.path(session)), read_summary(path)["steps"][0], camera)
+        jpeg = picture_jpeg(unmeasured_picture(image, places), width)
+    return Response(jpeg, media_type="image/jpeg")
 
 
 add_arrays(router, "/{run}", _locate)

@@ -6,7 +6,8 @@ export const byId = (id) => document.getElementById(id);
 export function element(tag, attributes = {}, ...children) {
   const item = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
-    if (name.startsWith("on")) item.addEventListener(name.slice(2), value);
+    if (name === "style") item.style.cssText = value; // as an attribute, the page's content security policy refuses it
+    else if (name.startsWith("on")) item.addEventListener(name.slice(2), value);
     else if (value !== null && value !== false && value !== undefined) item.setAttribute(name, value === true ? "" : value);
   }
   item.append(...children.filter((child) => child !== null && child !== undefined));

@@ -72,7 +72,9 @@ const apply = {
   },
 };
 
-/** Follow the event stream for as long as the page is open; the browser reconnects by itself. */
+const AGAIN = 5000; // ms until the next attempt, where the browser makes none
+
+/** Follow the event stream for as long as the page is open. The browser reconnects by itself, except after a refusal. */
 export function follow() {
   const source = new EventSource("/api/v1/live");
   const connected = (yes) => {
@@ -80,9 +82,11 @@ export function follow() {
     changed("connected");
   };
   source.addEventListener("open", () => connected(true));
-  source.addEventListener("error", () => connected(false));
+  source.addEventListener("error", () => {
+    connected(false);
+    if (source.readyState === EventSource.CLOSED) setTimeout(follow, AGAIN);
+  });
   for (const [name, update] of Object.entries(apply)) {
     source.addEventListener(name, (event) => update(JSON.parse(event.data)));
   }
-  return source;
 }

@@ -1,16 +1,20 @@
 // The choice of the session, and the creation of a new one.
 
 import { post, put, url } from "./api.js";
-import { byId, counted, notice, setOptions } from "./dom.js";
+import { byId, counted, element, notice, setOptions } from "./dom.js";
 import { state } from "./live.js";
 
 export function showSessions() {
-  const options = state.sessions.map(({ name, captures, runs }) => {
+  const options = state.sessions.map(({ name, captures, runs, damaged }) => {
     const count = Object.values(captures).reduce((sum, n) => sum + n, 0);
-    return { value: name, label: `${name} (${counted(count, "capture")}, ${counted(runs, "run")})` };
+    const harm = damaged.length ? ", damaged" : "";
+    return { value: name, label: `${name} (${counted(count, "capture")}, ${counted(runs, "run")}${harm})` };
   });
   const none = [{ value: "", label: "no session yet" }];
   setOptions(byId("session-select"), options.length ? options : none, state.current ?? "");
+  const sentences = state.sessions.flatMap(({ name, damaged }) => damaged.map((sentence) => `${name}: ${sentence}`));
+  byId("damaged").replaceChildren(...sentences.map((sentence) => element("li", {}, sentence)));
+  byId("damaged").hidden = sentences.length === 0;
   const rig = state.rig?.name;
   byId("session-name").disabled = byId("session-create").disabled = !rig;
   byId("session-create").title = rig ? "" : "The controller runs without a rig.toml, so no session can be created.";
