@@ -12,7 +12,7 @@ OLDEST := $(shell sed -n 's/.*"numba>=\([0-9.]*\),.*/\1/p' pyproject.toml | head
 # Fails unless the bundled page lies in the installed package.
 HAS_PAGE := from importlib.resources import files; files('ringdic_controller').joinpath('web/static/index.html').read_text()
 
-.PHONY: install demo test test-narrow test-numba test-dist lint bench dist clean
+.PHONY: install demo test test-narrow test-numba test-dist lint audit bench dist clean
 
 $(VENV)/.installed: pyproject.toml
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
@@ -51,6 +51,12 @@ test-numba:                            ## the kernels as compiled by the oldest 
 	test -d build/numba || $(PYTHON) -m venv build/numba
 	RINGDIC_SKIP_PAGE=1 build/numba/bin/python -m pip install --quiet ".[processing]" "numba==$(OLDEST).*" pytest
 	cd build && numba/bin/python -P -m pytest --noconftest ../tests/processing/correlation/test_single_precision_kernel.py
+
+audit: $(VENV)/.installed              ## known weaknesses of the packages that are installed; asks PyPI
+	test -d build/audit || $(PYTHON) -m venv build/audit
+	build/audit/bin/python -m pip install --quiet pip-audit
+	$(BIN)/python -m pip freeze --exclude-editable > build/audit/installed.txt
+	build/audit/bin/pip-audit --no-deps --disable-pip --strict -r build/audit/installed.txt
 
 bench: install                         ## speed and memory
 	$(BIN)/ringdic bench

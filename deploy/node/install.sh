@@ -87,6 +87,10 @@ account() {
   id -u "$USER_NAME" >/dev/null 2>&1 ||
     useradd --system --user-group --groups video --home-dir /var/lib/ringdic --shell /usr/sbin/nologin "$USER_NAME"
   install -d -o "$USER_NAME" -g "$USER_NAME" -m 0750 "$state"
+  if [[ -d ${config%/*}/certificates ]]; then # root keeps them; the service may read its key, and nobody else
+    chown -R "root:$USER_NAME" "${config%/*}/certificates"
+    chmod -R u=rwX,g=rX,o= "${config%/*}/certificates"
+  fi
 }
 
 build() { # build FOLDER: the release, complete or absent; every step says so itself, for `set -e` sleeps in a condition

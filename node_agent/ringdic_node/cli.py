@@ -17,6 +17,7 @@ from pathlib import Path
 from ringdic_node.cameras.camera import CameraError, Shot
 from ringdic_node.clock import SystemClock, clock_offset
 from ringdic_node.config import ConfigError, NodeConfig, make_camera, read_node_config
+from ringdic_node.endpoint import EndpointError, endpoint_security, handshake_fault
 from ringdic_node.spool import Spool
 
 DEFAULT_CONFIG = Path("/etc/ringdic/node.toml")
@@ -33,12 +34,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     try:
         config = read_node_config(options.config)
-        if options.command == "run":
-            return _run(config)
-        if options.command == "check":
-            return _check(config)
-        return _shoot(config, options.out)
-    except ConfigError as error:
+        if options.command == "shoot":
+            return _shoot(config, options.out)
+        endpoint_security(config.controller, config.certificates)  # refused before anything is opened
+        return _run(config) if options.command == "run" else _check(config)
+    except (ConfigError, EndpointError) as error:
         sys.stderr.write(f"{error}\n")
         return 2
     except (CameraError, OSError) as error:
@@ -132,8 +132,12 @@ def _probe_controller(config: NodeConfig) -> tuple[bool, str]:
     def ignore(*_: object) -> None:
         pass
 
+    if fault := handshake_fault(config.controller, config.certificates):
+        return False, f"{config.controller} and this node do not accept each other's certificates: {fault}"
     # With an id of its own, since the controller would take it for the running service.
-    with NodeLink(Keys(config.rig), "check", config.controller, ignore, ignore) as link:
+    with NodeLink(
+        Keys(config.rig), "check", config.controller, ignore, ignore, certificates=config.certificates
+    ) as link:
         deadline = time.monotonic() + 3.0
         while time.monotonic() < deadline:
             if link.connected:

@@ -4,7 +4,8 @@
 
     rig = "ring-12"
     id = "cam_01"
-    controller = "tcp/192.168.1.10:7447"
+    controller = "tls/192.168.1.10:7447"
+    certificates = "/etc/ringdic/certificates"
     spool = "/var/lib/ringdic/spool"
     camera = "pi"                       # or "virtual", "pattern", "playback"
 
@@ -12,7 +13,8 @@
     size = [3280, 2464]
     sync = "client"
 
-Relative paths of the spool and of a playback image are taken from the folder of the configuration file.
+Relative paths of the spool, of the certificates and of a playback image are taken from the folder of the configuration
+file. A controller on the same machine may have an endpoint ``tcp/…`` without certificates.
 """
 
 from __future__ import annotations
@@ -62,6 +64,7 @@ class NodeConfig:
     ``camera_settings``. spool_reserve_mb : MiB of the disk that images leave free. spool_keep_mb : MiB of delivered
     images that are kept while there is room. arm_captures : number of captures that must find room before the camera
     arms. resend_s, status_s : seconds until an unacknowledged image is sent again, and between two status messages.
+    certificates : folder of this node's certificate, for an endpoint ``tls/…``.
     """
 
     rig: str
@@ -75,6 +78,7 @@ class NodeConfig:
     arm_captures: int = 10
     resend_s: float = 5.0
     status_s: float = 1.0
+    certificates: Path = Path("/etc/ringdic/certificates")
 
     def __post_init__(self) -> None:
         try:
@@ -85,7 +89,7 @@ class NodeConfig:
         if self.camera not in _CAMERA_KEYS:
             raise ConfigError(f"camera '{self.camera}' is none of {', '.join(_CAMERA_KEYS)}")
         if not re.fullmatch(r"(tcp|tls|quic)/\S+:\d+(#\S*)?", self.controller):
-            raise ConfigError(f"controller '{self.controller}' is no endpoint; write it like tcp/192.168.1.10:7447")
+            raise ConfigError(f"controller '{self.controller}' is no endpoint; write it like tls/192.168.1.10:7447")
         if self.resend_s <= 0 or self.status_s <= 0 or self.arm_captures < 1:
             raise ConfigError("resend_s, status_s and arm_captures must be positive")
         if self.spool_reserve_mb < 0 or self.spool_keep_mb < 0:
@@ -122,6 +126,8 @@ def _parse(table: dict[str, Any], folder: Path) -> NodeConfig:
     for key in ("rig", "id", "controller", "spool", "camera"):
         if not isinstance(table.get(key), str):
             raise ConfigError(f"the key '{key}' is missing or not a text in quotes")
+    if not isinstance(table.get("certificates", ""), str):
+        raise ConfigError("certificates must be a folder in quotes")
     numbers = {}
     for key in ("spool_reserve_mb", "spool_keep_mb", "arm_captures", "resend_s", "status_s"):
         if key in table:
@@ -140,6 +146,7 @@ def _parse(table: dict[str, Any], folder: Path) -> NodeConfig:
         spool=folder / table["spool"],
         camera=table["camera"],
         camera_settings=settings,
+        certificates=folder / table.get("certificates", NodeConfig.certificates),
         **numbers,
     )
 

@@ -11,10 +11,12 @@ import json
 import logging
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from types import TracebackType
 
 import zenoh
 
+from ringdic_node.endpoint import endpoint_security
 from ringdic_node.wire import NETWORK, Keys, Manifest, Message, encode
 
 log = logging.getLogger(__name__)
@@ -35,6 +37,10 @@ class NodeLink:
         Called from Zenoh's threads with an acknowledgement; must only enqueue.
     instance : str
         Name of this process, which is seen alive beside the node; empty for none.
+    certificates : Path
+        Folder of this node's certificate, for an endpoint ``tls/…``.
+
+    Entering raises EndpointError for an endpoint or certificates that may not or cannot be used.
     """
 
     def __init__(
@@ -45,6 +51,7 @@ class NodeLink:
         on_query: Callable[[str, bytes, int], None],
         on_ack: Callable[[bytes], None],
         instance: str = "",
+        certificates: Path | None = None,
     ) -> None:
         self._keys = keys
         self._node = node
@@ -52,12 +59,13 @@ class NodeLink:
         self._on_query = on_query
         self._on_ack = on_ack
         self._instance = instance
+        self._certificates = certificates
         self._questions: dict[int, zenoh.Query] = {}
         self._numbers = itertools.count(1)
         self._lock = threading.Lock()
 
     def __enter__(self) -> NodeLink:
-        self._session = zenoh.open(node_config(self._controller))
+        self._session = zenoh.open(node_config(self._controller, self._certificates))
         # Queryables first, the liveliness token last: a node that is seen alive answers.
         self._queryables = [
             self._session.declare_queryable(self._keys.node(self._node, verb), self._receiver(verb)) for verb in VERBS
@@ -147,15 +155,19 @@ class NodeLink:
             log.warning("the status could not be sent: %s", error)
 
 
-def node_config(controller: str) -> zenoh.Config:
-    """Zenoh's configuration of a node: a peer that connects to the controller and retries without end."""
+def node_config(controller: str, certificates: Path | None = None) -> zenoh.Config:
+    """Zenoh's configuration of a node: a peer that connects to the controller and retries without end.
+
+    Raises EndpointError for a plain endpoint on another machine, and for certificates that cannot be used.
+    """
     config = zenoh.Config()
-    parameters = f"{RETRY};{SMALL_BUFFER}" if controller.startswith("tcp/") else RETRY
+    parameters = f"{RETRY};{SMALL_BUFFER}" if controller.startswith(("tcp/", "tls/")) else RETRY
     settings = {
         "mode": "peer",
         "listen/endpoints": [],
         "connect/endpoints": [f"{controller}{';' if '#' in controller else '#'}{parameters}"],
         **NETWORK,
+        **endpoint_security(controller, certificates),
     }
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))

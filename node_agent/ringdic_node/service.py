@@ -86,8 +86,9 @@ class NodeService:
     def run(self) -> None:
         """Serve until stopped. Raises ServiceError if one of its threads has died."""
         keys = Keys(self.config.rig)
+        config, instance = self.config, self._identity.instance
         with NodeLink(
-            keys, self.config.id, self.config.controller, self._receive, self._receive_ack, self._identity.instance
+            keys, config.id, config.controller, self._receive, self._receive_ack, instance, config.certificates
         ) as link:
             self._link = link
             workers = [

@@ -25,7 +25,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar
 
 from ringdic_node.json_document import WireError, build, document_of, plain, read_document, shown
@@ -317,6 +317,14 @@ class Inventory(_Message):
 
     def __post_init__(self) -> None:
         valid_name("node", self.node)
+
+    def own_part(self) -> Inventory:
+        """The list without what it says of other nodes: a node speaks for itself alone."""
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        for name, value in values.items():
+            if isinstance(value, tuple):
+                values[name] = tuple(entry for entry in value if entry.node == self.node)
+        return Inventory(**values)
 
 
 @dataclass(frozen=True)

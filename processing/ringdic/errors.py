@@ -29,7 +29,7 @@ class ComputationError(RingdicError, RuntimeError):
 # Extras of the installation and the packages that each brings, by the names under which they are imported.
 _EXTRAS = {
     "processing": ("cv2", "h5py", "matplotlib", "numba", "PIL", "pydantic", "rich", "scipy", "trimesh", "typer"),
-    "controller": ("fastapi", "uvicorn"),
+    "controller": ("argon2", "cryptography", "fastapi", "itsdangerous", "uvicorn"),
     "cluster": ("dask", "distributed"),
     "viewer": ("pyvista",),
 }

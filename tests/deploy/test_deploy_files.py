@@ -63,7 +63,7 @@ def test_controller_example_is_accepted_and_archives_where_the_unit_may_write() 
     config = read_controller_config(CONTROLLER / "controller.toml.example")
     assert config.archive == Path("/var/lib/ringdic/archive")
     assert unit_of(UNITS[1])["Service"]["StateDirectory"] == "ringdic"
-    assert config.host == "127.0.0.1"  # the page has no login: it is not offered to the network unasked
+    assert config.host == "127.0.0.1"  # without users, the page is not offered to the network
 
 
 def test_nodes_connect_to_the_port_on_which_the_controller_listens() -> None:

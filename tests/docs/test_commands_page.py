@@ -30,10 +30,10 @@ def offered() -> dict[str, Any]:
 def described(table: Table) -> dict[str, str]:
     """What the page writes of each command of `ringdic`, by name."""
     texts: dict[str, str] = {}
-    for heading in ("Sessions", "Building a rig", "Archives", "Results of a session", "Studies"):
+    for heading in ("Sessions", "Building a rig", "Users of the page", "Archives", "Results of a session", "Studies"):
         for cell, _ in table("commands.md", heading):
             text = cell.strip("`").replace("\\|", "|")
-            name = re.match(r"ringdic (?:(?:measure|rig|archive) )?\w+", text)
+            name = re.match(r"ringdic (?:(?:measure|rig|users|archive) )?\w+", text)
             assert name is not None, cell
             texts[name[0]] = text
     return texts

@@ -67,6 +67,16 @@ def test_a_missing_configuration_is_bad_input(tmp_path, capsys):
     assert "no such file" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["run", "check"])
+@pytest.mark.parametrize("controller", ["tcp/192.168.1.10:7447", "tls/192.168.1.10:7447"])
+def test_a_controller_on_another_machine_needs_certificates(config, tmp_path, controller, command, capsys):
+    text = SOUND.replace("tcp/127.0.0.1:1", controller).replace("camera =", f'certificates = "{tmp_path}/c"\ncamera =')
+    config.write_text(text)
+    assert main([command, "--config", str(config)]) == 2
+    assert "ringdic rig certificates" in capsys.readouterr().err
+    assert not (tmp_path / "spool").exists(), "refused before anything is opened"
+
+
 def test_shoot_writes_one_still_and_never_replaces_it(config, tmp_path, capsys):
     out = tmp_path / "still.pgm"
     assert main(["shoot", "--config", str(config), "--out", str(out)]) == 0

@@ -1,4 +1,4 @@
-"""The commands ``demo``, ``controller``, ``validate`` and ``bench``, added to ``ringdic`` through its entry points.
+"""The commands ``demo``, ``controller``, ``rig``, ``users``, ``validate``, ``bench``, added to ``ringdic``.
 
 Importing this module needs no package of the extra ``controller``, so that ``ringdic --help`` lists the commands
 wherever the library is installed; a command whose packages are missing says which extra to install.
@@ -13,7 +13,10 @@ from typing import Annotated
 import typer
 from ringdic.cli.console import print_json
 from ringdic.cli.options import AsJson
+from ringdic.cli.rig import rig_app
 
+from ringdic_controller.cli.rig import RIG_COMMANDS
+from ringdic_controller.cli.users import users_app
 from ringdic_controller.studies.bench.command import bench_command
 
 
@@ -23,6 +26,9 @@ def add_commands(app: typer.Typer) -> None:
     app.command("controller")(controller_command)
     app.command("validate")(validate_command)
     app.command("bench")(bench_command)
+    app.add_typer(users_app)
+    for name, command in RIG_COMMANDS.items():
+        rig_app.command(name)(command)
 
 
 def demo_command(

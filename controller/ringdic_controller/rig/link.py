@@ -7,12 +7,12 @@ the nodes, when they appear and at an interval, which images they still hold.
 
 from __future__ import annotations
 
-import json
 import logging
 import queue
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -20,8 +20,8 @@ import zenoh
 from ringdic.errors import ComputationError, InputError
 from ringdic.session.records import CaptureRecord
 from ringdic.session.writer import Archive, CaptureWriter, SessionWriter
+from ringdic_node.endpoint import EndpointError
 from ringdic_node.wire import (
-    NETWORK,
     Ack,
     Arm,
     ArmReply,
@@ -45,6 +45,7 @@ from ringdic_controller.rig.capture import Timing
 from ringdic_controller.rig.intake import Intake
 from ringdic_controller.rig.presence import NodePresence
 from ringdic_controller.rig.rounds import run_round
+from ringdic_controller.rig.router import router_config
 from ringdic_controller.rig.unclosed import UnclosedCaptures
 from ringdic_controller.rig.visits import NodeVisits
 
@@ -68,7 +69,7 @@ class RigLink:
     cameras
         Ids of the expected cameras, in ring order.
     endpoint
-        Where nodes connect, like ``tcp/0.0.0.0:7447``; the port must be a definite one.
+        Where nodes connect, like ``tls/0.0.0.0:7447``; the port must be a definite one.
     archive
         Receives the captures.
     on_event : callable (dict)
@@ -80,6 +81,9 @@ class RigLink:
         Largest skew of a capture that is not flagged, ns.
     reconcile_s
         Interval at which nodes are asked which images they hold, s.
+    certificates
+        Folder of the controller's certificate, for an endpoint ``tls/…``: then a node needs one too, and may speak only
+        for itself. Only an endpoint on loopback does without.
     """
 
     def __init__(
@@ -93,10 +97,12 @@ class RigLink:
         timing: Timing | None = None,
         tolerance_ns: int = 1_000_000,
         reconcile_s: float = 10.0,
+        certificates: Path | None = None,
     ) -> None:
         self.cameras = list(cameras)
         self._keys = Keys(rig_name)
         self._endpoint = endpoint
+        self._certificates = certificates
         self._archive = archive
         self._on_event = on_event
         self._timing = timing or Timing()
@@ -114,7 +120,9 @@ class RigLink:
         for name in self._archive.close_unfinished("the controller was restarted before the image arrived"):
             log.warning("capture %s was left open by an earlier run and is closed", name)
         try:
-            self._session = zenoh.open(_router_config(self._endpoint))
+            self._session = zenoh.open(router_config(self._endpoint, self._keys.rig, self.cameras, self._certificates))
+        except EndpointError as error:
+            raise InputError(str(error)) from error
         except zenoh.ZError as error:
             reason = str(error).split(" at /")[0].lstrip("[")
             raise InputError(
@@ -459,15 +467,8 @@ def _decoded(reply: zenoh.Reply, answer: type[Any]) -> Any | None:
         log.warning("a question to a node went without its answer: %s", reason)
         return None
     try:
-        return decode_as(answer, reply.ok.payload.to_bytes())
+        message = decode_as(answer, reply.ok.payload.to_bytes())
     except WireError as error:
         log.warning("an answer on %s breaks the contract: %s", reply.ok.key_expr, error)
         return None
-
-
-def _router_config(endpoint: str) -> zenoh.Config:
-    """Zenoh's configuration of the controller, which is the router that all nodes connect to."""
-    config = zenoh.Config()
-    for key, value in {"mode": "router", "listen/endpoints": [endpoint], **NETWORK}.items():
-        config.insert_json5(key, json.dumps(value))
-    return config
+    return message.own_part() if isinstance(message, Inventory) else message

@@ -12,10 +12,12 @@ from fastapi.staticfiles import StaticFiles
 from ringdic.errors import RingdicError
 from starlette.types import Scope
 
+from ringdic_controller.access.audit import AUDIT_FILE, AuditLog
 from ringdic_controller.service.desk import Desk
+from ringdic_controller.service.gate import Access, AccessGate
 from ringdic_controller.service.guard import OWN_FILES_RUN, SAFE_HEADERS, GuardRules, RequestGuard
 from ringdic_controller.service.refusals import NO_ROOM, BusyError, NotFoundError, RefusedError, disk_sentence
-from ringdic_controller.service.routes import captures, events, jobs, live_step, results, rig, sessions
+from ringdic_controller.service.routes import captures, events, jobs, live_step, login, results, rig, sessions
 
 logger = logging.getLogger(__name__)
 
@@ -27,7 +29,9 @@ _NO_PAGE = (
 )
 
 
-def create_app(desk: Desk, static: Path = STATIC, rules: GuardRules | None = None) -> FastAPI:
+def create_app(
+    desk: Desk, static: Path = STATIC, rules: GuardRules | None = None, access: Access | None = None
+) -> FastAPI:
     """Create the web application that serves a desk over HTTP, and the bundled page.
 
     Parameters
@@ -38,6 +42,8 @@ def create_app(desk: Desk, static: Path = STATIC, rules: GuardRules | None = Non
         Folder of the page's files.
     rules
         Which requests pass; None lets those pass that come to an address of this PC.
+    access
+        Who may use it; None where whoever reaches it may.
     """
     app = FastAPI(
         title="RingDIC controller",
@@ -48,11 +54,15 @@ def create_app(desk: Desk, static: Path = STATIC, rules: GuardRules | None = Non
         redoc_url=None,
     )
     app.state.desk = desk
-    app.add_middleware(RequestGuard, rules=rules or GuardRules())
+    app.state.access = access or Access(AuditLog(desk.catalogue.root / AUDIT_FILE))
+    app.add_middleware(AccessGate, access=app.state.access)
+    app.add_middleware(RequestGuard, rules=rules or GuardRules())  # the last one added is asked first
     api = APIRouter(prefix="/api/v1", responses={404: {"description": "Not found"}, 409: {"description": "Refused"}})
     for resource in (rig, sessions, captures, jobs, results, live_step, events):
         api.include_router(resource.router)
+    api.include_router(login.account_router)
     app.include_router(api)
+    app.include_router(login.router)
     _answer_errors(app)
     _serve_page(app, static)
     return app

@@ -6,14 +6,16 @@
     rig = "rig.toml"                 # the rig whose nodes are expected; without it the controller only shows
     settings = "settings.toml"       # settings of the processing
     live = true                      # each step is processed as soon as it is archived, and shown
+    certificates = "certificates/controller"  # made by `ringdic rig certificates`
+    users = "users.json"             # made by `ringdic users add`; with it the page asks who you are
 
     [http]
-    host = "127.0.0.1"               # the page has no password: another address opens it to that network
+    host = "127.0.0.1"               # another address needs certificates and users
     port = 8000                      # 0: a free port
     hosts = ["lab-pc"]               # further names that the page is opened by; others are refused
 
     [zenoh]
-    endpoint = "tcp/127.0.0.1:7447"  # where the nodes connect
+    endpoint = "tcp/127.0.0.1:7447"  # where the nodes connect; another address needs certificates and tls/…
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ def _tcp_port(port: int) -> int:
 
 def _tcp_endpoint(endpoint: str) -> str:
     if "/" not in endpoint or ":" not in endpoint:
-        raise ValueError(f"'{endpoint}' is not of the form tcp/ADDRESS:PORT")
+        raise ValueError(f"'{endpoint}' is not of the form tls/ADDRESS:PORT")
     return endpoint
 
 
@@ -64,6 +66,8 @@ class ControllerConfig:
     archive : folder of the sessions. rig : the rig file; None for a controller that only shows sessions. settings :
     settings file of the processing. live : whether each step is processed as soon as it is archived. host, port : of
     the page. endpoint : where the nodes connect. hosts : further names by which the page may be opened, in lower case.
+    certificates : folder of the controller's certificate. users : file of
+    those who may use the page; None where whoever reaches it may.
     """
 
     archive: Path = Path("ringdic-archive")
@@ -74,6 +78,8 @@ class ControllerConfig:
     port: Port = 8000
     endpoint: Endpoint = "tcp/127.0.0.1:7447"
     hosts: tuple[HostName, ...] = ()
+    certificates: Path | None = None
+    users: Path | None = None
 
 
 @dataclass(frozen=True, config=TABLE)
@@ -100,6 +106,8 @@ class _ConfigFile:
     rig: Path | None = None
     settings: Path | None = None
     live: StrictBool = ControllerConfig.live
+    certificates: Path | None = None
+    users: Path | None = None
     http: _Http = _Http()
     zenoh: _Zenoh = _Zenoh()
 
@@ -132,6 +140,7 @@ def read_controller_config(path: Path | None) -> ControllerConfig:
         hosts=file.http.hosts,
         endpoint=file.zenoh.endpoint,
     )
-    if file.rig is not None:
-        config = replace(config, rig=folder / file.rig)
-    return config if file.settings is None else replace(config, settings=folder / file.settings)
+    for name in ("rig", "settings", "certificates", "users"):
+        if (named := getattr(file, name)) is not None:
+            config = replace(config, **{name: folder / named})
+    return config

@@ -24,6 +24,7 @@ from ringdic_controller.service.app import create_app
 from ringdic_controller.service.config import ControllerConfig
 from ringdic_controller.service.desk import Desk
 from ringdic_controller.service.guard import GuardRules
+from ringdic_controller.service.page_security import page_security
 
 logger = logging.getLogger(__name__)
 
@@ -66,7 +67,14 @@ def open_desk(
         tolerance_ns = TOLERANCE_NS if tolerance_us is None else round(tolerance_us * 1000)
         cameras = [camera.id for camera in rig.cameras]
         with RigLink(
-            rig.name, cameras, config.endpoint, archive, desk.on_event, timing=timing, tolerance_ns=tolerance_ns
+            rig.name,
+            cameras,
+            config.endpoint,
+            archive,
+            desk.on_event,
+            timing=timing,
+            tolerance_ns=tolerance_ns,
+            certificates=config.certificates,
         ) as link:
             desk.connect(archive, link)
             yield desk
@@ -77,14 +85,21 @@ def open_desk(
 def serve_page(desk: Desk, config: ControllerConfig, on_ready: Callable[[str], None] | None = None) -> None:
     """Serve the page and the HTTP interface until SIGINT or SIGTERM.
 
-    ``on_ready`` is called with the page's address. Raises InputError if the port is taken.
+    ``on_ready`` is called with the page's address. Raises InputError if the port is taken, and where other machines
+    reach the page without certificates and users.
     """
+    secured = page_security(config)
     listener = _listen(config)
     host = f"[{config.host}]" if ":" in config.host else config.host
-    address = f"http://{host}:{listener.getsockname()[1]}"
+    address = f"{secured.scheme}://{host}:{listener.getsockname()[1]}"
     rules = GuardRules(hosts=frozenset({config.host.lower(), *config.hosts}))
     server = uvicorn.Server(
-        uvicorn.Config(create_app(desk, rules=rules), log_level="warning", timeout_graceful_shutdown=SHUTDOWN_LIMIT)
+        uvicorn.Config(
+            create_app(desk, rules=rules, access=secured.access),
+            log_level="warning",
+            timeout_graceful_shutdown=SHUTDOWN_LIMIT,
+            **secured.server_settings,
+        )
     )
     logger.info("the page is at %s", address)
     with listener, _ended_by_signal(server):
@@ -95,6 +110,7 @@ def serve_page(desk: Desk, config: ControllerConfig, on_ready: Callable[[str], N
 
 def run_controller(config: ControllerConfig, on_ready: Callable[[str], None] | None = None) -> None:
     """Run the controller until SIGINT or SIGTERM; ``on_ready`` is called with the page's address."""
+    page_security(config)  # refused before nodes are let in
     with open_desk(config) as desk:
         serve_page(desk, config, on_ready)
 

@@ -12,6 +12,7 @@ async function request(address, options) {
     throw new Error("The controller does not answer.");
   }
   if (response.ok) return response;
+  if (response.status === 401) location.assign("/login");
   const answer = await response.json().catch(() => ({}));
   throw new Error(answer.detail ?? `The controller answered ${response.status} ${response.statusText}.`);
 }

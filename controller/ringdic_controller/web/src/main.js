@@ -1,5 +1,6 @@
 // The operator's page: follows the live state and draws each part when it changes.
 
+import { showAccount } from "./account.js";
 import { showCapture, showCaptures, wireCaptures } from "./captures.js";
 import { byId } from "./dom.js";
 import { showJobs, wireJobs } from "./jobs.js";
@@ -13,6 +14,7 @@ function showConnection() {
   const live = byId("live");
   live.textContent = state.connected ? "live" : "no answer from the controller, trying again …";
   live.classList.toggle("on", state.connected);
+  showAccount(); // a login that has ended leads to the page to log in on
 }
 
 wireSessions();
