@@ -1,4 +1,4 @@
-"""The commands ``demo``, ``controller``, ``rig``, ``users``, ``validate``, ``bench``, added to ``ringdic``.
+"""The commands ``demo``, ``controller``, ``rig``, ``users``, ``validate``, ``chaos``, ``bench``, added to ``ringdic``.
 
 Importing this module needs no package of the extra ``controller``, so that ``ringdic --help`` lists the commands
 wherever the library is installed; a command whose packages are missing says which extra to install.
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from ringdic.cli.console import print_json
+from ringdic.cli.console import print_json, say
 from ringdic.cli.options import AsJson
 from ringdic.cli.rig import rig_app
 
@@ -25,6 +25,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command("demo")(demo_command)
     app.command("controller")(controller_command)
     app.command("validate")(validate_command)
+    app.command("chaos")(chaos_command)
     app.command("bench")(bench_command)
     app.add_typer(users_app)
     for name, command in RIG_COMMANDS.items():
@@ -111,6 +112,24 @@ def validate_command(
         findings = run_validation(out, scale=size, quick=quick, only=only or (), images_only=images_only)
     if as_json:
         print_json(findings)
+
+
+def chaos_command(
+    cameras: Annotated[int, typer.Option(min=1, max=60, help="Nodes.")] = 12,
+    captures: Annotated[int, typer.Option(min=1, help="Captures, one after the other.")] = 300,
+    scale: Annotated[float, typer.Option(min=0.02, max=1.0, help="Size of the images; 1 is 3280 x 2464 px.")] = 1.0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the plan of what fails when.")] = 0,
+    out: Annotated[Path, typer.Option(help="Folder for archive, spools and logs.")] = Path("ringdic-chaos"),
+    as_json: AsJson = False,
+) -> None:
+    """Capture while nodes, controller, disks and network fail as planned, and audit that nothing was lost."""
+    _need_controller()
+    from ringdic_controller.studies.chaos import run_chaos
+
+    pixels = (round(3280 * scale), round(2464 * scale))
+    audit = run_chaos(out, cameras=cameras, captures=captures, size=pixels, seed=seed, say=say)
+    if as_json:
+        print_json(audit)
 
 
 def _need_controller() -> None:
