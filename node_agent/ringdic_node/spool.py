@@ -10,7 +10,8 @@
     SPOOL/.claim                              locked by the process that uses the spool
 
 Every file is written aside, flushed to the disk and renamed, so a power cut leaves either the whole image with
-its manifest or nothing that counts. A manifest that this release cannot read stays where it is, with its image.
+its manifest or nothing that counts. A manifest that this release cannot read stays where it is, with its image; those
+that it writes can be read by all releases.
 
 An acknowledgement can be forged where the network is open. A delivered image is therefore kept as long as there is
 room, so that the controller can ask for it again, and the oldest is removed first.
@@ -29,7 +30,7 @@ from pathlib import Path
 from typing import IO
 
 from ringdic_node.image_file import digest_of_file, image_is_whole
-from ringdic_node.wire import CaptureKey, Manifest, WireError, decode_as, encode
+from ringdic_node.wire import CaptureKey, Manifest, WireError, decode_as, encode_for_first_release
 
 try:
     import fcntl
@@ -253,7 +254,7 @@ class Spool:
             while self._delivered and self._spare() < needed:
                 self._remove_oldest()
         # Both are on the disk before either gets its name: a full disk or a power cut leaves no image without manifest.
-        described = self._write_aside(manifest_path, [encode(manifest)])
+        described = self._write_aside(manifest_path, [encode_for_first_release(manifest)])
         try:
             written = self._write_aside(image, parts)
         except SpoolError:

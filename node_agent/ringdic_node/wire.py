@@ -406,6 +406,13 @@ _NESTED: dict[tuple[str, str], type[Any]] = {
 }
 
 
+_FIRST_MANIFEST = (
+    "schema", "type", "node", "key", "kind", "sha256", "bytes", "width", "height", "time_ns", "exposure_us", "format",
+    "metadata",
+)  # fmt: skip
+_LATER = "fields of later releases"
+
+
 def encode(message: Message) -> bytes:
     """Return the message as JSON bytes with its schema version and type."""
     document = {"schema": SCHEMA, "type": message.TYPE, **plain(document_of(message))}
@@ -421,7 +428,7 @@ def decode(payload: bytes) -> Message:
         Not JSON, no schema or an unknown type, a missing or wrong field. A message of another schema is understood
         as far as it has the fields that are wanted here.
     """
-    document = read_document(payload)
+    document = _with_later_fields(read_document(payload))
     schema = document.pop("schema", None)
     if not isinstance(schema, int) or isinstance(schema, bool) or schema < 1:
         raise WireError(f"the message has schema {shown(schema)}, which is no version of a contract")
@@ -436,6 +443,23 @@ def decode(payload: bytes) -> Message:
         raise WireError(
             f"{error}; the message has schema {schema}, this side speaks schema {SCHEMA}: update the older side"
         ) from error
+
+
+def encode_for_first_release(manifest: Manifest) -> bytes:
+    """Return the manifest as JSON bytes that the first release can read, too: later fields are in its metadata.
+
+    That release knows no other fields, and removes an image whose manifest it cannot read. `decode` puts them back.
+    """
+    document = {"schema": SCHEMA, "type": manifest.TYPE, **plain(document_of(manifest))}
+    later = {name: document.pop(name) for name in list(document) if name not in _FIRST_MANIFEST}
+    document["metadata"] = {**document["metadata"], _LATER: later}
+    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _with_later_fields(document: dict[str, Any]) -> dict[str, Any]:
+    metadata = document.get("metadata")
+    later = metadata.pop(_LATER, None) if isinstance(metadata, dict) else None
+    return {**document, **later} if isinstance(later, dict) else document
 
 
 def decode_as(expected: type[Any], payload: bytes) -> Any:

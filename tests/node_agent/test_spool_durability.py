@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from dataclasses import replace
 
 import pytest
 from ringdic_node import spool as spool_module
 from ringdic_node.image_file import image_digest
 from ringdic_node.spool import Spool, SpoolError
-from ringdic_node.wire import CaptureKey, Manifest, encode
+from ringdic_node.wire import CaptureKey, Manifest, decode, encode
 
 PARTS = (b"P5\n3 2\n255\n", b"abcdef")
 
@@ -190,6 +191,19 @@ def test_an_image_whose_manifest_cannot_be_read_stays_and_is_delivered_by_the_re
     assert content(tmp_path) == before
     manifest_path.write_text(original)  # what the other release makes of it
     assert len(claimed(tmp_path).manifests()) == 2
+
+
+def test_a_release_before_can_read_what_this_one_has_stored(tmp_path):
+    """The first release sets a manifest with any other field aside, and removes its image at the next start."""
+    manifest = replace(manifest_of(), settings_hash="a" * 64, metadata={"Lux": 7}, unknown={"lens": "wide"})
+    Spool(tmp_path).store(manifest, PARTS)
+    document = json.loads((tmp_path / "s~0001-board~5.json").read_text())
+    first = "schema type node key kind sha256 bytes width height time_ns exposure_us format metadata"
+    assert set(document) == set(first.split())
+    assert (document["schema"], document["metadata"]["Lux"]) == (1, 7)
+    assert claimed(tmp_path).manifests() == [manifest]
+    delivered_by_it = json.dumps(document, separators=(",", ":")).encode()
+    assert decode(delivered_by_it) == manifest, "and the controller still knows all of it"
 
 
 def test_a_delivered_image_whose_manifest_cannot_be_read_is_no_fault(tmp_path):
