@@ -12,7 +12,7 @@ OLDEST := $(shell sed -n 's/.*"numba>=\([0-9.]*\),.*/\1/p' pyproject.toml | head
 # Fails unless the bundled page lies in the installed package.
 HAS_PAGE := from importlib.resources import files; files('ringdic_controller').joinpath('web/static/index.html').read_text()
 
-.PHONY: install demo test test-narrow test-numba test-dist lint audit bench dist clean
+.PHONY: install demo test fuzz test-narrow test-numba test-dist lint audit bench dist clean
 
 $(VENV)/.installed: pyproject.toml
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
@@ -42,6 +42,9 @@ lint: $(VENV)/.installed-test          ## style, types and the walls between the
 test: $(VENV)/.installed-test          ## style, types and the whole suite; the kernels are compiled meanwhile
 	$(BIN)/python -m ringdic.jobs.compiling & $(MAKE) --no-print-directory lint && wait && \
 	  $(BIN)/python -m pytest $(PYTEST)
+
+fuzz: $(VENV)/.installed-test          ## 100 times as many hostile requests, messages and files as in the suite
+	RINGDIC_FUZZ=$${RINGDIC_FUZZ-100} $(BIN)/python -m pytest tests/fuzz
 
 test-narrow: $(VENV)/.installed-test   ## the kernels compiled for an x86-64 processor without AVX-512
 	NUMBA_CPU_NAME=haswell NUMBA_CPU_FEATURES="$(NARROW)" NUMBA_CACHE_DIR=build/narrow \
