@@ -215,7 +215,7 @@ def load_settings(path: Path | None = None, overrides: Sequence[str] = ()) -> Se
             raise InputError(f"{path}: no such settings file")
         try:
             tables = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (ValueError, RecursionError) as error:  # also numbers without end, and tables in tables without end
             raise InputError(f"{path}: not readable as TOML ({error})") from error
     for override in overrides:
         _set(tables, override)
@@ -242,10 +242,10 @@ def settings_of_run(text: str) -> Settings:
             if group in Settings.model_fields:
                 known[group] = values
         return Settings.model_validate(known)
-    except (tomllib.TOMLDecodeError, AttributeError) as error:
-        raise InputError(f"the run's settings are not readable as TOML ({error})") from error
     except ValidationError as error:
         raise InputError(f"the run's settings: {faults(error, Settings, _SETTINGS)}") from error
+    except (ValueError, RecursionError, AttributeError) as error:
+        raise InputError(f"the run's settings are not readable as TOML ({error})") from error
 
 
 def _set(tables: dict[str, Any], override: str) -> None:
@@ -267,7 +267,7 @@ def _value(text: str) -> Any:
     """A value as TOML reads it; a bare word is text."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return text
 
 

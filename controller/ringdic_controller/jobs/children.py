@@ -311,7 +311,7 @@ def message_of(line: str) -> dict[str, Any] | None:
         return None
     try:
         message = json.loads(line)
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):
         return None
     is_message = isinstance(message, dict) and any(name in message for name in ("stage", "state", "worker"))
     return message if is_message else None

@@ -129,7 +129,7 @@ def read_controller_config(path: Path | None) -> ControllerConfig:
         raise InputError(f"{path}: no such configuration file") from error
     except ValidationError as error:
         raise InputError(f"{path}: {faults(error, _ConfigFile)}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: {error}") from error
     folder = path.resolve().parent
     config = ControllerConfig(

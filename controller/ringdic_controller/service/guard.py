@@ -17,7 +17,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Collection
 from dataclasses import dataclass
-from ipaddress import ip_address
+from ipaddress import IPv4Address, IPv6Address, ip_address
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -222,11 +222,16 @@ def _host_name(host: str) -> str | None:
 def _is_own_address(name: str, scope: Scope) -> bool:
     """Whether a name is an address (not a name) of loopback, or the one at which the connection has arrived."""
     try:
-        address = ip_address(name)
-        server = scope.get("server")
-        return address.is_loopback or (server is not None and address == ip_address(server[0]))
+        address, server = _address(name), scope.get("server")
+        return address.is_loopback or (server is not None and address == _address(server[0]))
     except ValueError:
         return False
+
+
+def _address(name: str) -> IPv4Address | IPv6Address:
+    """The address that a text is; an IPv4 address in the form of IPv6 counts as itself. Raises ValueError."""
+    address = ip_address(name)
+    return getattr(address, "ipv4_mapped", None) or address
 
 
 def _origin(page: str) -> str:

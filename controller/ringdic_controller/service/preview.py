@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from ringdic.session.images import read_gray
 
+_HIGHEST = 16_384  # px; a JPEG can have 65 535
+
 
 def preview_jpeg(path: Path, width: int = 320) -> bytes:
     """A JPEG (as bytes) of the image in a file, at most ``width`` px wide.
@@ -31,10 +33,11 @@ def picture_jpeg(picture: NDArray[np.uint8], width: int) -> bytes:
 
 
 def _no_wider(image: NDArray[Any], width: int) -> NDArray[Any]:
-    if image.shape[1] <= width:
+    scale = min(1.0, width / image.shape[1], _HIGHEST / image.shape[0])
+    if scale == 1.0:
         return image
-    height = max(1, round(image.shape[0] * width / image.shape[1]))
-    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+    size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
 def _jpeg(image: NDArray[Any]) -> bytes:

@@ -22,6 +22,7 @@ from ringdic_controller.rig.capture import Timing
 from ringdic_controller.rig.link import RigLink
 from ringdic_controller.service.app import create_app
 from ringdic_controller.service.config import ControllerConfig
+from ringdic_controller.service.connections import BoundedConnection
 from ringdic_controller.service.desk import Desk
 from ringdic_controller.service.guard import GuardRules
 from ringdic_controller.service.page_security import page_security
@@ -93,9 +94,11 @@ def serve_page(desk: Desk, config: ControllerConfig, on_ready: Callable[[str], N
     host = f"[{config.host}]" if ":" in config.host else config.host
     address = f"{secured.scheme}://{host}:{listener.getsockname()[1]}"
     rules = GuardRules(hosts=frozenset({config.host.lower(), *config.hosts}))
+    app = create_app(desk, rules=rules, access=secured.access)
     server = uvicorn.Server(
         uvicorn.Config(
-            create_app(desk, rules=rules, access=secured.access),
+            app,
+            http=BoundedConnection,
             log_level="warning",
             timeout_graceful_shutdown=SHUTDOWN_LIMIT,
             **secured.server_settings,

@@ -25,8 +25,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from shutil import rmtree
@@ -38,6 +39,7 @@ from ringdic.session.names import CAPTURE_KINDS, split_capture_id
 from ringdic.session.records import REMEDY, CaptureRecord, SessionError, read_capture_record, read_session_record
 from ringdic.session.rig import Rig, read_rig
 
+_ABANDONED_S = 24 * 3600.0  # age at which a folder that is being written belongs to a process that was killed
 _LIVE_KEPT = 5  # single steps that stay; the operator may look at one while newer ones come
 
 
@@ -159,6 +161,7 @@ def new_live(path: Path, capture_id: str) -> Iterator[Path]:
     """
     live = Path(path) / "live"
     live.mkdir(exist_ok=True)
+    _remove_abandoned(live)
     partial = live / f".{capture_id}-{uuid4().hex}"
     partial.mkdir()
     try:
@@ -190,6 +193,7 @@ def new_run(path: Path) -> Iterator[NewRun]:
     """
     results = Path(path) / "results"
     results.mkdir(exist_ok=True)
+    _remove_abandoned(results)
     number = 1 + max((int(p.name) for p in runs(path)), default=0)
     while True:
         partial = results / f".{number:04d}.partial"
@@ -208,6 +212,15 @@ def new_run(path: Path) -> Iterator[NewRun]:
     except BaseException:
         rmtree(partial, ignore_errors=True)
         raise
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Remove temporary folders that nobody has written into for long: those of runs and steps that were killed."""
+    for partial in folder.glob(".*"):
+        with suppress(OSError):  # another process removes it, too
+            newest = max(item.stat().st_mtime for item in (partial, *partial.rglob("*")))
+            if partial.is_dir() and not partial.is_symlink() and time.time() - newest > _ABANDONED_S:
+                rmtree(partial, ignore_errors=True)
 
 
 def _require_session(path: Path) -> None:

@@ -217,7 +217,7 @@ def read_rig(path: Path) -> Rig:
         return parse_rig(path.read_text(encoding="utf-8"))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # also numbers without end, and tables in tables without end
         raise InputError(f"{path}: not readable as TOML ({error})") from error
 
 

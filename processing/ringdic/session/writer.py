@@ -137,7 +137,7 @@ class SessionWriter:
             rig = tomllib.loads((self.path / "rig.toml").read_text(encoding="utf-8"))
             self.cameras: tuple[str, ...] = tuple(str(camera["id"]) for camera in rig.get("cameras", []))
             self.camera_settings: dict[str, Any] = dict(rig.get("capture", {}))
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
             raise SessionError(f"{self.path / 'rig.toml'}: not readable as a rig file ({error}); {REMEDY}") from error
 
     @classmethod
@@ -168,7 +168,7 @@ class SessionWriter:
         """
         try:
             rig_name = tomllib.loads(rig_toml)["rig"]["name"]
-        except (tomllib.TOMLDecodeError, KeyError, TypeError) as error:
+        except (ValueError, RecursionError, KeyError, TypeError) as error:
             raise SessionError(f"the rig file of session '{name}' has no readable [rig] name: {error}") from error
         record = SessionRecord(name, str(rig_name), _iso(wall_ns()), source)
         path.mkdir(parents=True)

@@ -126,6 +126,10 @@ STRANGE: dict[str, Callable[[Path], None]] = {
     "numbers that are not finite": lambda folder: change(folder / CAPTURE, skew_ns=None, lux=float("nan"), far=1e999),
     "half a character": lambda folder: change(folder / CAPTURE, note="\ud800", **{"\udfff": "\udc00"}),
     "half a character in the header": lambda folder: change(folder / "session.json", rig="\ud800", created="\udfff"),
+    "a checksum that is none": lambda folder: change(
+        folder / CAPTURE,
+        cameras={"01": {"status": "ok", "file": "01.pgm", "sha256": "a\r\nSet-Cookie: b=\u20ac"}},
+    ),
     "a close at no time": lambda folder: change(folder / CAPTURE, closed_at="yesterday"),
     "a number of another folder": lambda folder: (folder / "captures" / ("9" * 30 + "-board")).mkdir(),
     "a folder in place of a file": lambda folder: (folder / "captures" / "0002-target" / "capture.json").mkdir(
@@ -145,6 +149,10 @@ def test_what_is_strange_in_a_folder_makes_no_page_fail(tmp_path: Path, shown, w
         answer = client.get(f"{API}/{path}")
         assert answer.status_code in (200, 404), (path, answer.text)
         json.loads(answer.content)
+    for path in ("", "/preview"):
+        answer = client.get(f"{API}/sessions/limb/captures/0001-board/images/01{path}")
+        assert answer.status_code in (200, 404)
+        assert "Set-Cookie" not in answer.headers
     desk = client.app.state.desk
     json.dumps(desk.state.snapshot(), allow_nan=False).encode()
 

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from ringdic_controller.service.preview import preview_jpeg
 from ringdic_controller.service.refusals import NotFoundError
 
 API = "/api/v1"
@@ -81,6 +82,13 @@ def test_a_preview_shows_the_image_and_comes_once(client) -> None:
     assert abs(picture.mean() - ramp.mean()) < 3
     again = client.get(address, headers={"If-None-Match": answer.headers["ETag"]})
     assert (again.status_code, again.content) == (304, b"")
+
+
+def test_a_preview_of_a_very_high_image_is_a_picture(tmp_path) -> None:
+    path = tmp_path / "01.pgm"
+    path.write_bytes(b"P5\n1 70000\n255\n" + bytes(70_000))
+    picture = cv2.imdecode(np.frombuffer(preview_jpeg(path), np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert picture.shape == (16_384, 1)
 
 
 def test_a_missing_node_is_named_and_an_override_captures_without_it(client, nodes) -> None:

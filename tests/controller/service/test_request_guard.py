@@ -7,14 +7,16 @@ import errno
 import json
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 import uvicorn
 from fastapi.testclient import TestClient
-from ringdic_controller.service import guard
+from ringdic_controller.service import connections, guard
 from ringdic_controller.service.app import create_app
+from ringdic_controller.service.connections import BoundedConnection
 from ringdic_controller.service.desk import Desk
 from ringdic_controller.service.events import EventStream
 from ringdic_controller.service.guard import GuardRules, RequestGuard
@@ -63,6 +65,7 @@ def test_a_page_is_asked_for_by_the_address_that_the_connection_arrives_at() -> 
 
     assert asyncio.run(ask("10.0.0.5:8000", "10.0.0.5")) == 200
     assert asyncio.run(ask("10.0.0.6:8000", "10.0.0.5")) == 403
+    assert asyncio.run(ask("10.0.0.5:8000", "::ffff:10.0.0.5")) == 200, "the server listens on IPv6 and IPv4"
     assert asyncio.run(ask("lab", "lab")) == 403, "a name is none of the addresses"
 
 
@@ -194,13 +197,19 @@ def test_a_client_that_reads_nothing_is_given_up() -> None:
 @pytest.fixture
 def server(desk: Desk) -> Iterator[Callable[[], socket.socket]]:
     """Call it for a connection to the desk's server."""
-    served = uvicorn.Server(uvicorn.Config(create_app(desk), log_level="critical", timeout_graceful_shutdown=1))
+    config = uvicorn.Config(create_app(desk), http=BoundedConnection, log_level="critical", timeout_graceful_shutdown=1)
+    served = uvicorn.Server(config)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         thread = threading.Thread(target=served.run, args=([listener],))
         thread.start()
         yield lambda: socket.create_connection(listener.getsockname(), timeout=20)
         served.should_exit = True
         thread.join(10)
+
+
+def read_to_the_end(connection: socket.socket) -> None:
+    while connection.recv(4096):
+        pass
 
 
 def first_line(connection: socket.socket) -> str:
@@ -228,22 +237,59 @@ def test_a_stream_of_chunks_is_refused_at_the_limit_while_it_is_sent(server) -> 
 # Many clients
 
 
+def test_so_many_connections_are_taken_and_the_next_is_told(server, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "MOST_CONNECTIONS", 3)
+    taken = [server() for _ in range(4)]
+    try:
+        assert " 503 " in first_line(taken[3])
+        taken[0].close()
+        for _ in range(200):
+            with server() as again:
+                again.sendall(f"GET {API}/rig HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+                if " 200 " in first_line(again):
+                    break
+            time.sleep(0.05)
+        else:
+            pytest.fail("one that has gone makes no room")
+    finally:
+        for connection in taken:
+            connection.close()
+
+
+@pytest.mark.parametrize("begun", [b"", b"GET / HTTP/1.1\r\nHo"])
+def test_a_connection_that_asks_for_nothing_is_closed(server, monkeypatch: pytest.MonkeyPatch, begun: bytes) -> None:
+    monkeypatch.setattr(connections, "HEAD_SECONDS", 0.2)
+    with server() as connection:
+        connection.sendall(begun)
+        read_to_the_end(connection)
+
+
+def test_an_event_stream_is_no_idle_connection(server, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "HEAD_SECONDS", 0.1)
+    with server() as connection:
+        connection.sendall(f"GET {API}/live HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+        assert " 200 " in first_line(connection)
+        connection.settimeout(0.4)
+        with pytest.raises(TimeoutError):
+            read_to_the_end(connection)
+
+
 def test_so_many_follow_the_live_state_and_the_next_is_told(desk: Desk, server) -> None:
     desk.state.events = EventStream(desk.state.snapshot, limit=3)
     request = f"GET {API}/live HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode()
-    connections = [server() for _ in range(4)]
+    followers = [server() for _ in range(4)]
     try:
-        for connection in connections[:3]:
+        for connection in followers[:3]:
             connection.sendall(request)
             assert " 200 " in first_line(connection)
-        connections[3].sendall(request)
-        with connections[3].makefile("rb") as lines:
+        followers[3].sendall(request)
+        with followers[3].makefile("rb") as lines:
             assert b" 503 " in lines.readline()
             while lines.readline() != b"\r\n":
                 pass
             assert "no more can" in json.loads(lines.read1())["detail"]
     finally:
-        for connection in connections:
+        for connection in followers:
             connection.close()
     deadline = 200
     while desk.state.events._followers and deadline:  # a seat is free again when its client has gone

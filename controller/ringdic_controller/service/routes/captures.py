@@ -1,5 +1,6 @@
 """Captures: begin one, follow it, read its record and images."""
 
+import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,7 +19,8 @@ from ringdic_controller.service.routes.etag import cache_headers, client_has
 from ringdic_controller.service.turns import Turns
 
 router = APIRouter(tags=["captures"])
-_PREVIEWS = Turns("previews are asked for", at_once=2, waiting=24)  # each holds a whole image in memory
+_SHA256 = re.compile(r"[0-9a-f]{64}")  # no other text of a record goes into a header
+_PREVIEWS = Turns("previews are asked for", at_once=2, waiting=14)  # each holds a whole image in memory
 
 
 class NewCapture(BaseModel):
@@ -110,4 +112,5 @@ def _image(desk: Desk, session: str, capture_id: str, camera: str) -> tuple[Path
     path = desk.catalogue.file(session, "captures", capture_id, str(entry["file"]))
     if path is None:
         raise NotFoundError(f"The image {entry['file']} of capture '{capture_id}' is not in its folder any more.")
-    return path, str(entry.get("sha256") or "")
+    sha256 = str(entry.get("sha256"))
+    return path, sha256 if _SHA256.fullmatch(sha256) else ""

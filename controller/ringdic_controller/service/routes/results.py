@@ -17,8 +17,8 @@ from ringdic_controller.service.routes.desk import TheDesk
 from ringdic_controller.service.turns import Turns
 
 router = APIRouter(prefix="/sessions/{session}/results", tags=["results"])
-_REPORTS = Turns("reports are asked for", at_once=1, waiting=4)
-_PICTURES = Turns("pictures are asked for", at_once=2, waiting=8)
+_REPORTS = Turns("reports are asked for", at_once=1, waiting=3)
+_PICTURES = Turns("pictures are asked for", at_once=2, waiting=4)
 
 
 def _locate(session: str, run: str, desk: TheDesk) -> Path:
