@@ -1,18 +1,19 @@
 """Figures that tell why a camera's reference image does not match that of its nearest partner.
 
 Features are matched between the whole images with no use of the calibration, and compared with it: how far off the
-epipolar lines they lie, at which depths, and how many of them inside the mask. A blur of standard deviation σ px leaves
-the share ``exp(-σ² ω²)`` of the pattern's power at ω radians a px: σ follows from the ratio of two cameras' spectra.
+epipolar lines they lie, at which depths, and how many of them inside the mask. How much more one of the two images is
+blurred follows from their spectra.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Image, Mask, Pixels
+from ringdic.charts.blur import SQUARE_PX, blur_change
 from ringdic.charts.contrast import contrast
 from ringdic.charts.depth_map import DepthImages, DepthMap, lattice_places
 from ringdic.charts.exchanged import exchanged_or_mirrored
@@ -31,11 +32,7 @@ _OFF_LINE = 1.0  # px of the reduced images, largest epipolar offset of a match 
 _BLUR = 1.5  # px, that stands out
 _FAINT = 0.35  # of the partner's contrast, or of that outside the mask
 _STRONGEST = 75.0  # percentile of the contrast over an image, of the places at which patterns are compared
-_SIDE = 64  # px, of the squares whose spectra are taken
-_SQUARES = 64  # of an image
-_RINGS = np.arange(1, _SIDE // 2)  # frequencies, periods a square
-_OVER_NOISE = 3.0  # power of the pattern, in units of the noise's, at a frequency that counts
-_FEWEST_RINGS = 3
+_SQUARES = 64  # of an image, whose spectra are taken
 
 
 @dataclass(frozen=True)
@@ -181,22 +178,21 @@ def why_unmatched(
 
 @dataclass(frozen=True)
 class _Pattern:
-    """The pattern in an image: contrast about n places of a lattice, and the spectrum about the strongest of them.
+    """The pattern in an image: contrast about n places of a lattice, and the image about the strongest of them.
 
-    places : (n, 2) px. level : (n,) grey levels a px. power : by ring of frequencies, without that of the noise, NaN
-    where this exceeds a third of it.
+    places : (n, 2) px. level : (n,) grey levels a px. squares : (k, 64, 64) grey levels.
     """
 
     places: Pixels
     level: Floats
-    power: Floats
+    squares: NDArray[np.float32]
 
     @classmethod
     def of(cls, image: Image, radius: int) -> _Pattern:
         """The pattern of an image. radius : px, of the subsets."""
         places = lattice_places((image.shape[1], image.shape[0]), radius, radius + 2, None)
         level = contrast(image, places, radius)
-        return cls(places, level, _power(image, places[level >= np.percentile(level, _STRONGEST)]))
+        return cls(places, level, _squares(image, places[level >= np.percentile(level, _STRONGEST)]))
 
     @property
     def contrast(self) -> float:
@@ -212,33 +208,21 @@ class _Pattern:
     def blur_against(self, other: _Pattern) -> float:
         """Standard deviation of the blur, px, that this pattern has more than another; negative where less.
 
-        NaN where the noise leaves too few frequencies of either.
+        The more blurred of the two tells it: in the other, frequencies stand out that it has lost. NaN where noise
+        leaves too few frequencies of either.
         """
-        ratio = np.log(self.power / other.power)
-        unknown = np.flatnonzero(np.isnan(ratio[1:]))  # the first ring has the shading too
-        end = 1 + (int(unknown[0]) if len(unknown) else len(ratio) - 1)
-        if end - 1 < _FEWEST_RINGS:
-            return np.nan
-        square = -float(np.polyfit((2.0 * np.pi * _RINGS[1:end] / _SIDE) ** 2, ratio[1:end], 1)[0])
-        return math.copysign(math.sqrt(abs(square)), square)
+        more = blur_change(other.squares, self.squares).mean
+        less = -blur_change(self.squares, other.squares).mean
+        return more if abs(more) > abs(less) or np.isnan(more) else less
 
 
-def _power(image: Image, px: Pixels) -> Floats:
-    """Power of an image about places (n, 2) px by ring of frequencies, without that of the noise."""
-    half, (height, width) = _SIDE // 2, image.shape
+def _squares(image: Image, px: Pixels) -> NDArray[np.float32]:
+    """Squares (k, 64, 64) of an image about some of the places (n, 2) px, as far as they lie inside it."""
+    half, (height, width) = SQUARE_PX // 2, image.shape
     px = px[((px >= half) & (px < (width - half, height - half))).all(axis=1)].astype(int)
-    if not len(px):
-        return np.full(len(_RINGS), np.nan)
     chosen = px[np.linspace(0, len(px) - 1, min(_SQUARES, len(px))).astype(int)]
-    squares = np.stack([image[y - half : y + half, x - half : x + half] for x, y in chosen]).astype(float)
-    squares -= squares.mean(axis=(1, 2), keepdims=True)
-    window = np.hanning(_SIDE)
-    power = np.mean(np.abs(np.fft.fft2(squares * window * window[:, None])) ** 2, axis=0)
-    frequency = np.abs(np.fft.fftfreq(_SIDE, 1.0 / _SIDE))
-    ring = np.rint(np.hypot(frequency, frequency[:, None])).astype(int).ravel()
-    mean = np.bincount(ring, power.ravel())[_RINGS] / np.bincount(ring)[_RINGS]
-    noise = float(mean[-_FEWEST_RINGS:].mean())
-    return np.where(mean > (1.0 + _OVER_NOISE) * noise, mean - noise, np.nan)
+    squares = [image[y - half : y + half, x - half : x + half] for x, y in chosen]
+    return np.array(squares, np.float32).reshape(-1, SQUARE_PX, SQUARE_PX)
 
 
 def _agreeing_features(

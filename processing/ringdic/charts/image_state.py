@@ -1,9 +1,7 @@
 """Figures of a camera's image of a step beside its reference image: blur, light, clipping, and a digest of its pixels.
 
 Squares of the reference image are compared with those that the same material takes in the later image, after the
-measured deformation: a blur of covariance S px² leaves the share ``exp(-ω·S·ω)`` of the pattern's power at the
-frequency ω radians a px, so S follows from the ratio of the two spectra, along every direction. Where hardly a point
-was matched, the squares at the same pixels are compared.
+measured deformation. Where hardly a point was matched, the squares at the same pixels are compared.
 """
 
 from __future__ import annotations
@@ -16,16 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Image, Pixels
+from ringdic.charts.blur import SQUARE_PX, blur_change
 from ringdic.correlation.seeds import even_sample
 
-_SIDE = 64  # px, of the squares
 _SQUARES = 20
 _FEWEST = 12  # matched points from which the squares follow the material
-_LOWEST = 2.5  # periods a square: below, the spectrum is that of the shading too
-_HIGHEST = 0.3  # periods a px: above, interpolation and JPEG change it
-_OVER_NOISE = 4.0  # power of the reference's pattern at a frequency that counts, in units of its noise's
-_NOISE_FROM = 0.42  # periods a px: from there on the spectrum is taken for that of the noise
-_FEWEST_FREQUENCIES = 24
 _ROWS = 16  # every so many rows of an image are enough to tell that it is another one
 
 
@@ -86,10 +79,10 @@ def image_state(reference: Image, image: Image, xy: Pixels, warp: Floats) -> Ima
     first, second = _squares(reference, image, xy[chosen], warp[chosen, :6] if moved else np.zeros((len(chosen), 6)))
     if not len(first):
         return ImageState(len(xy), len(good), *[np.nan] * 7)
-    blur, along, across, contrast = _change(first, second)
+    change = blur_change(first, second)
     low, high = grey_limits(image)
     return ImageState(
-        len(xy), len(good), blur, along, across, contrast,
+        len(xy), len(good), change.along, change.angle, change.across, change.contrast,
         float((second >= high).mean()), float((second <= low).mean()), float(second.mean() * 255.0 / _range(image)),
     )  # fmt: skip
 
@@ -112,14 +105,14 @@ def _squares(
 
     xy : (n, 2) px. warp : (n, 6) of their matches. Squares that leave an image are left out.
     """
-    half, (height, width) = _SIDE // 2, image.shape
+    half, (height, width) = SQUARE_PX // 2, image.shape
     pairs = []
     for point, (u, v, ux, uy, vx, vy) in zip(xy, warp, strict=False):
         to = point + np.array([u, v])
         x, y = np.rint(to).astype(int)
         back = np.linalg.inv([[1.0 + ux, uy], [vx, 1.0 + vy]])
         start = point + back @ (np.array([x, y]) - half - to)
-        corners = start + np.array([[0, 0], [_SIDE, 0], [0, _SIDE], [_SIDE, _SIDE]]) @ back.T
+        corners = start + np.array([[0, 0], [SQUARE_PX, 0], [0, SQUARE_PX], [SQUARE_PX, SQUARE_PX]]) @ back.T
         inside = half <= x < width - half and half <= y < height - half
         if not inside or (corners < 0).any() or (corners > (reference.shape[1] - 1, reference.shape[0] - 1)).any():
             continue
@@ -128,40 +121,7 @@ def _squares(
         part = reference[max(y0, 0) : y1, max(x0, 0) : x1].astype(np.float32)
         matrix = np.column_stack([back, start - (max(x0, 0), max(y0, 0))])
         flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-        warped = cv2.warpAffine(part, matrix, (_SIDE, _SIDE), flags=flags, borderMode=cv2.BORDER_REFLECT)
+        warped = cv2.warpAffine(part, matrix, (SQUARE_PX, SQUARE_PX), flags=flags, borderMode=cv2.BORDER_REFLECT)
         pairs.append((warped, image[y - half : y + half, x - half : x + half].astype(np.float32)))
-    both = np.array(pairs, np.float32).reshape(-1, 2, _SIDE, _SIDE)
+    both = np.array(pairs, np.float32).reshape(-1, 2, SQUARE_PX, SQUARE_PX)
     return both[:, 0], both[:, 1]
-
-
-def _change(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[float, float, float, float]:
-    """Blur along its direction, px, this direction, degrees, blur across it, px, and contrast of squares (k, s, s).
-
-    Of the second squares, beside the first; NaN where noise leaves too few frequencies.
-    """
-    (power, noise), (other, other_noise) = _spectrum(first), _spectrum(second)
-    y, x = np.meshgrid(*[2.0 * np.pi * np.fft.fftfreq(_SIDE)] * 2, indexing="ij")
-    radius = np.hypot(x, y) / (2.0 * np.pi)
-    counts = (radius * _SIDE >= _LOWEST) & (radius <= _HIGHEST) & (power > (1.0 + _OVER_NOISE) * noise)
-    if counts.sum() < _FEWEST_FREQUENCIES:
-        return np.nan, np.nan, np.nan, np.nan
-    with np.errstate(divide="ignore"):
-        pattern = np.maximum(other[counts] - other_noise, 0.5 * other_noise + 1e-9)
-        ratio = np.log(pattern / (power[counts] - noise))
-    wx, wy = x[counts], y[counts]
-    terms = np.column_stack([np.ones(len(wx)), -(wx**2), -2.0 * wx * wy, -(wy**2)])
-    level, xx, xy, yy = np.linalg.lstsq(terms, ratio, rcond=None)[0]
-    values, vectors = np.linalg.eigh([[xx, xy], [xy, yy]])
-    across, along = np.sign(values) * np.sqrt(np.abs(values))
-    angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])) % 180.0
-    return float(along), float(angle), float(across), float(np.exp(0.5 * level))
-
-
-def _spectrum(squares: NDArray[np.float32]) -> tuple[Floats, float]:
-    """Mean power of squares (k, s, s) by frequency, and that of the noise, from the highest frequencies."""
-    window = np.hanning(_SIDE).astype(np.float32)
-    level = squares - squares.mean(axis=(1, 2), keepdims=True)
-    power = np.mean(np.abs(np.fft.fft2(level * window * window[:, None])) ** 2, axis=0)
-    frequency = np.abs(np.fft.fftfreq(_SIDE))
-    corner = (frequency >= _NOISE_FROM) & (frequency[:, None] >= _NOISE_FROM)
-    return np.asarray(power), float(np.median(power[corner]))
