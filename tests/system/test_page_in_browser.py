@@ -226,7 +226,7 @@ def test_an_operator_presses_the_buttons_and_sees_the_strain(page: Page, station
     assert min(ticks(page)) == pytest.approx(0.9)
     assert max(ticks(page)) == pytest.approx(1.1)
     expect(page.locator("#table")).to_contain_text("larger stretch")
-    expect(page.locator("#verdict strong")).to_have_text("! Look at this")
+    expect(page.locator("#verdict strong")).to_have_text("! Look at this: camera 02")
     expect(page.locator("#verdict li b")).to_have_text("camera 02 · 0004-specimen")
     expect(page.locator("#verdict li")).to_contain_text("moved since the reference, by 1.20 px")
     expect(page.locator("#session-select option:checked")).to_have_text("by-hand (4 captures, 1 run)")

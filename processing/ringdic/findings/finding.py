@@ -13,6 +13,8 @@ from typing import Any
 
 from ringdic.findings.codes import CODES, Verdict
 
+_NAMED = 3  # cameras at most that a headline names
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -57,8 +59,23 @@ def overall_verdict(findings: Iterable[Finding]) -> Verdict:
     return max((finding.verdict for finding in findings), key=lambda each: each.severity, default=Verdict.SOUND)
 
 
+def verdict_headline(findings: Sequence[Finding]) -> str:
+    """The verdict of some findings and what it is about, in one line, such as "do not use: camera cam_02".
+
+    It is about the cameras that the gravest findings name, up to three, or else about what the first of these means.
+    """
+    verdict = overall_verdict(findings)
+    gravest = [finding for finding in findings if finding.verdict == verdict]
+    if not gravest:
+        return str(verdict)
+    cameras = list(dict.fromkeys(camera for finding in gravest for camera in finding.cameras))
+    if 0 < len(cameras) <= _NAMED:
+        return f"{verdict}: camera {', '.join(cameras)}"
+    return f"{verdict}: {CODES[gravest[0].code][1]}"
+
+
 def verdict_figures(findings: Sequence[Finding], accepted: Sequence[str] = ()) -> dict[str, Any]:
-    """The verdict, the findings of a run, the gravest first, and their sentences as ``warnings``, as JSON values.
+    """The verdict and its headline, the findings of a run, the gravest first, and their sentences, as JSON values.
 
     accepted : codes of findings that the operator has accepted; they are marked, and no longer forbid the use.
     """
@@ -66,6 +83,7 @@ def verdict_figures(findings: Sequence[Finding], accepted: Sequence[str] = ()) -
     marked.sort(key=lambda each: -each.verdict.severity)
     return {
         "verdict": str(overall_verdict(marked)),
+        "headline": verdict_headline(marked),
         "findings": [each.to_json() for each in marked],
         "warnings": [each.sentence for each in marked],
     }

@@ -12,7 +12,7 @@ from jinja2 import Environment, PackageLoader
 from matplotlib.figure import Figure
 from PIL import Image
 
-from ringdic.findings import Finding, Verdict
+from ringdic.findings import Finding, Verdict, verdict_headline
 from ringdic.pictures.scale import Picture
 
 UNKNOWN = "not recorded"
@@ -48,7 +48,8 @@ class Document:
 
     def verdict(self, verdict: Verdict, findings: Iterable[Finding]) -> None:
         """Add whether the results can be used, and the findings that say why not."""
-        self._add("verdict", verdict=verdict, findings=list(findings))
+        listed = list(findings)
+        self._add("verdict", verdict=verdict, headline=verdict_headline(listed), findings=listed)
 
     def facts(self, key: str, rows: Mapping[str, Any]) -> None:
         """Add a table of names and values; None is shown as not recorded."""

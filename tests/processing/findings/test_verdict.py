@@ -2,7 +2,7 @@
 
 import pytest
 from ringdic.errors import InputError
-from ringdic.findings import CODES, Finding, Verdict, overall_verdict, verdict_figures
+from ringdic.findings import CODES, Finding, Verdict, overall_verdict, verdict_figures, verdict_headline
 from ringdic.settings import load_settings
 
 LOOK = Finding("area-unmeasured", "4 of 80 cm² were not measured")
@@ -13,6 +13,17 @@ def test_the_worst_finding_decides() -> None:
     assert overall_verdict([]) is Verdict.SOUND
     assert overall_verdict([LOOK]) is Verdict.LOOK
     assert overall_verdict([LOOK, STOP, LOOK]) is Verdict.DO_NOT_USE
+
+
+def test_the_headline_names_the_cameras_of_the_gravest_findings_or_what_they_mean() -> None:
+    assert verdict_headline([]) == "sound"
+    assert verdict_headline([LOOK, STOP]) == "do not use: camera 3"
+    assert verdict_headline([LOOK]) == "look at this: textured area that two cameras see was not measured"
+    moved = [Finding("camera-moved", "", (camera,)) for camera in ("2", "4", "2")]
+    assert verdict_headline([LOOK, *moved]) == "look at this: camera 2, 4"
+    blurred = [Finding("image-blurred", "", (str(k),)) for k in range(5)]
+    assert verdict_headline(blurred) == "look at this: an image is more blurred than its reference"
+    assert verdict_figures([LOOK, STOP], ["camera-moved-unknown"])["headline"] == "look at this: camera 3"
 
 
 def test_an_accepted_code_is_marked_and_no_longer_forbids_the_use() -> None:

@@ -194,7 +194,7 @@ def test_text_is_shown_as_text(page: Page) -> None:
 @pytest.mark.browser
 def test_the_verdict_stands_at_the_top_with_the_camera_and_the_step(page: Page) -> None:
     verdict = page.locator("#verdict")
-    assert verdict.locator("strong").text_content() == "Do not use"
+    assert verdict.locator("strong").text_content() == "Do not use: camera 3"
     assert verdict.locator("li b").all_text_contents() == ["camera 3 · 0002"]
     first = page.locator("table").first.bounding_box()
     box = verdict.bounding_box()

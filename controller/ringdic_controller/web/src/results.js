@@ -231,15 +231,15 @@ const MARKS = { sound: "✓", "look at this": "!", "do not use": "✕" };
 
 /** Whether the results can be used, and the findings that say why not: which camera, at which step, what to do. */
 function showVerdict() {
-  const { verdict, findings = [] } = header.summary ?? {};
+  const { verdict, headline = verdict, findings = [] } = header.summary ?? {};
   const part = byId("verdict");
   part.hidden = !verdict;
   part.dataset.verdict = verdict ?? "";
   if (!verdict) return;
   const where = ({ cameras, step }) =>
-    [cameras.length > 3 ? `${cameras.length} cameras` : cameras.map((id) => `camera ${id}`).join(", "), step].filter(Boolean).join(" · ");
+    [cameras.length > 3 ? "" : cameras.map((id) => `camera ${id}`).join(", "), step].filter(Boolean).join(" · ");
   part.replaceChildren(
-    element("strong", {}, `${MARKS[verdict]} ${verdict[0].toUpperCase()}${verdict.slice(1)}`),
+    element("strong", {}, `${MARKS[verdict]} ${headline[0].toUpperCase()}${headline.slice(1)}`),
     element(
       "ul",
       {},
