@@ -15,6 +15,8 @@ from ringdic.charts.image_state import ImageState, image_state, pixel_digest
 from ringdic.correlation.repetition import find_repetition
 from ringdic.findings import Finding
 
+#: Names of the arrays that a reference state is stored as.
+REFERENCE_STATE = ("image_state", "speckle", "certain", "digest", "repetition")
 _KNOWN = 0.3  # of the textured places have a depth: with fewer, all textured places are looked at, background too
 _MOST = 0.6  # of these that must repeat: lamps in the background do
 

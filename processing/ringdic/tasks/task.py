@@ -103,17 +103,19 @@ class Executor(Protocol):
         """
 
 
-def read_output(path: Path) -> dict[str, NDArray[Any]]:
+def read_output(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
     """Read the arrays of a task's output file, by name; each (n, ...) has the shape and unit of the task's result.
 
+    names : of the arrays that are read; None reads all.
     Raises the ComputationError that the task ended with, InputError where the file is not readable.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+            failed = _ERROR in file.files
+            arrays = {name: file[name] for name in (file.files if failed or names is None else names)}
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: not readable ({error}); remove it and process again") from error
-    if _ERROR in arrays:
+    if failed:
         raise ComputationError(str(arrays[_ERROR]))
     return arrays
 
