@@ -14,6 +14,7 @@ from ringdic_node.virtual_rig.arrays import Floats, Radiance
 from ringdic_node.virtual_rig.lens import VirtualCamera
 from ringdic_node.virtual_rig.rotation import rotation
 
+_RED, _BLUE = 0.5, 0.6  # of the green values, in white light
 _BODY = np.array([0.0, 0.0, 125.0])  # mm, the middle of what stands in the rig
 
 
@@ -23,7 +24,8 @@ class ShotCondition:
 
     light : exposure times gain, 1 is calm. noise : standard deviation of the sensor's noise, 1 is calm. smear : motion
     of the image during the exposure, along x and y, px. mirrored : whether left and right are exchanged in the file;
-    upside_down : whether it is turned by 180°.
+    upside_down : whether it is turned by 180°. mosaic : whether the file holds the raw values under the colour filters,
+    without balance of the colours, where the calm one holds the luminance.
     """
 
     light: float = 1.0
@@ -31,6 +33,7 @@ class ShotCondition:
     smear: tuple[float, float] = (0.0, 0.0)
     mirrored: bool = False
     upside_down: bool = False
+    mosaic: bool = False
 
 
 CALM = ShotCondition()
@@ -73,6 +76,18 @@ def refocused_camera(camera: VirtualCamera, factor: float) -> VirtualCamera:
     K = camera.K.copy()
     K[:2, :2] *= factor
     return replace(camera, K=K)
+
+
+def mosaicked(image: Radiance) -> Radiance:
+    """An image (height, width) under the colour filters of a sensor, in linear light without unit.
+
+    Even rows have red and green pixels, odd ones green and blue. Under white light a silicon sensor with common filters
+    gives half as much red, and six tenths as much blue, as green.
+    """
+    out = image.copy()
+    out[0::2, 0::2] *= np.float32(_RED)
+    out[1::2, 1::2] *= np.float32(_BLUE)
+    return out
 
 
 def smeared(image: Radiance, smear: tuple[float, float]) -> Radiance:

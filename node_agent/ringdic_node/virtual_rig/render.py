@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ringdic_node.virtual_rig.arrays import Radiance
 from ringdic_node.virtual_rig.body import CYLINDER, approach, body_point
-from ringdic_node.virtual_rig.disturbance import CALM, ShotCondition, smeared
+from ringdic_node.virtual_rig.disturbance import CALM, ShotCondition, mosaicked, smeared
 from ringdic_node.virtual_rig.lens import VirtualCamera, ideal_of_pixel
 from ringdic_node.virtual_rig.rig import paper_rig
 from ringdic_node.virtual_rig.room import BLACK, SKIN, STAMP, WHITE, brightness, room_radiance, to_world
@@ -43,6 +43,7 @@ def render(camera: VirtualCamera, scene: Scene, seed: int = 0, condition: ShotCo
     seed : of the sensor's noise. condition : exposure, noise and motion of the image.
     """
     light = smeared(radiance(camera, scene), condition.smear)
+    light = mosaicked(light) if condition.mosaic else light
     image = expose(light, seed, condition.light, condition.noise)
     if condition.upside_down:
         image = image[::-1, ::-1]

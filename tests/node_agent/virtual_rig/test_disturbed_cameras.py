@@ -16,7 +16,9 @@ from ringdic_node.virtual_rig.disturbance import (
 )
 from ringdic_node.virtual_rig.render import radiance, render
 from ringdic_node.virtual_rig.rig import arc_rig
-from ringdic_node.virtual_rig.scenes import Bar, Damage, Shadow, SolidMotion, SolidSpecimen
+from ringdic_node.virtual_rig.scenes import Bar, Damage, Hair, Shadow, SolidMotion, SolidSpecimen
+from ringdic_node.virtual_rig.scenes.damage import HAIR
+from ringdic_node.virtual_rig.solid_damage import grown_hairs
 
 CAMERA = arc_rig(4, 30.0, 0.15).cameras[1]
 BODY = np.array([[0.0, 0.0, 125.0]])
@@ -146,3 +148,44 @@ def test_shadows_and_bars_spoil_a_solid_body_where_they_lie() -> None:
     assert 0.03 < hidden.mean() < 0.3
     np.testing.assert_allclose(barred[inner], 0.10, atol=0.01)
     np.testing.assert_allclose(barred[outside], clean[px[:, 1], px[:, 0]][outside], atol=1e-6)
+
+
+def test_a_mosaic_keeps_the_green_pixels_and_weakens_the_red_and_blue_ones() -> None:
+    condition = ShotCondition(noise=0.0, mosaic=True)
+    plain, mosaic = (render(CAMERA, ROD, 5, each).astype(float) for each in (ShotCondition(noise=0.0), condition))
+    linear = lambda grey: ((grey / 255.0 + 0.055) / 1.055) ** 2.4  # noqa: E731 - decoding of sRGB
+    ratio = linear(mosaic) / linear(plain)
+    bright = plain > 150
+    for row, column, share in ((0, 0, 0.5), (0, 1, 1.0), (1, 0, 1.0), (1, 1, 0.6)):
+        place = np.zeros(plain.shape, bool)
+        place[row::2, column::2] = True
+        assert ratio[place & bright].mean() == pytest.approx(share, abs=0.01)
+
+
+def test_a_hair_covers_what_its_thickness_and_length_cover_and_moves_with_the_skin() -> None:
+    facing = (CAMERA.centre - BODY[0]) * [1.0, 1.0, 0.0]
+    facing /= np.linalg.norm(facing)
+    root = BODY[0] + 45.0 * facing
+    hair = Hair(tuple(root), (0.0, 0.0, 1.0), tuple(np.cross(facing, [0.0, 0.0, 1.0])), 20.0, 0.1)
+    for motion in (SolidMotion(), SolidMotion(shift=(4.0, -3.0, 7.0))):
+        bare = SolidSpecimen(upright_column(45.0), motion, seed=4)
+        plain = radiance(CAMERA, bare).astype(float)
+        hairy = radiance(CAMERA, replace(bare, damage=Damage(hairs=(hair,)))).astype(float)
+        share = np.divide(plain - hairy, plain - HAIR, out=np.zeros_like(plain), where=np.abs(plain - HAIR) > 1e-3)
+        ends = CAMERA.project(bare.moved(root + np.outer([0.0, 20.0], [0.0, 0.0, 1.0])))
+        length = np.linalg.norm(ends[1] - ends[0])
+        assert share.sum() == pytest.approx(length * 0.2 * length / 20.0, rel=0.1)  # px²
+        y, x = np.mgrid[: plain.shape[0], : plain.shape[1]]
+        middle = [(share * x).sum() / share.sum(), (share * y).sum() / share.sum()]
+        np.testing.assert_allclose(middle, ends.mean(axis=0), atol=0.5)
+
+
+def test_hairs_grow_all_over_a_body_and_lie_on_it() -> None:
+    body = upright_column(45.0)
+    hairs = grown_hairs(body, 200, 3)
+    assert len(hairs) == 200
+    roots, along, across = (np.array([getattr(hair, name) for hair in hairs]) for name in ("root", "along", "across"))
+    assert np.abs(body.nearest(roots)[2]).max() < 1e-3
+    assert np.abs(np.sum(along * across, axis=1)).max() < 1e-3
+    assert np.abs(np.sum(along * body.nearest(roots)[1], axis=1)).max() < 1e-3
+    assert np.ptp(roots[:, 2]) > 150.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ringdic_node.virtual_rig.scenes.board import BoardScene
-from ringdic_node.virtual_rig.scenes.damage import Bar, Damage, Shadow, SpoiltPatch
+from ringdic_node.virtual_rig.scenes.damage import Bar, Damage, Hair, Shadow, SpoiltPatch
 from ringdic_node.virtual_rig.scenes.solid import Solid, SolidMotion, SolidSpecimen
 from ringdic_node.virtual_rig.scenes.specimen import Cylinder, Limb, Specimen
 from ringdic_node.virtual_rig.scenes.target import TargetScene
@@ -15,6 +15,7 @@ __all__ = [
     "BoardScene",
     "Cylinder",
     "Damage",
+    "Hair",
     "Limb",
     "Scene",
     "Shadow",

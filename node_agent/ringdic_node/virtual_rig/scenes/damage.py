@@ -1,6 +1,6 @@
-"""Disturbances of a specimen's images: worn speckles, reflections of lamps, bars in front of the body.
+"""Disturbances of a specimen's images: worn speckles, hairs, reflections of lamps, bars in front of the body.
 
-Positions are in the world, mm; worn patches lie on the body, in its material coordinates.
+Positions are in the world, mm; worn patches and hairs lie on the body, in its material coordinates.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from ringdic_node.virtual_rig.texture import RADIUS
 GLARE_PEAK = 3.0  # radiance of a lamp's reflection; 1 saturates
 GLARE_WIDTH = 0.03  # rad, standard deviation of the lobe about the mirror's direction
 BAR = 0.10  # radiance of a bar
+HAIR = 0.05  # radiance of a hair
 _GLARING = 0.3  # radiance of a reflection above which the speckles under it count as spoilt
 
 
@@ -52,16 +53,32 @@ class Shadow:
 
 
 @dataclass(frozen=True)
+class Hair:
+    """A dark hair that lies on a solid body and moves with it, in the plane through its root across the surface.
+
+    root : mm, the material point at which it begins. along : unit vector, its direction there; across : unit vector in
+    the surface at right angles to it. length, radius : mm.
+    """
+
+    root: tuple[float, float, float]
+    along: tuple[float, float, float]
+    across: tuple[float, float, float]
+    length: float
+    radius: float
+
+
+@dataclass(frozen=True)
 class Damage:
     """Disturbances of a specimen's images at one step. lamps : positions, mm, reflected by the glossy body.
 
-    Shadows fall on solid bodies only, worn patches are on the others only.
+    Shadows fall, and hairs lie, on solid bodies only; worn patches are on the others only.
     """
 
     patches: tuple[SpoiltPatch, ...] = ()
     lamps: tuple[tuple[float, float, float], ...] = ()
     bars: tuple[Bar, ...] = ()
     shadows: tuple[Shadow, ...] = ()
+    hairs: tuple[Hair, ...] = ()
 
     def arrays(self) -> tuple[Floats, Floats, Floats]:
         """Arrays for the renderer, mm.
