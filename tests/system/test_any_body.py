@@ -33,7 +33,9 @@ def test_a_body_of_any_shape_is_measured(rows: dict[str, dict], figures: Callabl
     row = rows[name]
     assert row["refusal"] == ""
     found, turned = row["figures"], "turned" in name
-    shape, displacement, stretches = (found[what]["robust"] for what in ("shape", "displacement", "stretches"))
+    shape, displacement, stretches = (
+        found["spreads"][what]["robust"] for what in ("position", "displacement", "stretch")
+    )
     figures(f"{name}: covered of what two cameras see", f"{found['covered']:.1%}", f"≥ {ROWS[name]:.0%}")
     figures("    shape, displacement, stretches over σ", f"{shape:.2f}, {displacement:.2f}, {stretches:.2f}", "")
     assert found["wrong"] == 0

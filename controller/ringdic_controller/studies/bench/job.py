@@ -1,9 +1,9 @@
 """Benchmark of whole jobs: time from the specimen's images to the results, by stage and by number of steps.
 
 The images are those of virtual cameras, rendered once and kept in a folder; those of the specimen are PGM files, as
-nodes deliver them and the archive keeps them. Each job runs in a process of its own, so that its peak memory and
-processor time are known. It begins without any matches, but with compiled kernels and calibrated cameras, as in a
-session that goes on. The calibration is timed by itself.
+nodes deliver them and the archive keeps them. Each job runs in a process of its own, so that its peak memory and its
+processor time, and that of its checks, are known. It begins without any matches, but with compiled kernels and
+calibrated cameras, as in a session that goes on. The calibration is timed by itself.
 """
 
 from __future__ import annotations
@@ -77,8 +77,9 @@ def bench_job(
     ``group.name=value`` to process with. say : called with one line about each job.
 
     Returns JSON values: the rig, the seconds of its calibration from the images of boards and target, and for each
-    number of steps the seconds (``wall``, ``cpu``, by stage), the peak memory in 1e6 bytes (None where the system does
-    not report it), the triangles and the size of the stored matches. Several numbers of steps also give
+    number of steps the seconds (``wall``, ``cpu``, by stage), the processor time of the checks and their share of the
+    whole (``checks``, ``checks_share``), the peak memory in 1e6 bytes (None where the system does not report it), the
+    triangles and the size of the stored matches. Several numbers of steps also give
     ``seconds_per_step``, ``cpu_seconds_per_step`` and ``peak_mb_per_step``, by a straight line.
     """
     if min(steps, default=0) < 2:
@@ -106,6 +107,7 @@ def bench_job(
         shutil.rmtree(session / "work", ignore_errors=True)
         run = {"steps": count, **_process(session, settings)}
         say(_told(run))
+        say(_told_checks(run))
         runs.append(run)
     rig = {"cameras": cameras, "scale": scale, "settings": list(settings)}
     return {**rig, "boards": _BOARDS, "calibration_seconds": calibration, "runs": runs, **_lines(runs)}
@@ -161,15 +163,16 @@ def _deliver(shot: RenderedShot, rendered_images: ImageCache, path: Path) -> Non
 
 
 def _process(session: Path, settings: Sequence[str]) -> dict[str, Any]:
-    """Process a session in a child process: seconds by stage, processor time and peak memory."""
+    """Process a session in a child process: seconds by stage, processor time, that of the checks, and peak memory."""
     chosen = [word for setting in settings for word in ("--set", setting)]
     stages: dict[str, float] = {}
     outcome: dict[str, Any] = {}
+    checks: dict[str, float] = {}
     began = time.monotonic()
     # Standard error goes to a file: nobody reads it meanwhile, and a full pipe would block the child.
     with tempfile.TemporaryFile("w+", encoding="utf-8") as errors:
         child = subprocess.Popen(
-            [sys.executable, "-P", "-m", "ringdic.jobs", str(session), *chosen],
+            [sys.executable, "-P", "-m", "ringdic_controller.studies.bench.checks", str(session), *chosen],
             stdout=subprocess.PIPE,
             stderr=errors,
             text=True,
@@ -178,7 +181,7 @@ def _process(session: Path, settings: Sequence[str]) -> dict[str, Any]:
         before, since = "start", began
         for line in child.stdout:
             message = json.loads(line)
-            outcome = message if "state" in message else outcome
+            outcome, checks = message if "state" in message else outcome, message.get("checks", checks)
             stage, now = message.get("stage", before), time.monotonic()
             if stage != before:
                 stages[before] = stages.get(before, 0.0) + now - since
@@ -192,8 +195,9 @@ def _process(session: Path, settings: Sequence[str]) -> dict[str, Any]:
     matches_size = sum(path.stat().st_size for path in (session / "work").glob("*.npz"))
     size = (results / "results.h5").stat().st_size
     shutil.rmtree(results)
+    share = sum(checks.values()) / used["cpu"] if used["cpu"] else None
     return {
-        "wall": time.monotonic() - began, **used, "seconds": stages,
+        "wall": time.monotonic() - began, **used, "seconds": stages, "checks": checks, "checks_share": share,
         "faces": outcome["summary"].get("faces"), "kept_mb": matches_size / _MB, "results_mb": size / _MB,
     }  # fmt: skip
 
@@ -229,3 +233,13 @@ def _told(run: Mapping[str, Any]) -> str:
         + ("" if run["cpu"] is None else f", {run['cpu']:.1f} CPU-s, peak {run['peak_mb']:,.0f} MB")
         + f", {run['kept_mb']:.0f} MB of matches kept, results {run['results_mb']:.0f} MB"
     )
+
+
+def _told_checks(run: Mapping[str, Any]) -> str:
+    """The processor time of the checks of a job, each with its share of the whole."""
+    parts = [
+        f"{name} {seconds:.2f}" + (f" ({100 * seconds / run['cpu']:.1f} %)" if run["cpu"] else "")
+        for name, seconds in run["checks"].items()
+    ]
+    share = "" if run["checks_share"] is None else f", {100 * run['checks_share']:.1f} % of the job's"
+    return f"its checks: {sum(run['checks'].values()):.2f} CPU-s{share}: {', '.join(parts)}"

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ringdic.session.json_values import json_value
+
 from ringdic_controller.studies.gallery.comparison import COVERED, SHAPE, SPREAD, RowFigures
+from ringdic_controller.studies.sigma_tables import SigmaRow, write_sigma_tables
+from ringdic_controller.studies.tables import markdown_table
 
 AIMS = (
     f"Aims: at least {100 * COVERED:.0f} % covered of what two cameras see below 60°, no point wrong by more than "
@@ -20,7 +22,10 @@ AIMS = (
 
 @dataclass(frozen=True)
 class GalleryEntry:
-    """One row of the gallery as it was measured: its figures, or the sentence by which it was refused."""
+    """One row of the gallery as it was measured: its figures, or the sentence by which it was refused.
+
+    calm : whether neither blur nor a large turn disturbs the measurement.
+    """
 
     name: str
     seconds: float
@@ -28,6 +33,7 @@ class GalleryEntry:
     refusal: str = ""
     warnings: tuple[str, ...] = ()
     picture: str = ""
+    calm: bool = True
 
     @property
     def missed(self) -> list[str]:
@@ -47,11 +53,11 @@ class GalleryEntry:
             f"{f.points}",
             f"{f.wrong}",
             f"{f.shape_mm:.4f}",
-            f"{f.shape.plain:.2f} / {f.shape.robust:.2f}",
+            f"{f.spreads.position.plain:.2f} / {f.spreads.position.robust:.2f}",
             f"{f.displacement_mm:.4f}",
-            f"{f.displacement.plain:.2f} / {f.displacement.robust:.2f}",
+            f"{f.spreads.displacement.plain:.2f} / {f.spreads.displacement.robust:.2f}",
             f"{f.stretch_rms:.5f}",
-            f"{f.stretches.plain:.2f} / {f.stretches.robust:.2f}",
+            f"{f.spreads.stretch.plain:.2f} / {f.spreads.stretch.robust:.2f}",
             f"{self.seconds:.0f}",
             ", ".join(f.missed),
         )
@@ -68,10 +74,10 @@ class GalleryEntry:
             f"{100 * f.covered_later:.1f}",
             f"{f.wrong}",
             f"{f.shape_mm:.3f}",
-            f"{f.shape.plain:.2f}",
+            f"{f.spreads.position.plain:.2f}",
             f"{f.displacement_mm:.3f}",
-            f"{f.displacement.robust:.2f}",
-            f"{f.stretches.robust:.2f}",
+            f"{f.spreads.displacement.robust:.2f}",
+            f"{f.spreads.stretch.robust:.2f}",
             f"{self.seconds:.0f}",
             ", ".join(f.missed),
         )
@@ -79,7 +85,7 @@ class GalleryEntry:
 
     def to_dict(self) -> dict[str, Any]:
         """The row as JSON values; figures that do not exist are null."""
-        values: dict[str, Any] = _jsonable(dataclasses.asdict(self))
+        values: dict[str, Any] = json_value(self)
         return {**values, "missed": self.missed}
 
 
@@ -91,16 +97,8 @@ _COLUMNS = (
 _SHORT = ("row", "cov. %", "later", "wrong", "shape", "s/σ", "displ.", "d/σ", "λ/σ", "s", "missed")
 
 
-def _jsonable(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _jsonable(each) for name, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_jsonable(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def write_gallery(folder: Path, entries: Sequence[GalleryEntry], about: Mapping[str, Any]) -> dict[str, Any]:
-    """Write ``gallery.json`` and ``gallery.md`` into a folder; returns what the JSON file holds."""
+    """Write ``gallery.json``, ``gallery.md`` and the tables of σ into a folder; returns what the JSON file holds."""
     reached = sum(not entry.missed for entry in entries)
     totals = {**about, "rows": len(entries), "reached": reached, "entries": [entry.to_dict() for entry in entries]}
     (folder / "gallery.json").write_text(json.dumps(totals, indent=1, ensure_ascii=False), encoding="utf-8")
@@ -110,10 +108,7 @@ def write_gallery(folder: Path, entries: Sequence[GalleryEntry], about: Mapping[
         f"Images of scale {about['scale']}; {reached} of {len(entries)} rows reach all aims. {AIMS}",
         "Over σ: RMS / robust. Later: covered before and after the motion.",
         "",
-        "| " + " | ".join(_COLUMNS) + " |",
-        "|" + "---|" * len(_COLUMNS),
-        *("| " + " | ".join(entry.cells().values()) + " |" for entry in entries),
-        "",
+        *markdown_table([entry.cells() for entry in entries]),
         *(f"- {entry.name}: refused: {entry.refusal}" for entry in entries if entry.refusal),
         *(f"- {entry.name}: {warning}" for entry in entries for warning in entry.warnings),
         "",
@@ -121,4 +116,6 @@ def write_gallery(folder: Path, entries: Sequence[GalleryEntry], about: Mapping[
         "",
     ]
     (folder / "gallery.md").write_text("\n".join(lines), encoding="utf-8")
+    known = [SigmaRow(each.name, each.figures.spreads, each.calm) for each in entries if each.figures is not None]
+    write_sigma_tables(folder, known, "Bodies of the virtual rig")
     return totals

@@ -26,6 +26,7 @@ _HIDDEN = ("hidden", "hides", "in front", "cable", "cover", "contradict")
 # Seen by all cameras of an arc about 45°; it moves from step to step.
 _GLARE = tuple(Damage(lamps=((250.0, 350.0, z),)) for z in (250.0, 180.0, 110.0))
 _SHADOWS = tuple(Damage(shadows=(Shadow((0.0, 0.0, 1.0), z),)) for z in (60.0, 110.0, 160.0))
+_HAIRS = 300  # on the whole limb: as on a leg with few
 _CABLE = Damage(bars=(Bar((72.0, 62.0, -150.0), (62.0, 72.0, 400.0), 2.5),))
 
 
@@ -47,6 +48,8 @@ def _calm() -> Iterator[MishapRow]:
         ("flicker", changes.flickering, ()),
         ("noise-threefold", changes.taken_otherwise(ShotCondition(noise=3.0)), ()),
         ("jpeg-60", changes.coded_as_jpeg(60), ()),
+        ("raw-mosaic", changes.taken_otherwise(ShotCondition(mosaic=True)), ()),
+        ("hairs", changes.hairy(_HAIRS), ()),
         ("board-squares-11mm", changes.rig_described({"square_mm": 11.0}), ()),
         ("times-recorded", changes.dated, ()),
     ]

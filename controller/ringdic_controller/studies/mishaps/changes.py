@@ -6,13 +6,14 @@ import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 from ringdic_node.virtual_rig import disturbance
 from ringdic_node.virtual_rig.disturbance import ShotCondition
 from ringdic_node.virtual_rig.lens import VirtualCamera
 from ringdic_node.virtual_rig.scenes import BoardScene, Damage, SolidSpecimen, TargetScene
+from ringdic_node.virtual_rig.solid_damage import grown_hairs
 
 from ringdic_controller.studies.mishaps.measurement import PlannedMeasurement, Shots, motion_share
 from ringdic_controller.studies.validate.image_cache import RenderedShot
@@ -32,12 +33,12 @@ KNOCKS: dict[str, Callable[[VirtualCamera, float], VirtualCamera]] = {
 
 
 def unchanged(measurement: PlannedMeasurement) -> PlannedMeasurement:
-    """The measurement as it is: nothing goes wrong."""
+    """A change that leaves the measurement as it is: nothing goes wrong."""
     return measurement
 
 
 def all_of(*changes: Change) -> Change:
-    """Several changes, one after the other."""
+    """A change that makes several changes of a measurement, one after the other."""
 
     def change(measurement: PlannedMeasurement) -> PlannedMeasurement:
         for each in changes:
@@ -53,7 +54,11 @@ def shots_changed(
     steps: Sequence[int] | None = None,
     kind: str = "specimen",
 ) -> Change:
-    """A change of single images. cameras, steps : those concerned, None for all. kind : of the captures."""
+    """A change that describes single images of the measurement anew.
+
+    change : from an image to the one that is taken in its place. cameras : ids; steps : numbers of the captures among
+    their kind, the reference 0; None for all. kind : of the captures, "board", "target" or "specimen".
+    """
     return lambda measurement: measurement.changed_shots(change, cameras, steps, kind)
 
 
@@ -63,31 +68,44 @@ def camera_changed(
     steps: Sequence[int] | None = None,
     kind: str = "specimen",
 ) -> Change:
-    """A change of the cameras themselves in some captures. cameras, steps : those concerned, None for all."""
+    """A change that puts other cameras, such as knocked ones, in the place of those that take some captures.
+
+    cameras : ids; steps : numbers of the captures, the reference 0; None for all. kind : of the captures.
+    """
     return shots_changed(lambda shot: replace(shot, camera=change(shot.camera)), cameras, steps, kind)
 
 
 def knocked(how: str, px: float, cameras: Sequence[str] | None, steps: Sequence[int] | None = None) -> Change:
-    """Cameras knocked before some steps, None for all. how : one of `KNOCKS`. px : shift of their images."""
+    """A change that knocks cameras before some captures of the specimen.
+
+    how : one of `KNOCKS`. px : shift of their images. cameras : ids; steps : numbers of the captures, the reference 0;
+    None for all.
+    """
     return camera_changed(lambda camera: KNOCKS[how](camera, px), cameras, steps)
 
 
 def refocused(
     factor: float, cameras: Sequence[str] | None, steps: Sequence[int] | None = None, kind: str = "specimen"
 ) -> Change:
-    """Lenses refocused before some captures: their focal lengths are ``factor`` times as long."""
+    """A change that refocuses lenses before some captures: their focal lengths become ``factor`` times as long.
+
+    cameras : ids; steps : numbers of the captures among their kind, None for all. kind : of the captures.
+    """
     return camera_changed(partial(disturbance.refocused_camera, factor=factor), cameras, steps, kind)
 
 
 def taken_otherwise(
     condition: ShotCondition, cameras: Sequence[str] | None = None, steps: Sequence[int] | None = None
 ) -> Change:
-    """Images of the specimen taken with another exposure, more noise, or moved or mirrored."""
+    """A change that takes images of the specimen under another condition, such as another exposure, or mirrored.
+
+    cameras : ids; steps : numbers of the captures, the reference 0; None for all.
+    """
     return shots_changed(lambda shot: replace(shot, condition=condition), cameras, steps)
 
 
 def always_taken_otherwise(condition: ShotCondition, camera: str) -> Change:
-    """All images of a camera taken otherwise, those of board and target with them."""
+    """A change that takes every image of a camera, of board, target and specimen, under another condition."""
 
     def change(shot: RenderedShot) -> RenderedShot:
         return replace(shot, condition=condition)
@@ -96,12 +114,12 @@ def always_taken_otherwise(condition: ShotCondition, camera: str) -> Change:
 
 
 def coded_as_jpeg(quality: int) -> Change:
-    """Images of the specimen coded as JPEG of a quality."""
+    """A change that stores the images of the specimen as JPEG files of a quality, 0 to 100."""
     return shots_changed(lambda shot: replace(shot, jpeg=quality))
 
 
 def flickering(measurement: PlannedMeasurement) -> PlannedMeasurement:
-    """Every image of the specimen lit otherwise than the others, by a fifth (standard deviation)."""
+    """A change that gives every image of the specimen a light of its own, which scatters by a fifth of the calm one."""
 
     def lit(shot: RenderedShot) -> RenderedShot:
         light = 1.0 + 0.2 * float(np.clip(np.random.default_rng([shot.seed, 50]).normal(), -1.5, 1.0))
@@ -113,7 +131,11 @@ def flickering(measurement: PlannedMeasurement) -> PlannedMeasurement:
 def specimen_changed(
     cameras: Sequence[str] | None = None, steps: Sequence[int] | None = None, **values: object
 ) -> Change:
-    """The specimen with other fields, such as ``defocus`` or ``speckle``, as some cameras see it at some steps."""
+    """A change that gives the specimen other properties, as some cameras see it at some steps.
+
+    cameras : ids; steps : numbers of the captures, the reference 0; None for all. values : fields of `SolidSpecimen`,
+    such as ``defocus`` (px) or ``speckle``.
+    """
 
     def change(shot: RenderedShot) -> RenderedShot:
         assert isinstance(shot.scene, SolidSpecimen)
@@ -122,18 +144,32 @@ def specimen_changed(
     return shots_changed(change, cameras, steps)
 
 
+def hairy(count: int) -> Change:
+    """A change that lays dark hairs on the specimen, at random places, which move with its skin. count : of hairs."""
+
+    def change(shot: RenderedShot) -> RenderedShot:
+        assert isinstance(shot.scene, SolidSpecimen)
+        hairs = _hairs(shot.scene.solid, count, shot.scene.seed)
+        return replace(shot, scene=replace(shot.scene, damage=Damage(hairs=hairs)))
+
+    return shots_changed(change)
+
+
+_hairs = lru_cache(grown_hairs)
+
+
 def damaged(*damages: Damage) -> Change:
-    """Shadows, reflections or bars at each step, the reference first."""
+    """A change that adds shadows, reflections or bars to the specimen, for each step, the reference first."""
     return all_of(*(specimen_changed(None, [step], damage=each) for step, each in enumerate(damages)))
 
 
 def target_nudged(offset: tuple[float, float, float], camera: str) -> Change:
-    """The target pushed aside before a camera took its image, mm."""
+    """A change that pushes the target aside before one camera takes its image of it. offset : mm, in the world."""
     return shots_changed(lambda shot: replace(shot, scene=TargetScene(offset)), [camera], kind="target")
 
 
 def board_bowed(bow: float) -> Change:
-    """The checkerboard bowed in all its views, mm."""
+    """A change that bows the checkerboard in all its views. bow : mm, of its middle."""
 
     def change(shot: RenderedShot) -> RenderedShot:
         assert isinstance(shot.scene, BoardScene)
@@ -143,7 +179,10 @@ def board_bowed(bow: float) -> Change:
 
 
 def exchanged(first: str, second: str, steps: Sequence[int] | None = None, kind: str = "specimen") -> Change:
-    """The images of two cameras filed under each other's names."""
+    """A change that files the images of two cameras under each other's names.
+
+    steps : numbers of the captures among their kind, None for all. kind : of the captures.
+    """
 
     def swap(_: int, shots: Shots) -> Shots:
         return {**shots, first: shots[second], second: shots[first]}
@@ -152,7 +191,7 @@ def exchanged(first: str, second: str, steps: Sequence[int] | None = None, kind:
 
 
 def repeated(camera: str, step: int, of: int) -> Change:
-    """A camera that delivers at a step the very image that it took at another."""
+    """A change by which a camera delivers at a step the very image that it took at another step, numbered ``of``."""
 
     def change(measurement: PlannedMeasurement) -> PlannedMeasurement:
         old = measurement.images("specimen", of)[camera]
@@ -162,7 +201,7 @@ def repeated(camera: str, step: int, of: int) -> Change:
 
 
 def late_scene(camera: str, step: int, of: int) -> Change:
-    """A camera that shows at a step what stood there at another, in an image of its own."""
+    """A change by which a camera shows at a step, in an image of its own, the body as it was at step ``of``."""
 
     def change(measurement: PlannedMeasurement) -> PlannedMeasurement:
         scene = measurement.images("specimen", of)[camera].scene
@@ -172,7 +211,7 @@ def late_scene(camera: str, step: int, of: int) -> Change:
 
 
 def gaps_closed(measurement: PlannedMeasurement) -> PlannedMeasurement:
-    """Camera k lost the image of step k, and each camera's images were filed one after the other: one step fewer."""
+    """A change by which camera k loses its image of step k and files those after it one step earlier."""
     positions = [position for position, _ in measurement.numbered("specimen")]
 
     def moved_up(number: int, shots: Shots) -> Shots:
@@ -183,7 +222,7 @@ def gaps_closed(measurement: PlannedMeasurement) -> PlannedMeasurement:
 
 
 def other_instant(camera: str, share: float, step: int, recorded_ms: float | None) -> Change:
-    """A camera that shows the moving body a share of the motion later than the others do.
+    """A change by which a camera shows the moving body, at a step, a share of the whole motion later than the others.
 
     recorded_ms : lateness that the record of the capture states, ms; None where it states no times.
     """
@@ -202,7 +241,7 @@ def other_instant(camera: str, share: float, step: int, recorded_ms: float | Non
 
 
 def dated(measurement: PlannedMeasurement) -> PlannedMeasurement:
-    """All images of the specimen with the time of their exposure, less than 0.1 ms apart in each capture."""
+    """A change that records the times of all exposures of the specimen, less than 0.1 ms apart in each capture."""
     return _dated(measurement, "", 0, 0.0)
 
 
@@ -223,7 +262,7 @@ def _dated(measurement: PlannedMeasurement, late: str, step: int, late_ms: float
 
 
 def camera_missing(camera: str, steps: Sequence[int]) -> Change:
-    """A camera that delivers no image at some steps."""
+    """A change by which a camera delivers no image at some steps. steps : numbers of the captures, the reference 0."""
 
     def without(_: int, shots: Shots) -> Shots:
         return {id_: shot for id_, shot in shots.items() if id_ != camera}
@@ -232,7 +271,7 @@ def camera_missing(camera: str, steps: Sequence[int]) -> Change:
 
 
 def set_up_again(measurement: PlannedMeasurement) -> PlannedMeasurement:
-    """The rig taken down and set up again after the calibration: all cameras turned, shifted and refocused a little."""
+    """A change that sets up the rig again after the calibration: all cameras turn, shift and refocus a little."""
     change: Change = unchanged
     for number, camera in enumerate(measurement.cameras):
         rows, columns, aside, focus = np.random.default_rng([number, 88]).normal(size=4)
@@ -247,7 +286,10 @@ def set_up_again(measurement: PlannedMeasurement) -> PlannedMeasurement:
 
 
 def rig_described(values: Mapping[str, float | str]) -> Change:
-    """The rig file with other values of the target or board, by names such as ``radius_mm``; each stands in it once."""
+    """A change of the rig file alone: other measures of target or board than those that the images show.
+
+    values : by their names in the rig file, such as ``radius_mm``, which must stand in it once.
+    """
 
     def change(measurement: PlannedMeasurement) -> PlannedMeasurement:
         text = measurement.rig_toml

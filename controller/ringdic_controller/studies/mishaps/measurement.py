@@ -49,7 +49,7 @@ class PlannedMeasurement:
     def changed_captures(
         self, change: Callable[[int, Shots], Shots], kind: str = "specimen", steps: Sequence[int] | None = None
     ) -> PlannedMeasurement:
-        """The measurement with other images of a kind of capture.
+        """A copy of the measurement in which some captures of a kind hold other images.
 
         change : from number and images of a capture to its new images. steps : numbers of the captures, None for all.
         """
@@ -66,9 +66,10 @@ class PlannedMeasurement:
         steps: Sequence[int] | None = None,
         kind: str = "specimen",
     ) -> PlannedMeasurement:
-        """The measurement with images taken otherwise.
+        """A copy of the measurement in which some images of a kind of capture are described anew.
 
-        change : of one image. cameras, steps : those concerned, None for all.
+        change : from an image to the one that is taken in its place. cameras : ids; steps : numbers of the captures
+        among their kind; None for all.
         """
 
         def all_changed(_: int, shots: Shots) -> Shots:

@@ -15,6 +15,8 @@ from ringdic.session.json_values import json_value
 
 from ringdic_controller.studies.mishaps.judgement import MishapJudgement, Outcome, RunRecord
 from ringdic_controller.studies.mishaps.rows import RANDOM
+from ringdic_controller.studies.sigma_tables import SigmaRow, write_sigma_tables
+from ringdic_controller.studies.tables import markdown_table
 
 AIMS = (
     "Followed: all errors within 3 times those of the calm row. Within σ: larger, and the stated standard deviations "
@@ -53,6 +55,13 @@ class MishapEntry:
         cells = self.cells()
         return {name: cells[name] for name in ("row", "outcome", "wrong %", "shape mm", "displ. mm", ">5σ %")}
 
+    def sigma_row(self) -> SigmaRow | None:
+        """Errors over stated σ; None where nothing was measured. Calm are the rows in which nothing is otherwise."""
+        if self.run.errors is None or self.run.errors.spreads is None:
+            return None
+        calm, usable = self.name.startswith(("calm-", RANDOM)), self.run.verdict != Verdict.DO_NOT_USE
+        return SigmaRow(self.name, self.run.errors.spreads, calm, usable)
+
     def to_dict(self) -> dict[str, Any]:
         """The row as JSON values; figures that do not exist are null."""
         return json_value({**dataclasses.asdict(self), "good": self.judgement.outcome.is_good})  # type: ignore[no-any-return]
@@ -65,7 +74,7 @@ def outcome_counts(entries: Sequence[MishapEntry]) -> dict[str, int]:
 
 
 def write_mishaps(folder: Path, entries: Sequence[MishapEntry], about: Mapping[str, Any]) -> dict[str, Any]:
-    """Write ``mishaps.json`` and ``mishaps.md`` into a folder; returns what the JSON file holds."""
+    """Write ``mishaps.json``, ``mishaps.md`` and the tables of σ into a folder; returns what the JSON file holds."""
     counts = outcome_counts(entries)
     good = sum(entry.judgement.outcome.is_good for entry in entries)
     totals = {
@@ -79,16 +88,15 @@ def write_mishaps(folder: Path, entries: Sequence[MishapEntry], about: Mapping[s
         f"Images of scale {about['scale']}; {good} of {len(entries)} rows are as they should be: {_counted(counts)}.",
         AIMS + " Findings in bold name the mishap.",
         "",
-        "| " + " | ".join(_COLUMNS) + " |",
-        "|" + "---|" * len(_COLUMNS),
-        *("| " + " | ".join(entry.cells().values()) + " |" for entry in entries),
-        "",
+        *markdown_table([entry.cells() for entry in entries]),
         "What was said:",
         "",
         *(line for entry in entries for line in _said(entry)),
         "",
     ]
     (folder / "mishaps.md").write_text("\n".join(lines), encoding="utf-8")
+    known = [row for entry in entries if (row := entry.sigma_row()) is not None]
+    write_sigma_tables(folder, known, "Mishaps in the virtual rig")
     return totals
 
 

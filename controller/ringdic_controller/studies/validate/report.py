@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ringdic_controller.studies.tables import markdown_table
 from ringdic_controller.studies.validate.figures import BETTER, PAPER, Figure
 
 #: A figure shows the systematic errors if it is at least this many times larger by the paper's way.
@@ -87,22 +88,16 @@ def _page(figures: Sequence[Figure], ways: Sequence[str], totals: Mapping[str, A
         f"{totals['reached']} of {totals['aimed_at']} aims reached.",
         "The paper: D. Solav et al., IEEE Access 6 (2018) 30520.",
         "",
-        *_table(rows(figures, ways)),
+        *markdown_table(rows(figures, ways)),
         *(f"{figure.experiment}, {figure.quantity}: {figure.note}" for figure in figures if figure.note),
         "",
     ]
     blind = blindness(figures)
     if blind:
-        lines += ["## Which figures see the systematic errors of the paper's way", "", *_table(blind)]
+        lines += ["## Which figures see the systematic errors of the paper's way", "", *markdown_table(blind)]
     lines += [
         *(f"![{name}]({path.name})" for name, path in plots.items()),
         "",
-        *_table([{"step": name, "seconds": f"{value:.1f}"} for name, value in totals["seconds"].items()]),
+        *markdown_table([{"step": name, "seconds": f"{value:.1f}"} for name, value in totals["seconds"].items()]),
     ]
     return "\n".join(lines)
-
-
-def _table(table: Sequence[Mapping[str, str]]) -> list[str]:
-    head = list(table[0]) if table else []
-    rows = ("| " + " | ".join(row[name].replace("|", "\\|") for name in head) + " |" for row in table)
-    return ["| " + " | ".join(head) + " |", "|" + "---|" * len(head), *rows, ""]

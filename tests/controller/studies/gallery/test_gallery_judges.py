@@ -9,11 +9,12 @@ import pytest
 from ringdic.errors import InputError
 from ringdic.geometry.camera import Camera
 from ringdic.results.results import Results
-from ringdic_controller.studies.gallery.comparison import JudgedRun, judged, normal_sigma
+from ringdic_controller.studies.gallery.comparison import JudgedRun, judged
 from ringdic_controller.studies.gallery.picture import draw_row
 from ringdic_controller.studies.gallery.rows import MODERATE, gallery_rig, gallery_rows
 from ringdic_controller.studies.gallery.sample import SurfaceSample
 from ringdic_controller.studies.gallery.tables import GalleryEntry, write_gallery
+from ringdic_controller.studies.solid_errors import normal_sigma
 from ringdic_node.virtual_rig.bodies import upright_column
 from ringdic_node.virtual_rig.scenes import SolidSpecimen
 
@@ -68,9 +69,9 @@ def test_planted_noise_is_measured_in_units_of_its_stated_deviation(sample: Surf
         BEFORE, AFTER, sample,
     )  # fmt: skip
     assert run.figures.shape_mm == pytest.approx(SIGMA, rel=0.03)
-    assert run.figures.shape.plain == pytest.approx(1.0, rel=0.03)
-    assert run.figures.shape.robust == pytest.approx(1.0, rel=0.03)
-    assert run.figures.displacement.plain == pytest.approx(2.0, rel=0.03)
+    assert run.figures.spreads.position.plain == pytest.approx(1.0, rel=0.03)
+    assert run.figures.spreads.position.robust == pytest.approx(1.0, rel=0.03)
+    assert run.figures.spreads.displacement.plain == pytest.approx(2.0, rel=0.03)
     assert run.figures.displacement_mm == pytest.approx(2.0 * SIGMA_MOVED * np.sqrt(3.0), rel=0.03)
     assert run.figures.missed[0] == "coverage"
     assert "displacement" in run.figures.missed

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import pytest
 from ringdic.errors import ComputationError
+from ringdic_controller.studies import row_study
 from ringdic_controller.studies.gallery import rows, run
-from ringdic_controller.studies.gallery.run import gallery_settings, run_gallery
+from ringdic_controller.studies.gallery.run import run_gallery
+from ringdic_controller.studies.row_study import scaled_settings
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +53,7 @@ def test_what_is_refused_or_fails_is_a_row_with_its_sentence(
 
     monkeypatch.setattr(rows, "BOARDS", 4)
     monkeypatch.setattr(run, "calibrate_rig", lambda *_: None)
-    monkeypatch.setattr(run, "process_session", refuse)
+    monkeypatch.setattr(row_study, "process_session", refuse)
     totals = run_gallery(images, scale=0.15, only=["limb-arc2"])
     assert totals["reached"] == 0
     assert totals["entries"][0]["figures"] is None
@@ -60,5 +62,5 @@ def test_what_is_refused_or_fails_is_a_row_with_its_sentence(
 
 
 def test_the_settings_are_the_defaults_at_the_scale_of_the_images() -> None:
-    assert (gallery_settings(0.3).correlation.radius_px, gallery_settings(0.3).correlation.step_px) == (10, 5)
-    assert gallery_settings(0.3).surface == gallery_settings(1.0).surface
+    assert (scaled_settings(0.3).correlation.radius_px, scaled_settings(0.3).correlation.step_px) == (10, 5)
+    assert scaled_settings(0.3).surface == scaled_settings(1.0).surface

@@ -101,6 +101,15 @@ def test_the_rig_file_is_changed_where_it_says_and_no_image_with_it() -> None:
         changes.rig_described({"raduis_mm": 58.0})(CALM)
 
 
+def test_hairs_and_mosaics_are_in_every_image_of_the_specimen_and_in_no_other() -> None:
+    for name in ("hairs-arc4", "raw-mosaic-arc4"):
+        planned = ROWS[name].planned(0.1)
+        assert changed(planned) == {camera: [0, 1, 2] for camera in CALM.cameras}
+        assert changed(planned, "board") == changed(planned, "target") == {}
+    scenes = [shot.scene for shot in ROWS["hairs-arc4"].planned(0.1).images("specimen", 2).values()]
+    assert all(scene == scenes[0] for scene in scenes)  # the same hairs in all cameras
+
+
 def test_times_and_nothing_else_are_dated() -> None:
     planned = changes.dated(CALM)
     assert changed(planned) == {}

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from ringdic.errors import ComputationError
+from ringdic_controller.studies import row_study
 from ringdic_controller.studies.gallery import rows as gallery_rows
 from ringdic_controller.studies.mishaps import run
 from ringdic_controller.studies.mishaps.changes import rig_described
@@ -59,7 +60,7 @@ def test_what_is_refused_or_fails_is_a_row_with_its_sentence(
         raise error
 
     monkeypatch.setattr(gallery_rows, "BOARDS", 4)
-    monkeypatch.setattr(run, "process_session", refuse)
+    monkeypatch.setattr(row_study, "process_session", refuse)
     totals = run_mishaps(folder, scale=0.15, only=[CALM])
     assert totals["good"] == 0
     (entry,) = totals["entries"]
