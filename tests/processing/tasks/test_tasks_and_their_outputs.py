@@ -100,6 +100,19 @@ def test_a_file_that_was_not_finished_is_not_read(tmp_path: Path) -> None:
     assert read_output(tasks[3].output)["sum"] == 10.0
 
 
+def test_some_arrays_of_an_output_can_be_read_alone_and_a_missing_one_is_a_sentence(tmp_path: Path) -> None:
+    (task,) = chain(tmp_path, 1)
+    run([task])
+    assert set(read_output(task.output)) == {"sum", "points"}
+    assert set(read_output(task.output, ["points"])) == {"points"}
+    with pytest.raises(InputError, match="remove it and process again"):
+        read_output(task.output, ["points", "of another version"])
+    failed = Task(digest("no texture"), "pair", impossible, ("no texture",), tmp_path)
+    run([failed])
+    with pytest.raises(ComputationError, match="no texture"):
+        read_output(failed.output, ["points"])
+
+
 def test_what_cannot_be_computed_is_an_outcome_and_is_not_tried_again(tmp_path: Path) -> None:
     task = Task(digest("no texture"), "pair", impossible, ("cameras 1 and 2 share no texture",), tmp_path)
     after = Task(digest("after"), "after", add, ("after", np.array(1.0)), tmp_path, (task.key,))
