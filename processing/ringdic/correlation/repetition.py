@@ -110,10 +110,11 @@ def find_repetition(image: Image, xy: Pixels, radius: int, region: Mask | None =
     wanted = max(round(_SUBSETS * radius / factor), _SMALLEST, 0.5 * _CHANCE / _LIKENESS * math.sqrt(peak))
     half = min(math.ceil(wanted), min(grey.shape) // 4)
     limit = _LIKENESS * max(wanted / half, 1.0)  # in a small image windows are smaller than wanted, and chance larger
+    usable = _usable(level, inside, half)
     found = []
     for point in xy[even_sample(xy, _WINDOWS)]:
         x, y = np.rint((point + 0.5) / factor - 0.5).astype(int)
-        one = _second_peak(level, inside, int(x), int(y), half, _REACH // factor)
+        one = _second_peak(level, usable, int(x), int(y), half, _REACH // factor)
         if one is not None:
             found.append((*point, one[0], *(factor * lag for lag in one[1:])))
     rows = np.array(found, dtype=np.float64).reshape(-1, 5)
@@ -175,25 +176,36 @@ def _at_zero(first: float, second: float) -> float:
     return min(max((4.0 * first - second) / 3.0, 0.5), 1.0)
 
 
+def _usable(level: Levels, inside: Levels, half: int) -> Mask:
+    """About which pixels of an image, (height, width) bool, a window lies in the region, most of it, and has a pattern.
+
+    half : px, half the side of the windows. Of a window without any, the ZNCC would be a quotient of rounding errors.
+    """
+    side = (2 * half + 1,) * 2
+    mean, square, covered = (cv2.blur(each, side) for each in (level, level * level, inside))
+    return np.asarray((covered >= _COVERED) & (square - mean * mean >= _LEAST**2))
+
+
 def _second_peak(
-    level: Levels, inside: Levels, x: int, y: int, half: int, reach: int
+    level: Levels, usable: Mask, x: int, y: int, half: int, reach: int
 ) -> tuple[float, float, float] | None:
     """The highest ZNCC of the window about a pixel with others within reach, and where: (ZNCC, dx, dy), lags in px.
 
-    half : px, half the side of the window, which is moved inwards at the image's edge. Places of the peak at zero do
-    not count, nor others along an edge, for which the result is 0. None where the window lies outside the region or has
-    no pattern.
+    usable : about which pixels windows count. half : px, half the side of the window, which is moved inwards at the
+    image's edge. Places of the peak at zero do not count, nor others along an edge, for which the result is 0. None
+    where the window itself does not count.
     """
     height, width = level.shape
     x, y = (min(max(at, half), side - half - 1) for at, side in ((x, width), (y, height)))
     rows, columns = slice(y - half, y + half + 1), slice(x - half, x + half + 1)
     window = level[rows, columns]
-    if inside[rows, columns].mean() < _COVERED or window.std() < _LEAST:
+    if not usable[y, x]:
         return None
     top, left = max(y - half - reach, 0), max(x - half - reach, 0)
     around = level[top : y + half + 1 + reach, left : x + half + 1 + reach]
     zncc: Levels = np.asarray(cv2.matchTemplate(around, window, cv2.TM_CCOEFF_NORMED), np.float32)
-    zncc[~np.isfinite(zncc)] = 0.0
+    places = usable[top + half : top + half + len(zncc), left + half : left + half + len(zncc[0])]
+    zncc[~places | ~np.isfinite(zncc)] = 0.0
     row, column = y - half - top, x - half - left
     noiseless = _noiseless(zncc, row, column)
     high = (zncc > _SAME_PEAK * noiseless).astype(np.uint8)

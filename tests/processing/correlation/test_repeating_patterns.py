@@ -109,6 +109,25 @@ def test_what_lies_outside_the_region_does_not_count() -> None:
     assert not ambiguous[xy[:, 0] < 200].any()
 
 
+def test_places_without_any_pattern_are_no_likeness(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The correlation with an empty window is a quotient of rounding errors, which may be anything up to 1."""
+    computed = cv2.matchTemplate
+
+    def unlucky(image: NDArray, window: NDArray, method: int) -> NDArray:
+        values = computed(image, window, method)
+        half = len(window) // 2
+        empty = cv2.blur(image * image, window.shape) < 1e-6
+        values[empty[half:-half, half:-half]] = 1.0
+        return values
+
+    region = (COLUMNS - 100) ** 2 + (ROWS - 100) ** 2 < 90**2
+    xy = grid(region, 10)[0]
+    image = photographed(speckle(2.0))
+    assert find_repetition(image, xy, 15, region).share == 0.0
+    monkeypatch.setattr(cv2, "matchTemplate", unlucky)
+    assert find_repetition(image, xy, 15, region).share == 0.0
+
+
 @pytest.mark.parametrize(
     ("period", "jitter", "radius"), [(12.0, 0.1, 10), (12.0, 0.2, 10), (12.0, 0.3, 10), (24.0, 0.15, 20)]
 )
