@@ -1,4 +1,4 @@
-"""Findings on cameras that moved: which camera, by how much, at which steps, and whether its motion is known."""
+"""Findings on cameras that moved or were refocused: which, by how much, at which steps, and how well that is known."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from ringdic.calibration.moved_cameras import MOVED_PX, UNEXPLAINED, CameraMotions
+from ringdic.calibration.moved_cameras import MOTION, MOVED_PX, UNEXPLAINED, CameraMotions
+from ringdic.calibration.parameters import POSE
 from ringdic.findings import Finding
 
 
 def motion_figures(motions: Mapping[int, CameraMotions], steps: Sequence[str]) -> list[dict[str, Any]]:
-    """Residuals (px), rotations and translations at the steps at which cameras had moved, as JSON values.
+    """Residuals (px), turns, shifts and changed focal lengths at the steps at which cameras had moved, as JSON values.
 
     motions, steps : as of `motion_findings`.
     """
     rows = []
     for step, one in sorted(motions.items()):
         if one.moved.any():
-            turn, shift = (np.linalg.norm(part, axis=1) for part in np.split(one.motion, 2, axis=1))
+            turn, shift = (np.linalg.norm(part, axis=1) for part in (one.motion[:, :3], one.motion[:, 3:POSE]))
             rows.append(
                 {
                     "step": steps[step],
@@ -31,6 +32,7 @@ def motion_figures(motions: Mapping[int, CameraMotions], steps: Sequence[str]) -
                             "image_px": float(one.effect[c]),
                             "turn_deg": float(np.degrees(turn[c])),
                             "shift_mm": float(shift[c]),
+                            "focal_length_percent": 100.0 * float(one.motion[c, POSE]),
                         }
                         for c, camera in enumerate(one.cameras)
                         if np.isfinite(one.effect[c])
@@ -49,13 +51,16 @@ def motion_findings(motions: Mapping[int, CameraMotions], steps: Sequence[str]) 
     later = {step: one for step, one in motions.items() if step and one.moved.any()}
     unknown = [step for step, one in later.items() if one.unexplained]
     findings += [_unknown(later[step], steps[step], "since the reference") for step in unknown]
-    count = max((len(one.cameras) for one in later.values()), default=0)
+    known = {step: one for step, one in later.items() if step not in unknown}
+    for step in [step for step, one in known.items() if _all_refocused(one)]:
+        findings.append(_lenses(known.pop(step), steps[step], f"since the reference in {steps[step]}"))
+    count = max((len(one.cameras) for one in known.values()), default=0)
     for c in range(count):
-        at = [step for step, one in sorted(later.items()) if one.moved[c] and step not in unknown]
+        at = [step for step, one in sorted(known.items()) if one.moved[c]]
         if at:
-            worst = max(at, key=lambda step: later[step].effect[c])
+            worst = max(at, key=lambda step: known[step].effect[c])
             where = steps[worst] if len(at) == 1 else f"{steps[worst]} and less in {len(at) - 1} other steps"
-            findings.append(_followed(later[worst], c, steps[worst], f"since the reference in {where}"))
+            findings.append(_followed(known[worst], c, steps[worst], f"since the reference in {where}"))
     return findings
 
 
@@ -80,6 +85,8 @@ def _since_calibration(motions: CameraMotions, reference: str) -> list[Finding]:
     if motions.unexplained:
         return [_unknown(motions, reference, "between the calibration and the reference")]
     when = "between the calibration and the reference"
+    if _all_refocused(motions):
+        return [_lenses(motions, reference, when)]
     return [_followed(motions, int(c), reference, when) for c in np.flatnonzero(motions.moved)]
 
 
@@ -89,11 +96,40 @@ def _followed(motions: CameraMotions, c: int, step: str, when: str) -> Finding:
     others = "; which of two cameras moved cannot be known" if len(motions.cameras) == 2 else ""
     result = f"ines of sight missed one another by {motions.before[c]:.2f} px"
     result = f"It was followed: l{result}, and by {motions.after[c]:.3f} px now" if motions.followed else f"L{result}"
-    sentence = (
-        f"camera {camera} moved {when}, by {motions.effect[c]:.2f} px in its image ({x:+.2f} along rows, {y:+.2f} "
-        f"along columns){others}. {result}. Fix the camera, and calibrate again"
-    )
+    far = f"by {motions.effect[c]:.2f} px in its image ({x:+.2f} along rows, {y:+.2f} along columns)"
+    if motions.refocused[c]:
+        sentence = (
+            f"the lens of camera {camera} was refocused {when}: its focal length changed by {_percent(motions, c)} %, "
+            f"and points moved {far}. {result}. Lock the focus, and calibrate again"
+        )
+        return Finding("lens-refocused", sentence, (camera,), step, float(motions.effect[c]), MOVED_PX, "px")
+    sentence = f"camera {camera} moved {when}, {far}{others}. {result}. Fix the camera, and calibrate again"
     return Finding("camera-moved", sentence, (camera,), step, float(motions.effect[c]), MOVED_PX, "px")
+
+
+def _all_refocused(motions: CameraMotions) -> bool:
+    """Whether the lenses of all cameras that see a point were refocused, and none is known to stand as it was."""
+    return bool(motions.refocused[np.isfinite(motions.effect)].all())
+
+
+def _lenses(motions: CameraMotions, step: str, when: str) -> Finding:
+    """A finding on cameras that were all refocused, so that hardly anything tells the scale."""
+    cameras = [c for c, moved in enumerate(motions.moved) if moved]
+    ids = tuple(motions.cameras[c].id for c in cameras)
+    changes = ", ".join(f"{motions.cameras[c].id} {_percent(motions, c)} %" for c in cameras)
+    at = POSE + MOTION * np.array(cameras)
+    doubt = 100.0 * float(np.sqrt(np.mean(motions.covariance[np.ix_(at, at)])))
+    sentence = (
+        f"the lenses of all cameras were refocused {when}: their focal lengths changed by {changes}. Images tell the "
+        f"mean of these, and with it the size of the specimen, to {doubt:.2f} % only, which is part of the stated "
+        "standard deviations. Lock the focus, and calibrate again"
+    )
+    return Finding("lens-refocused", sentence, ids, step, float(np.nanmax(motions.effect)), MOVED_PX, "px")
+
+
+def _percent(motions: CameraMotions, c: int) -> str:
+    """Change of the focal length of camera number c, in percent."""
+    return f"{100.0 * motions.motion[c, POSE]:+.2f}"
 
 
 def _unknown(motions: CameraMotions, step: str, when: str) -> Finding:

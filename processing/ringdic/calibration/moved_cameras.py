@@ -1,12 +1,13 @@
-"""Cameras that moved, found and followed by matched points of a specimen, while all others hold the world where it is.
+"""Cameras that moved or were refocused, found and followed by matched points of a specimen.
 
-The cost ``Σ ρ(r / σ) + Σ_c ρ_c(p_cᵀ Σ_c⁻¹ p_c)`` is minimised over the points and a small motion p_c = (ω, τ) of each
-camera, with the lenses fixed. r are the reprojection residuals with Huber's ρ; Σ_c is the covariance of the pose of a
-camera that stands still. ρ_c is the cost of Geman and McClure: a camera's prior counts the less the more the points
-contradict it (iteratively reweighted least squares), so that the motion of one camera is not spread over all. Where
-that shows a motion, cameras are freed one after the other, that which explains most first, and all others stand still;
-where more than three or half have moved, all are free, and the smallest motion that fits is taken. The points are
-eliminated from the normal equations (Schur complement).
+All other cameras hold the world where it is. The cost ``Σ ρ(r / σ) + Σ_c ρ_c(p_cᵀ Σ_c⁻¹ p_c)`` is minimised over the
+points and a small motion p_c = (ω, τ, φ) of each camera: of its pose, and the relative change φ of its focal length. r
+are the reprojection residuals with Huber's ρ; Σ_c is the covariance of a camera that stands still. ρ_c is the cost of
+Geman and McClure: a camera's prior counts the less the more the points contradict it (iteratively reweighted least
+squares), so that the motion of one camera is not spread over all. Where that shows a motion, cameras are freed one
+after the other, that which explains most first, its pose, its focal length or both, and all others stand still; where
+more than three or half have moved, all are free, and the smallest motion that fits is taken. The points are eliminated
+from the normal equations (Schur complement).
 
 Two cameras that see a point each along one line tell all of their motion against each other but its scale. What moves
 all cameras alike cannot be told from a rigid motion of the body.
@@ -15,7 +16,7 @@ all cameras alike cannot be told from a rigid motion of the body.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,25 +24,29 @@ import scipy
 
 from ringdic.arrays import Floats, Mask, Pixels
 from ringdic.calibration.adjustment import HUBER, huber_weights
-from ringdic.calibration.parameters import LENS, POSE, CameraParameters, projection_jacobians
+from ringdic.calibration.parameters import LENS, PER_CAMERA, POSE, CameraParameters, projection_jacobians
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
 from ringdic.geometry.triangulation import reprojection_residuals, triangulate
 
-#: Shift of a camera's image beyond which it has moved, px.
+#: Parameters of a camera's motion: ω (rad), τ (mm), and the relative change of the focal length.
+MOTION = POSE + 1
+#: Shift of a camera's image beyond which it has moved, or its lens was refocused, px.
 MOVED_PX = 0.06
 _FOLLOWED_BY_TWO_PX = 1.0  # least motion that is followed with two cameras
 _FARTHEST_PX = 60.0  # greatest motion that is followed; more would be another image, not a bump
 #: Most points that are used, and fewest that are needed.
 _MOST, _FEWEST = 3000, 50
 _STILL_PX, _UNKNOWN_PX = 0.02, 0.3  # px, motion in the image of a camera that stands still, and of one that may move
-_TAIL = 3.0  # squares of σ, for each of the six parameters, at which a motion's weight is a quarter
+_FIXED = 1e-12  # standard deviation of the relative change of a focal length that is not freed
+_TAIL = 3.0  # squares of σ, for each of the six parameters of a pose, at which a motion's weight is a quarter
 #: Robust ratio of residuals to their standard deviations, and their RMS, px, beyond which motions of the cameras do not
 #: explain them. A lens that its model does not describe quite leaves some hundredths of a pixel.
 UNEXPLAINED, _UNEXPLAINED_PX = 3.0, 0.1
 _MEDIAN_OF_CHI2 = 2.0 * np.log(2.0)  # with two degrees of freedom
 _FEW = 3  # cameras at most that are freed alone
-_PRICE = 50.0  # squares of σ that a freed camera must explain
+_PRICE = 50.0  # squares of σ that a freed pose must explain, and a freed focal length
+_SCREENED, _SCREENING_STEPS = 600, 5  # points, and steps of a fit, by which the camera to be freed is chosen
 _FREE_PX, _ALL_FREE_PX = 30.0, 1.0  # px, standard deviation of a motion where few cameras moved, and where most did
 _GAIN = 0.5  # squares of σ an observation, least gain by a motion; noise gives 0.3 on a patch of a hundred points
 _LOOSE_STEPS, _STEPS = 2, 14
@@ -53,9 +58,12 @@ class CameraMotions:
     """Small motions of C cameras since they were calibrated, or since the reference.
 
     cameras : before the motion.
-    motion : (C, 6) ω (rad) and τ (mm), by which ``R ← exp([ω]×) R``, ``t ← t + τ``. covariance : (6 C, 6 C) of it.
+    motion : (C, 7) ω (rad), τ (mm) and φ, by which ``R ← exp([ω]×) R``, ``t ← t + τ``, ``f ← (1 + φ) f``. covariance :
+        (7 C, 7 C) of it.
+    freed : (C,) bool, which of the cameras may have moved; the others stand still but for what is not known of them.
     shift : (C, 2) px, median shift of the points' images by the motion, and effect : (C,) px, RMS of its length; NaN
         for a camera without points.
+    lens_effect : (C,) px, the part of effect that is due to the change of the focal length alone.
     before, after : (C,) px, RMS reprojection error of each camera's points without the motion and with it, else NaN.
     misfit : (C,) robust ratio of each camera's residuals, with the motion, to their standard deviations, else NaN.
     scale : factor, 1 or more, by which the standard deviations of the pixels must be multiplied to fit the residuals.
@@ -68,8 +76,10 @@ class CameraMotions:
     cameras: tuple[Camera, ...]
     motion: Floats
     covariance: Floats
+    freed: Mask
     shift: Pixels
     effect: Floats
+    lens_effect: Floats
     before: Floats
     after: Floats
     misfit: Floats
@@ -81,7 +91,12 @@ class CameraMotions:
     @property
     def moved(self) -> Mask:
         """Which of the cameras, (C,) bool, moved by more than `MOVED_PX` in their images, as the residuals bear out."""
-        return np.asarray((np.nan_to_num(self.effect) > MOVED_PX) & (self.gain > _GAIN))
+        return np.asarray(self.freed & (np.nan_to_num(self.effect) > MOVED_PX) & (self.gain > _GAIN))
+
+    @property
+    def refocused(self) -> Mask:
+        """Which of the cameras that moved, (C,) bool, did so in part or in all by a change of the focal length."""
+        return np.asarray(self.moved & (np.nan_to_num(self.lens_effect) > MOVED_PX))
 
     @property
     def unexplained(self) -> bool:
@@ -117,8 +132,8 @@ def still_cameras(cameras: Sequence[Camera]) -> CameraMotions:
     count = len(cameras)
     nothing = np.full(count, np.nan)
     return CameraMotions(
-        tuple(cameras), np.zeros((count, POSE)), np.zeros((POSE * count,) * 2), np.full((count, 2), np.nan), nothing,
-        nothing, nothing, nothing, 1.0, 0.0, -1, 0,
+        tuple(cameras), np.zeros((count, MOTION)), np.zeros((MOTION * count,) * 2), np.zeros(count, dtype=bool),
+        np.full((count, 2), np.nan), nothing, nothing, nothing, nothing, nothing, 1.0, 0.0, -1, 0,
     )  # fmt: skip
 
 
@@ -140,45 +155,58 @@ def find_moved_cameras(
     ------
     ComputationError : fewer than 50 points are seen by two cameras.
     """
-    fit = _Fit(cameras, px, sigma, most)
     known = np.zeros((len(cameras), POSE, POSE)) if covariance is None else covariance
-    still = _inverses(known + fit.standing(_STILL_PX))
+    fit = _Fit(cameras, px, sigma, known, most)
+    none = np.zeros(len(cameras), dtype=bool)
+    still = fit.information(none, none)
     for _ in range(_LOOSE_STEPS):
-        fit.step(_inverses(known + fit.standing(_UNKNOWN_PX)))
-    fit.settle(lambda: still / (1.0 + fit.squares(still) / (_TAIL * POSE))[:, None, None] ** 2, still)
+        fit.step(fit.information(~none, none, _UNKNOWN_PX))
+    fit.settle(lambda: still / (1.0 + fit.squares(still) / (_TAIL * POSE))[:, None, None] ** 2)
     motions = fit.motions()
     if not motions.moved.any():
         return motions
-    best = _fewest_moved(fit, still, known)
+    best = _fewest_moved(fit)
     motions = best.motions()
     return replace(motions, contradicting=best.contradicting()) if motions.unexplained else motions
 
 
-def _fewest_moved(fit: _Fit, still: Floats, known: Floats) -> _Fit:
+@dataclass(frozen=True)
+class _Freed:
+    """Which cameras' poses and focal lengths are free, (C,) bool each, and by how many px in the images."""
+
+    poses: Mask
+    lenses: Mask
+    px: float
+
+    def options(self, c: int) -> Iterator[_Freed]:
+        """What may be freed beside these: the pose of camera c, its focal length, or both."""
+        this = np.arange(len(self.poses)) == c
+        for pose, lens in ((True, False), (False, True), (True, True)):
+            yield _Freed(self.poses | (this & pose), self.lenses | (this & lens), self.px)
+
+
+def _fewest_moved(fit: _Fit) -> _Fit:
     """The fit that explains the points best with the fewest free cameras: at most three and half of them, or all.
 
-    One camera after the other is freed, that which explains most. still : (C, 6, 6) information matrices of motions of
-    cameras that stand still. known : (C, 6, 6) covariances of the poses.
+    One camera after the other is freed, that whose free pose explains most. Two cameras do not tell a motion from
+    another focal length.
     """
-    count, scale = len(fit.cameras), fit.scale
-    loose, all_loose = (_inverses(known + fit.standing(px)) for px in (_FREE_PX, _ALL_FREE_PX))
-
-    def freed(which: Mask, free: Floats) -> tuple[float, _Fit]:
-        trial = fit.restarted()
-        prior = np.where(which[:, None, None], free, still)
-        trial.settle(lambda: prior, still)
-        unmoved = float(trial.squares(still)[~which].sum())
-        return trial.cost() / scale**2 + unmoved + _PRICE * int(which.sum()), trial
-
-    moved = np.zeros(count, dtype=bool)
-    best = freed(~moved, all_loose)
-    last = np.inf
-    while count > 2 and moved.sum() < min(count // 2, _FEW):
-        trials = [(c, *freed(moved | (np.arange(count) == c), loose)) for c in np.flatnonzero(~moved)]
-        c, price, trial = min(trials, key=lambda each: each[1])
+    none = np.zeros(len(fit.cameras), dtype=bool)
+    if len(none) == 2:
+        return fit.freed(_Freed(~none, none, _ALL_FREE_PX))[1]
+    whole = [fit.freed(_Freed(poses, lenses, _ALL_FREE_PX)) for poses, lenses in ((~none, none), (none, ~none))]
+    whole.append(fit.freed(_Freed(~none, ~none, _ALL_FREE_PX)))
+    best = min(whole, key=lambda each: each[0])
+    screened, freed, last = fit.thinned(_SCREENED), _Freed(none, none, _FREE_PX), np.inf
+    while (changed := freed.poses | freed.lenses).sum() < min(len(none) // 2, _FEW):
+        c = min(
+            np.flatnonzero(~changed), key=lambda k: screened.freed(next(freed.options(int(k))), _SCREENING_STEPS)[0]
+        )
+        trials = [(*fit.freed(each), each) for each in freed.options(int(c))]
+        price, trial, freed = min(trials, key=lambda each: each[0])
         if price >= last:
             break
-        moved[c], last = True, price
+        last = price
         if price < best[0]:
             best = price, trial
     return best[1]
@@ -187,7 +215,9 @@ def _fewest_moved(fit: _Fit, still: Floats, known: Floats) -> _Fit:
 class _Fit:
     """Least-squares fit of the motions of C cameras and of the points that they see, step by step."""
 
-    def __init__(self, cameras: Sequence[Camera], px: Pixels, sigma: Pixels | float, most: int) -> None:
+    def __init__(
+        self, cameras: Sequence[Camera], px: Pixels, sigma: Pixels | float, known: Floats, most: int
+    ) -> None:  # fmt: skip
         px = np.asarray(px, dtype=np.float64)
         sigma = np.broadcast_to(np.asarray(sigma, dtype=np.float64), px.shape)
         shared = np.flatnonzero((np.isfinite(px).all(axis=2) & np.isfinite(sigma).all(axis=2)).sum(axis=0) >= 2)
@@ -202,9 +232,9 @@ class _Fit:
         self.cameras, self.px, self.sigma, self.xyz = tuple(cameras), px[:, whole], sigma[:, whole], xyz[whole]
         self.seen: Mask = np.asarray(np.isfinite(self.px + self.sigma).all(axis=2))
         self.start = [CameraParameters.of(camera) for camera in cameras]
-        self.motion, self.covariance = np.zeros((len(cameras), POSE)), np.zeros((POSE * len(cameras),) * 2)
-        self.scale = 1.0
-        self._first = self.xyz
+        self.motion, self.covariance = np.zeros((len(cameras), MOTION)), np.zeros((MOTION * len(cameras),) * 2)
+        self.scale, self._known, self._standing = 1.0, known, self._deviations()
+        self._first, self.free = self.xyz, np.ones(len(cameras), dtype=bool)
         self.residuals = reprojection_residuals(cameras, self.xyz, self.px)
 
     def restarted(self) -> _Fit:
@@ -218,32 +248,63 @@ class _Fit:
         residuals = reprojection_residuals(self._moved(), self.xyz, self.px)
         return _huber_cost(residuals[self.seen] / self.sigma[self.seen])
 
-    def standing(self, px: float) -> Floats:
-        """Covariances (C, 6, 6), rad and mm, of motions by which the points move by some px in the images."""
-        focal = np.array([first.inner[0] for first in self.start])
-        far = np.array([np.median((self.xyz @ one.rotation.T + one.translation)[:, 2]) for one in self.start])
-        deviations = np.stack([px / focal] * 3 + [px * far / focal] * 3, axis=1)
-        return np.asarray(np.eye(POSE) * (deviations**2)[:, None, :])
+    def thinned(self, most: int) -> _Fit:
+        """A fit to a part of the points, at the motions and with the scale of this one."""
+        other, chosen = copy.copy(self), np.linspace(0, len(self.xyz) - 1, min(len(self.xyz), most)).astype(int)
+        other.px, other.sigma, other.seen = self.px[:, chosen], self.sigma[:, chosen], self.seen[:, chosen]
+        other.xyz, other._first, other.residuals = self.xyz[chosen], self._first[chosen], self.residuals[:, chosen]
+        return other
+
+    def freed(self, free: _Freed, most: int = _STEPS) -> tuple[float, _Fit]:
+        """Price of a fit with free cameras, in squares of σ, and the fit. most : number of its steps."""
+        trial, prior = self.restarted(), self.information(free.poses, free.lenses, free.px)
+        trial.free = free.poses | free.lenses
+        trial.settle(lambda: prior, most)
+        none = np.zeros(len(self.cameras), dtype=bool)
+        unmoved = float(self.squares(self.information(none, none), trial.motion)[~trial.free].sum())
+        price = _PRICE * int(free.poses.sum() + free.lenses.sum())
+        return trial.cost() / self.scale**2 + unmoved + price, trial
+
+    def information(self, poses: Mask, lenses: Mask, px: float = 0.0) -> Floats:
+        """Information matrices (C, 7, 7) of the motions of cameras whose poses and lenses, (C,) bool each, are free.
+
+        px : standard deviation of these motions in the images. The others stand still.
+        """
+        moving = np.where(poses, px, _STILL_PX)
+        covariance = np.eye(MOTION) * ((self._standing * moving[:, None]) ** 2)[:, None, :]
+        covariance[:, :POSE, :POSE] += self._known
+        covariance[:, POSE, POSE] = np.where(lenses, self._standing[:, POSE] * px, _FIXED) ** 2
+        return np.asarray(np.linalg.inv(covariance), dtype=float)
+
+    def _deviations(self) -> Floats:
+        """Motions (C, 7) in rad, mm and without unit by each of which the points move by about 1 px in the images."""
+        rows = []
+        for c, (first, seen) in enumerate(zip(self.start, self.seen, strict=True)):
+            focal, far = first.inner[0], np.median((self.xyz @ first.rotation.T + first.translation)[:, 2])
+            radius = (
+                np.sqrt(np.mean(np.sum((self.px[c, seen] - first.inner[3:5]) ** 2, axis=1))) if seen.any() else focal
+            )
+            rows.append([*[1.0 / focal] * 3, *[far / focal] * 3, 1.0 / radius])
+        return np.array(rows)
 
     def squares(self, information: Floats, motion: Floats | None = None) -> Floats:
-        """Squared Mahalanobis length (C,) of the motions, or of others (C, 6), by information matrices (C, 6, 6)."""
+        """Squared Mahalanobis length (C,) of the motions, or of others (C, 7), by information matrices (C, 7, 7)."""
         p = self.motion if motion is None else motion
         return np.asarray(np.einsum("ci,cij,cj->c", p, information, p))
 
-    def settle(self, prior: Callable[[], Floats], still: Floats) -> None:
-        """Take steps until they are negligible.
+    def settle(self, prior: Callable[[], Floats], most: int = _STEPS) -> None:
+        """Take steps until they are negligible, or as many as are allowed.
 
-        prior : function that gives the information matrices (C, 6, 6) of the motions. still : those of cameras that
-        stand still.
+        prior : function that returns the information (C, 7, 7) of the motions. most : number of steps.
         """
-        for _ in range(_STEPS):
-            if self.squares(still, self.step(prior())).max() < (_SETTLED / _STILL_PX) ** 2:
+        for _ in range(most):
+            if (np.abs(self.step(prior())) / self._standing).max() < _SETTLED:
                 break
 
     def step(self, prior: Floats) -> Floats:
-        """Take one Gauss-Newton step of motions and points; returns that of the motions, (C, 6) rad and mm.
+        """Take one Gauss-Newton step of motions and points; returns that of the motions, (C, 7) rad, mm and no unit.
 
-        prior : (C, 6, 6) information matrices of the motions.
+        prior : (C, 7, 7) information matrices of the motions.
         """
         count, n = len(self.cameras), len(self.xyz)
         poses = [_after(first, each) for first, each in zip(self.start, self.motion, strict=True)]
@@ -254,12 +315,15 @@ class _Fit:
         residuals = [self.px[c, at] - expected for c, (at, expected, _, _) in enumerate(rows)]
         self.scale = self._robust_scale(residuals)
         N, right = scipy.linalg.block_diag(*prior), -np.einsum("cij,cj->ci", prior, self.motion)
-        H, h, B = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3, count, POSE))
+        H, h, B = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3, count, MOTION))
         for c, ((at, _, by_parameters, by_point), r) in enumerate(zip(rows, residuals, strict=True)):
             w = huber_weights(r, self.scale * self.sigma[c, at])
-            A = by_parameters[:, :, LENS:]
+            by_focal = by_parameters[:, :, :3] @ self.start[c].inner[:3]
+            A = np.concatenate([by_parameters[:, :, LENS:], by_focal[..., None]], axis=2)
             weighted, across = A * w[..., None], by_point * w[..., None]
-            N[POSE * c : POSE * (c + 1), POSE * c : POSE * (c + 1)] += np.tensordot(A, weighted, ((0, 1), (0, 1)))
+            N[MOTION * c : MOTION * (c + 1), MOTION * c : MOTION * (c + 1)] += np.tensordot(
+                A, weighted, ((0, 1), (0, 1))
+            )
             right[c] += np.tensordot(weighted, r, ((0, 1), (0, 1)))
             H[at] += across.transpose(0, 2, 1) @ by_point
             h[at] += np.einsum("nri,nr->ni", across, r)
@@ -271,10 +335,10 @@ class _Fit:
         size = 1 / np.sqrt(np.diag(N))
         self.covariance = np.linalg.inv(N * np.outer(size, size)) * np.outer(size, size)
         step = self.covariance @ (right.ravel() - flat @ solved[..., -1].ravel())
-        self.motion = self.motion + step.reshape(count, POSE)
+        self.motion = self.motion + step.reshape(count, MOTION)
         again = triangulate(self._moved(), self.px)  # as a step of the points too would diverge after large motions
         self.xyz = np.where(np.isfinite(again), again, self.xyz)
-        return step.reshape(count, POSE)
+        return step.reshape(count, MOTION)
 
     def _moved(self) -> list[Camera]:
         """The cameras after their motions so far."""
@@ -296,17 +360,19 @@ class _Fit:
     def motions(self) -> CameraMotions:
         """The motions so far, and measures of the fit."""
         moved = self._moved()
-        shift, (effect, misfit) = np.full((len(moved), 2), np.nan), np.full((2, len(moved)), np.nan)
+        shift, (effect, by_lens, misfit) = np.full((len(moved), 2), np.nan), np.full((3, len(moved)), np.nan)
         residuals = reprojection_residuals(moved, self.xyz, self.px)
         for c, (before, after, seen) in enumerate(zip(self.cameras, moved, self.seen, strict=True)):
             if seen.any():
                 shifts = after.project(self.xyz[seen]) - before.project(self.xyz[seen])
                 shift[c], effect[c] = np.median(shifts, axis=0), np.sqrt(np.mean(np.sum(shifts**2, axis=1)))
+                by_lens[c] = np.abs(self.motion[c, POSE]) / self._standing[c, POSE]
                 square = np.sum((residuals[c, seen] / self.sigma[c, seen]) ** 2, axis=1)
                 misfit[c] = np.sqrt(np.median(square) / _MEDIAN_OF_CHI2)
+        gain = self._gain(residuals, np.nan_to_num(effect) > MOVED_PX)
         return CameraMotions(
-            self.cameras, self.motion, self.covariance, shift, effect, _rms(self.residuals), _rms(residuals), misfit,
-            self.scale, self._gain(residuals, np.nan_to_num(effect) > MOVED_PX), -1, len(self.xyz),
+            self.cameras, self.motion, self.covariance, self.free, shift, effect, by_lens, _rms(self.residuals),
+            _rms(residuals), misfit, self.scale, gain, -1, len(self.xyz),
         )  # fmt: skip
 
     def contradicting(self) -> int:
@@ -344,14 +410,19 @@ def _huber_cost(ratios: Floats) -> float:
     return cost if np.isfinite(cost) else np.inf
 
 
-def _inverses(matrices: Floats) -> Floats:
-    """Inverses (n, k, k) of matrices (n, k, k)."""
-    return np.asarray(np.linalg.inv(matrices), dtype=float)
+def motion_parameters(camera: Camera) -> Floats:
+    """Derivatives (16, 7) of a camera's parameters, px, rad and mm, with respect to those of its motion."""
+    out = np.zeros((PER_CAMERA, MOTION))
+    out[LENS:, :POSE] = np.eye(POSE)
+    out[:3, POSE] = CameraParameters.of(camera).inner[:3]  # fx, fy and the skew
+    return out
 
 
 def _after(start: CameraParameters, motion: Floats) -> CameraParameters:
-    """The parameters of a camera after a motion (6,) of its pose, ω (rad) and τ (mm)."""
-    return start.plus(np.concatenate([np.zeros(LENS), motion]))
+    """The parameters of a camera after a motion (7,): ω (rad), τ (mm) and φ."""
+    lens = np.zeros(LENS)
+    lens[:3] = motion[POSE] * start.inner[:3]
+    return start.plus(np.concatenate([lens, motion[:POSE]]))
 
 
 def _rms(residuals: Pixels) -> Floats:

@@ -41,10 +41,14 @@ CODES: dict[str, tuple[Verdict, str]] = {
     "pair-left-out": (_LOOK, "two neighbouring cameras cannot be used together"),
     "camera-unmatched": (_LOOK, "a camera shares hardly a point with another"),
     "camera-moved": (_LOOK, "a camera moved after the calibration or between steps, and was followed"),
+    "lens-refocused": (_LOOK, "a lens was refocused after the calibration or between steps, and was followed"),
     "camera-contradicts": (_LOOK, "a camera contradicts all others at a step, and was left out there"),
     "camera-drift": (_LOOK, "by the method paper: matches lie off the epipolar lines in the mean; a camera moved"),
     "camera-moved-unknown": (_STOP, "a camera moved, and how is not known well enough"),
     # captures
+        _STOP,
+        "a rigid body changes its size with its distance from two cameras: they show different instants",
+    ),
     "skew-exceeded": (_LOOK, "the cameras of a capture were exposed at different times"),
     "file-numbers-shifted": (_LOOK, "the file numbers of a camera differ from those that they are paired with"),
     # images

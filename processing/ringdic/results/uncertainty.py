@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 
 from ringdic.arrays import Floats, Indices, Mask, Points
 from ringdic.calibration.bundle import BundleFit
-from ringdic.calibration.moved_cameras import CameraMotions
-from ringdic.calibration.parameters import LENS, PER_CAMERA, POSE
+from ringdic.calibration.moved_cameras import MOTION, CameraMotions, motion_parameters
+from ringdic.calibration.parameters import PER_CAMERA
 from ringdic.results.results import Results
 from ringdic.strain.deformation import Deformation, deformation
 from ringdic.uncertainty.calibration import (
@@ -55,10 +55,11 @@ def motion_covariance(motions: CameraMotions) -> CameraCovariance:
 
 def _of_motions(motions: CameraMotions, ids: Sequence[str]) -> Floats:
     """Covariance (16 C, 16 C) of the parameters of C cameras, by id, that is due to their motions."""
-    at = [PER_CAMERA * ids.index(camera.id) + LENS + k for camera in motions.cameras for k in range(POSE)]
-    out = np.zeros((PER_CAMERA * len(ids),) * 2)
-    out[np.ix_(at, at)] = motions.covariance
-    return out
+    by_motion = np.zeros((PER_CAMERA * len(ids), MOTION * len(motions.cameras)))
+    for c, camera in enumerate(motions.cameras):
+        row = PER_CAMERA * ids.index(camera.id)
+        by_motion[row : row + PER_CAMERA, MOTION * c : MOTION * (c + 1)] = motion_parameters(camera)
+    return np.asarray(by_motion @ motions.covariance @ by_motion.T)
 
 
 class StepUncertainty:
