@@ -19,6 +19,7 @@ from ringdic.calibration.motion_findings import left_out_finding, motion_figures
 from ringdic.calibration.moved_cameras import CameraMotions, find_moved_cameras
 from ringdic.charts.agreement import triangulate_agreeing
 from ringdic.charts.chart import texture_of
+from ringdic.charts.instants import two_instants
 from ringdic.charts.surface import ReferenceSurface
 from ringdic.charts.tracking import CameraMatches, interpolate_matches
 from ringdic.charts.views import facing_pairs
@@ -138,6 +139,7 @@ class SurfaceSeries:
         self._views = [camera_view(camera, c, surface) for c, camera in enumerate(cameras)]
         self._textures = [texture_of(surface.texture[k, view.vertex]) for k, view in enumerate(self._views)]
         self._motions: dict[int, CameraMotions] = {} if moved is None else {0: moved}
+        self._instants: list[Finding] = []
         self._contradictions: dict[int, CameraMotions] = {}
         self._drift = np.full((len(self.names), len(cameras)), np.nan)
         self._measured = np.ones(len(self.names))
@@ -153,6 +155,8 @@ class SurfaceSeries:
         for k, step in enumerate(map_in_order(lambda k: self._measure(k, matches), steps), start=1):
             cache.put(k, step)
             self._measured[k] = np.mean(step.status == 0)
+            instants = two_instants(cameras, surface.xyz, step.xyz, self.names[k])
+            self._instants += [] if instants is None else [instants]
             self._drift[k] = self._drift[0] + step.residual
             for samples, one in zip(c_ls, step.cameras, strict=True):
                 samples.append(_sample(one.c_ls))
@@ -209,7 +213,7 @@ class SurfaceSeries:
         if self._settings.method == "paper":
             return [*idle, *drift_findings(self.drift, self.names)]
         left_out = [left_out_finding(one, self.names[k]) for k, one in sorted(self._contradictions.items())]
-        return [*idle, *left_out, *motion_findings(self._motions, self.names)]
+        return [*idle, *left_out, *self._instants, *motion_findings(self._motions, self.names)]
 
     def _measure(self, k: int, matches: MatchesOfStep) -> SurfaceStep:
         """Triangulate the points of step k from all cameras."""

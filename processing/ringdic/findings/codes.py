@@ -46,6 +46,7 @@ CODES: dict[str, tuple[Verdict, str]] = {
     "camera-drift": (_LOOK, "by the method paper: matches lie off the epipolar lines in the mean; a camera moved"),
     "camera-moved-unknown": (_STOP, "a camera moved, and how is not known well enough"),
     # captures
+    "instants-differ": (
         _STOP,
         "a rigid body changes its size with its distance from two cameras: they show different instants",
     ),
