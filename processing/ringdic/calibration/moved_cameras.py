@@ -38,6 +38,7 @@ _FARTHEST_PX = 60.0  # greatest motion that is followed; more would be another i
 #: Most points that are used, and fewest that are needed.
 _MOST, _FEWEST = 3000, 50
 _STILL_PX, _UNKNOWN_PX = 0.02, 0.3  # px, motion in the image of a camera that stands still, and of one that may move
+_MOST_REFOCUSED = 0.2  # relative change of a focal length, beyond which points that contradict one another lead
 _FIXED = 1e-12  # standard deviation of the relative change of a focal length that is not freed
 _TAIL = 3.0  # squares of σ, for each of the six parameters of a pose, at which a motion's weight is a quarter
 #: Robust ratio of residuals to their standard deviations, and their RMS, px, beyond which motions of the cameras do not
@@ -336,6 +337,7 @@ class _Fit:
         self.covariance = np.linalg.inv(N * np.outer(size, size)) * np.outer(size, size)
         step = self.covariance @ (right.ravel() - flat @ solved[..., -1].ravel())
         self.motion = self.motion + step.reshape(count, MOTION)
+        self.motion[:, POSE] = self.motion[:, POSE].clip(-_MOST_REFOCUSED, _MOST_REFOCUSED)
         again = triangulate(self._moved(), self.px)  # as a step of the points too would diverge after large motions
         self.xyz = np.where(np.isfinite(again), again, self.xyz)
         return step.reshape(count, MOTION)

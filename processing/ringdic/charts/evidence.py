@@ -16,7 +16,7 @@ from ringdic.arrays import Floats, Image, Mask, Pixels
 from ringdic.charts.blur import SQUARE_PX, blur_change
 from ringdic.charts.contrast import contrast
 from ringdic.charts.depth_map import DepthImages, DepthMap, lattice_places
-from ringdic.charts.exchanged import exchanged_or_mirrored
+from ringdic.charts.exchanged import ConfusedImages, exchanged_or_mirrored
 from ringdic.charts.patches import depths
 from ringdic.charts.plane_sweep import DepthRange
 from ringdic.correlation import prepare_reference
@@ -46,7 +46,7 @@ class MatchEvidence:
     matched, of which in_mask lie inside the mask and in_range at a depth that is searched. offset : px, their median
     distance from the epipolar lines; limit : px, that is allowed. near, far : mm, 5th and 95th percentile of their
     depths; low, high : mm, range of depths searched. features : (2, n, 2) px, of the full images of both. confused :
-    that an image is another camera's or mirrored, empty where nothing shows it.
+    that an image is another camera's or mirrored, None where nothing shows it.
     """
 
     camera: str
@@ -68,7 +68,7 @@ class MatchEvidence:
     low: float
     high: float
     features: Pixels = field(repr=False)
-    confused: str = ""
+    confused: ConfusedImages | None = None
 
     @property
     def sentence(self) -> str:
@@ -87,8 +87,8 @@ class MatchEvidence:
     def _verdict(self, partner: str) -> str:
         """The figure that stands against a match, and what to check."""
         known = self.matches >= _FEWEST
-        if self.confused:
-            return self.confused
+        if self.confused is not None:
+            return self.confused.sentence
         if not self.masked and not self.textured:
             return f"the strongest contrast of its image is {self.contrast:.1f} grey levels a px; speckle the specimen"
         if self.masked and known and self.in_mask < 0.1 * self.matches:
@@ -158,22 +158,33 @@ def match_evidence(
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Unmatched:
+    """Why a camera has hardly a depth.
+
+    sentence : empty where it has enough. features : (2, n, 2) px, matched in it and its partner without use of the
+    calibration. confused : that its image or its partner's is another camera's or mirrored, None where nothing shows
+    it.
+    """
+
+    sentence: str = ""
+    features: Pixels = field(default_factory=lambda: np.zeros((2, 0, 2)), repr=False)
+    confused: ConfusedImages | None = None
+
+
 def why_unmatched(
     images: DepthImages, depth_map: DepthMap, k: int, partner: int | None, space: DepthRange, mask: Mask | None
-) -> tuple[str, Pixels]:
-    """A sentence that says why a camera has hardly a depth, and features (2, n, 2) px matched in it and its partner.
-
-    Both are empty where it has enough depths. The features do not depend on the calibration.
+) -> Unmatched:
+    """Find out why a camera has hardly a depth, if so.
 
     partner : index of its nearest partner, None without. mask : (height, width) bool, of the full image, or None.
     """
-    none = np.zeros((2, 0, 2))
     evidence = None if partner is None else match_evidence(images, depth_map, k, partner, space, mask)
     if evidence is not None:
-        return evidence.sentence, evidence.features
+        return Unmatched(evidence.sentence, evidence.features, evidence.confused)
     if len(depth_map.patches.px):
-        return "", none
-    return f"camera {images.cameras[k].id} does not match: no other camera's view is similar enough", none
+        return Unmatched()
+    return Unmatched(f"camera {images.cameras[k].id} does not match: no other camera's view is similar enough")
 
 
 @dataclass(frozen=True)

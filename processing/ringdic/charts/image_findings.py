@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,7 +26,9 @@ _FAINT = 0.25  # of the reference's contrast
 _LOST = 0.15  # of a camera's points, that are worth a finding
 _TIMES = 3.0  # times as much as the lower quartile of all cameras
 _HARDLY = 0.1  # of the points of a step
-_COARSE = 0.75  # of a subset's width, from which on speckles are too large for it: it holds hardly an edge
+_COARSE = 0.42  # of a subset's width, from which on speckles are too large for it: it holds hardly two
+_SOFT = 1.8  # px, edges of a pattern that is out of focus; in focus they are 1.2 to 1.4
+_SOFTER = 1.3  # times as wide as those of the target
 _FINE = 1.7  # px, below which pixels do not resolve speckles
 
 
@@ -36,7 +38,8 @@ class RunImages:
 
     cameras : ids of the C cameras. steps : ids of the F captures, the reference first. references : (C,). states :
     images of the later steps by camera and step, None where there is none; digests : of their pixels. measured : (F,)
-    share of the surface's points that each step measured. radius : px, of the subsets.
+    share of the surface's points that each step measured. radius : px, of the subsets. target_edge : function that
+    returns the width, px, of the sharpest edges in the images of the target.
     """
 
     cameras: tuple[str, ...]
@@ -46,6 +49,7 @@ class RunImages:
     digests: Mapping[tuple[int, int], str]
     measured: Floats
     radius: int
+    target_edge: Callable[[], float]
 
     def findings(self) -> list[Finding]:
         """All findings about the images."""
@@ -53,6 +57,7 @@ class RunImages:
         return [
             *([_joint(repeating)] if repeating else []),
             *self._speckle(),
+            *self._focus(),
             *self._clipped_references(),
             *(one for c in range(len(self.cameras)) for one in self._reference(c)),
             *self._repeated(),
@@ -61,7 +66,7 @@ class RunImages:
 
     def _speckle(self) -> Iterator[Finding]:
         """Speckles that are too large for the subsets, or too small for the pixels, in the median of the cameras."""
-        sizes = [one.speckle for one in self.references if one.certain]  # those of the others may be the background's
+        sizes = [one.speckle for one in self.references if one.sized]  # those of the others may be the background's
         if not sizes:
             return
         size, width = float(np.median(sizes)), 2 * self.radius + 1
@@ -73,6 +78,22 @@ class RunImages:
                 "them, which biases the matches; apply a coarser pattern, or move the cameras closer"
             )
             yield Finding("fine-speckle", sentence, value=round(size, 2), limit=_FINE, unit="px")
+
+    def _focus(self) -> Iterator[Finding]:
+        """Cameras that are out of focus, most of them, so that none can be held against the others."""
+        edge = float(np.median([one.edge for one in self.references]))
+        if not edge > _SOFT:
+            return
+        target = self.target_edge()
+        if edge < _SOFTER * target:  # the lenses, or the images, are no sharper
+            return
+        cameras = tuple(id_ for id_, one in zip(self.cameras, self.references, strict=True) if one.edge > _SOFT)
+        sentence = (
+            f"{self.steps[0]}: the edges of the pattern are {edge:.1f} px wide (median of the cameras; limit {_SOFT} "
+            f"px), those of the target {target:.1f} px: the cameras are out of focus, or the pattern has soft edges. "
+            "Focus them on the specimen, and calibrate and capture again"
+        )
+        yield Finding("image-blurred", sentence, cameras, self.steps[0], round(edge, 3), _SOFT, "px")
 
     def _clipped_references(self) -> Iterator[Finding]:
         """Cameras whose reference image is mostly white or black."""
@@ -218,7 +239,7 @@ def coarse_speckle(sizes: Sequence[float], radius: int) -> list[str]:
         return []
     return [
         f"the speckles are {size:.1f} px wide (median of the cameras; limit {_COARSE * width:.0f} px), a subset is "
-        f"{width} px wide and holds hardly one: set correlation.radius_px to {round(1.5 * size)} or more, or apply a "
+        f"{width} px wide and holds too few: set correlation.radius_px to {round(1.5 * size)} or more, or apply a "
         "finer pattern"
     ]
 

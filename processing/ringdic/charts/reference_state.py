@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from ringdic.arrays import Image, Mask, Pixels
 from ringdic.charts.depth_map import DepthMap
 from ringdic.charts.image_state import ImageState, image_state, pixel_digest
+from ringdic.charts.sharpness import edge_width
 from ringdic.correlation.repetition import find_repetition
 from ringdic.findings import Finding
 
 #: Names of the arrays that a reference state is stored as.
 REFERENCE_STATE = ("image_state", "speckle", "certain", "digest", "repetition")
 _KNOWN = 0.3  # of the textured places have a depth: with fewer, all textured places are looked at, background too
+_FEWEST = 12  # places with a depth, from which the size of the speckles is known
 _MOST = 0.6  # of these that must repeat: lamps in the background do
 
 
@@ -26,15 +28,18 @@ class ReferenceState:
     """State of a camera's reference image.
 
     state : the image beside itself: how it is lit. speckle : px, size of the speckles. certain : whether the surface is
-    known well enough to tell the pattern from the background. repetition : findings of a repeating pattern. digest : of
-    its pixels.
+    known well enough to tell the pattern from the background. sized : whether the speckles are the surface's, as they
+    are where it is certain, and where they were measured at the places with a depth alone. repetition : findings of a
+    repeating pattern. digest : of its pixels. edge : px, width of the pattern's sharpest edges.
     """
 
     state: ImageState
     speckle: float
     certain: bool
+    sized: bool
     repetition: tuple[Finding, ...]
     digest: str
+    edge: float
 
     @classmethod
     def of(cls, camera: str, image: Image, depth_map: DepthMap, radius: int) -> ReferenceState:
@@ -47,21 +52,27 @@ class ReferenceState:
         places = known if certain else depth_map.textured
         found = find_repetition(image, places, radius, _about(places, image.shape, depth_map.spacing))
         repeats = found.share >= (0.0 if certain else _MOST)
+        sized = certain or len(known) >= _FEWEST
+        speckle = found.speckle
+        if sized and not certain:
+            speckle = find_repetition(image, known, radius, _about(known, image.shape, depth_map.spacing)).speckle
         return cls(
-            image_state(image, image, places, np.zeros((len(places), 6))), found.speckle, certain,
+            image_state(image, image, places, np.zeros((len(places), 6))), speckle, certain, sized,
             tuple(found.findings(f"camera {camera}", (camera,))) if repeats else (), pixel_digest(image),
+            edge_width(image, places),
         )  # fmt: skip
 
     def arrays(self) -> dict[str, NDArray]:
         """The state as arrays of a task's output, by name.
 
-        "image_state" (9,), "speckle" () px, "certain" () bool, "digest" () of text, "repetition" (k, 4) of text.
+        "image_state" (9,), "speckle" and "edge" () px, "certain" and "sized" () bool, "digest" () and "repetition"
+        (k, 4) of text.
         """
         sentences = [(one.sentence, *one.cameras, one.value, one.limit) for one in self.repetition]
         return {
             "image_state": self.state.array(), "speckle": np.array(self.speckle),
-            "certain": np.array(self.certain), "digest": np.array(self.digest),
-            "repetition": np.array(sentences, dtype=str).reshape(-1, 4),
+            "certain": np.array(self.certain), "sized": np.array(self.sized), "digest": np.array(self.digest),
+            "edge": np.array(self.edge), "repetition": np.array(sentences, dtype=str).reshape(-1, 4),
         }  # fmt: skip
 
     @classmethod
@@ -72,8 +83,10 @@ class ReferenceState:
             for sentence, camera, value, limit in arrays["repetition"]
         )
         state = ImageState.of_array(arrays["image_state"])
-        certain = bool(arrays["certain"])
-        return cls(state, float(arrays["speckle"]), certain, repetition, str(arrays["digest"]))
+        certain, sized = (bool(arrays[name]) for name in ("certain", "sized"))
+        return cls(
+            state, float(arrays["speckle"]), certain, sized, repetition, str(arrays["digest"]), float(arrays["edge"])
+        )
 
 
 def _about(places: Pixels, shape: tuple[int, ...], spacing: int) -> Mask:

@@ -7,7 +7,7 @@ the newest step alone, leaves the outputs of all other steps valid.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +22,7 @@ from ringdic.charts.body_motion import SeenBody, SurfaceFrames
 from ringdic.charts.chart import Chart, chart_with_uncertainty
 from ringdic.charts.depth_map import DepthMap, depths_at_fitting_size
 from ringdic.charts.evidence import why_unmatched
+from ringdic.charts.exchanged import ConfusedImages
 from ringdic.charts.image_findings import RunImages, coarse_speckle
 from ringdic.charts.image_state import ImageState, image_state, pixel_digest
 from ringdic.charts.images import ChartImages
@@ -117,6 +118,12 @@ class ChartsJob:
             return still_cameras(self.cameras)
         return motions_from_arrays(self.cameras, read_output(self.poses.output))
 
+    @property
+    def confused(self) -> list[ConfusedImages]:
+        """What is wrong with reference images that do not match, once the depth maps are computed."""
+        found = [read_output(task.output)["confused"].tolist() for task in self.maps]
+        return [ConfusedImages(kind, tuple(cameras)) for kind, *cameras in filter(None, found)]
+
     def matches(self, camera: int, step: int) -> CameraMatches | None:
         """Matches of a camera at a step from 1 on; None where it has no image or no part in the surface."""
         task = self.steps[camera][step - 1]
@@ -128,10 +135,13 @@ class ChartsJob:
             return None
         return CameraMatches(step=int(arrays["step"]), **{name: arrays[name] for name in _MATCHES})
 
-    def images(self, steps: Sequence[str], measured: Floats, radius: int) -> RunImages:
+    def images(
+        self, steps: Sequence[str], measured: Floats, radius: int, target_edge: Callable[[], float]
+    ) -> RunImages:  # fmt: skip
         """Blur, light and digest of every camera's image of every step, beside its reference image.
 
         steps : ids of the F captures. measured : (F,) share of the surface's points that each measured. radius : px.
+        target_edge : function that returns the width, px, of the sharpest edges in the images of the target.
         """
         references = tuple(ReferenceState.of_arrays(read_output(task.output, REFERENCE_STATE)) for task in self.maps)
         states, digests = {}, {}
@@ -147,7 +157,7 @@ class ChartsJob:
                 states[c, step] = ImageState.of_array(arrays["image_state"])
                 digests[c, step] = str(arrays["digest"])
         cameras = tuple(camera.id for camera in self.views.cameras)
-        return RunImages(cameras, tuple(steps), references, states, digests, measured, radius)
+        return RunImages(cameras, tuple(steps), references, states, digests, measured, radius, target_edge)
 
 
 def charts_job(
@@ -264,9 +274,10 @@ def depth_task(files: _ReferenceFiles, k: int, *, inputs: tuple[Path, ...]) -> A
         files.views.cameras, files.image, files.correlation, k, partners[:_MOST], space, mask
     )
     nearest = partners[0] if partners else None
-    why, features = why_unmatched(images, depth_map, k, nearest, space, mask)
+    unmatched = why_unmatched(images, depth_map, k, nearest, space, mask)
+    why, confused = unmatched.sentence, unmatched.confused
     state = ReferenceState.of(files.views.cameras[k].id, files.image(k), depth_map, files.correlation.radius)
-    if why and state.repetition:
+    if why and confused is None and state.repetition:
         why = state.repetition[0].sentence
     patches = depth_map.patches
     return {
@@ -274,7 +285,8 @@ def depth_task(files: _ReferenceFiles, k: int, *, inputs: tuple[Path, ...]) -> A
         "sigma": depth_map.sigma, "textured": depth_map.textured, "patterned": depth_map.patterned,
         "spacing": np.array(depth_map.spacing), "grey_noise": np.array(depth_map.grey_noise),
         "points": np.array(len(patches.px)), "why": np.array(why), **state.arrays(),
-        "features": features, "between": np.array([k, k if nearest is None else nearest]),
+        "confused": np.array([] if confused is None else [confused.kind, *confused.cameras], dtype=str),
+        "features": unmatched.features, "between": np.array([k, k if nearest is None else nearest]),
     }  # fmt: skip
 
 

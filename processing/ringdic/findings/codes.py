@@ -42,6 +42,8 @@ CODES: dict[str, tuple[Verdict, str]] = {
     "camera-unmatched": (_LOOK, "a camera shares hardly a point with another"),
     "camera-moved": (_LOOK, "a camera moved after the calibration or between steps, and was followed"),
     "lens-refocused": (_LOOK, "a lens was refocused after the calibration or between steps, and was followed"),
+    "images-exchanged": (_STOP, "the images of two cameras at the reference are exchanged"),
+    "image-turned": (_STOP, "the specimen's reference image of a camera is mirrored or upside down"),
     "camera-contradicts": (_LOOK, "a camera contradicts all others at a step, and was left out there"),
     "camera-drift": (_LOOK, "by the method paper: matches lie off the epipolar lines in the mean; a camera moved"),
     "camera-moved-unknown": (_STOP, "a camera moved, and how is not known well enough"),

@@ -10,6 +10,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,12 @@ import numpy as np
 
 from ringdic.arrays import Floats, Vectors
 from ringdic.calibration.calibrated_rig import CalibratedRig, calibrate_rig, control_points
+from ringdic.calibration.motion_findings import left_out_finding
 from ringdic.calibration.quality import ReconstructionError
+from ringdic.charts.depth_map import lattice_places
+from ringdic.charts.exchanged import confusion_findings, without_consequences
 from ringdic.charts.series import SurfaceSeries
+from ringdic.charts.sharpness import edge_width
 from ringdic.charts.surface import ReferenceSurface
 from ringdic.charts.tasks import ChartsJob, charts_job
 from ringdic.charts.unmeasured import places_of_arrays
@@ -38,6 +43,7 @@ from ringdic.session.folder import Capture, Session, new_run, open_session
 from ringdic.session.moments import moment_findings
 from ringdic.settings import CalibrationGroup, Settings
 from ringdic.tasks import Executor, LocalExecutor, Task, TaskReport, process_memory, read_output, tidy, work_folder
+from ringdic.tasks.step_images import step_image
 
 Calibrate = Callable[[Session, CalibrationGroup, Callable[[float, str], None]], CalibratedRig]
 
@@ -45,6 +51,7 @@ log = logging.getLogger(__name__)
 
 #: Times that the reference is matched where cameras moved so far, in px of the image, that matches were lost by it.
 _MOST_LOOKS, _LOOK_AGAIN_PX = 3, 0.3
+_TARGETS_LOOKED_AT, _PLACES_APART = 3, 32  # cameras, and px between the places, at which edges are measured
 _ABOUT_MM = 50.0  # about the middle of the rig, of points that the shift of images is told by
 
 _WEIGHTS = {"prepare": 0.03, "calibrate": 0.25, "correlate": 0.62, "triangulate": 0.04, "deform": 0.06}
@@ -128,34 +135,80 @@ def match_session(
     stages.at("calibrate", 0.0)
     rig = calibrate(session, settings.calibration, lambda done, who: stages.at("calibrate", done, who))
     errors, left_out = _usable_pairs(session, rig, steps)
-    cameras = [each.camera for id_, each in rig.cameras.items() if id_ in steps[0].images]
-    covariance = None if rig.bundle is None else rig.bundle.pose_covariance([camera.id for camera in cameras])
     work, executor = work_folder(session.path), executor or LocalExecutor()
-
-    def job_with(assumed: Sequence[Camera], placed: Sequence[Camera]) -> ChartsJob:
-        return charts_job(session, cameras, tuple(errors), steps, settings, covariance, assumed, placed)
-
-    placed = tuple(cameras)
-    for _ in range(_MOST_LOOKS):
-        assumed = placed
-        job = job_with(assumed, placed)
-        _run_tasks(job.at_reference, job.tasks, work, stages, executor)
-        placed = job.motions.moved_cameras
-        if _image_shift(assumed, placed, job.views.space.centre) < _LOOK_AGAIN_PX:
-            break
-    job = job_with(assumed, placed)
+    cameras = [each.camera for id_, each in rig.cameras.items() if id_ in steps[0].images]
+    reference = _Reference(session, rig, tuple(errors), steps, settings)
+    job, placed = reference.matched(cameras, stages, executor)
+    contradicting = job.motions.contradicting
+    if contradicting >= 0:  # as one that shows another instant: without it the others agree
+        left_out = (*left_out, left_out_finding(job.motions, steps[0].id))
+        del cameras[contradicting]
+        job, placed = reference.matched(cameras, stages, executor)
     _run_tasks(job.later, job.tasks, work, stages, executor)
     stages.at("triangulate", 0.0)
     found = read_output(job.surface.output)
     series = SurfaceSeries(
-        session.rig.name, placed, tuple(errors), job.names, [step.id for step in steps],
+        session.rig.name, placed, reference.pairs_of(cameras), job.names, [step.id for step in steps],
         ReferenceSurface.from_arrays(found), job.matches, settings, StepCache(work),
         places_of_arrays(cameras, found), found["unmatched"].tolist(), job.motions,
     )  # fmt: skip
-    images = job.images(series.names, series.measured, settings.correlation.radius_px)
+    images = job.images(
+        series.names, series.measured, settings.correlation.radius_px, partial(_target_edge, session, cameras)
+    )
     moments = moment_findings([step for step in steps if step.kind == "specimen"])
-    findings = (*rig.findings, *left_out, *moments, *images.findings(), *series.findings)
+    surface = without_consequences(series.findings, job.confused)
+    findings = (
+        *rig.findings,
+        *left_out,
+        *confusion_findings(job.confused, steps[0].id),
+        *moments,
+        *images.findings(),
+        *surface,
+    )
     return SessionMatches(series, rig, errors, series.drift, series.agreement, findings)
+
+
+@dataclass(frozen=True)
+class _Reference:
+    """A session whose reference is to be matched. rig : calibrated. pairs : ids of neighbouring cameras that are used.
+
+    steps : the captures, the reference first.
+    """
+
+    session: Session
+    rig: CalibratedRig
+    pairs: tuple[tuple[str, str], ...]
+    steps: tuple[Capture, ...]
+    settings: Settings
+
+    def pairs_of(self, cameras: Sequence[Camera]) -> tuple[tuple[str, str], ...]:
+        """The pairs both of whose cameras are among some."""
+        ids = {camera.id for camera in cameras}
+        return tuple(pair for pair in self.pairs if ids.issuperset(pair))
+
+    def matched(
+        self, cameras: Sequence[Camera], stages: Stages, executor: Executor
+    ) -> tuple[ChartsJob, tuple[Camera, ...]]:
+        """Match the reference images of some cameras, again where these have moved so far that matches were lost.
+
+        Returns the tasks, those of later steps included, and the cameras as they stood at the reference.
+        """
+        bundle = self.rig.bundle
+        covariance = None if bundle is None else bundle.pose_covariance([camera.id for camera in cameras])
+        placed, work = tuple(cameras), work_folder(self.session.path)
+
+        def job_with(assumed: Sequence[Camera], placed: Sequence[Camera]) -> ChartsJob:
+            pairs = self.pairs_of(cameras)
+            return charts_job(self.session, cameras, pairs, self.steps, self.settings, covariance, assumed, placed)
+
+        for _ in range(_MOST_LOOKS):
+            assumed = placed
+            job = job_with(assumed, placed)
+            _run_tasks(job.at_reference, job.tasks, work, stages, executor)
+            placed = job.motions.moved_cameras
+            if _image_shift(assumed, placed, job.views.space.centre) < _LOOK_AGAIN_PX:
+                break
+        return job_with(assumed, placed), placed
 
 
 def _deform(
@@ -250,6 +303,17 @@ def _usable_pairs(
     if not usable:
         raise InputError(f"{session.path}: no camera pair can be used: {'; '.join(each.sentence for each in findings)}")
     return usable, tuple(findings)
+
+
+def _target_edge(session: Session, cameras: Sequence[Camera]) -> float:
+    """Median width, px, of the sharpest edges in images of the target by some of the cameras; NaN without any."""
+    images = {id_: path for capture in session.of_kind("target") for id_, path in capture.images.items()}
+    edges = []
+    for camera in cameras[:_TARGETS_LOOKED_AT]:
+        if camera.id in images:
+            places = lattice_places(camera.size, _PLACES_APART, _PLACES_APART, None)
+            edges.append(edge_width(step_image(images[camera.id], camera, again=False), places))
+    return float(np.median(edges)) if edges else float("nan")
 
 
 def _image_shift(before: Sequence[Camera], after: Sequence[Camera], centre: Vectors) -> float:

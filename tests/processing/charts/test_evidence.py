@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from ringdic.charts.depth_map import DepthImages, measure_depths
 from ringdic.charts.evidence import MatchEvidence, match_evidence
-from ringdic.charts.exchanged import exchanged_or_mirrored
+from ringdic.charts.exchanged import ConfusedImages, confusion_findings, exchanged_or_mirrored, without_consequences
 from ringdic.charts.plane_sweep import DepthRange
 from ringdic.correlation import CorrelationSettings
+from ringdic.findings import Finding, Verdict
 from ringdic.geometry.camera import Camera, Intrinsics
 from ringdic_node.virtual_rig.render import render
 from ringdic_node.virtual_rig.rig import paper_rig
@@ -119,18 +120,45 @@ def test_an_image_of_a_third_camera_is_told_of_from_either_side() -> None:
     cameras = [calibrated(camera) for camera in rig]
     taken = [render(camera, Specimen(Limb(), 0, seed=4), seed=7 + k) for k, camera in enumerate(rig)]
     reduced = DepthImages.of(cameras, lambda c: taken[(0, 2, 1)[c]], SETTINGS)
+    confused = []
     for k, partner in ((0, 1), (1, 0), (1, 2)):
-        sentence = exchanged_or_mirrored(reduced, k, partner, SPACE)
-        assert "cam_02" in sentence
-        assert "cam_03" in sentence
-        assert "cam_01" not in sentence
+        found = exchanged_or_mirrored(reduced, k, partner, SPACE)
+        assert found.kind == "exchanged"
+        assert set(found.cameras) == {"cam_02", "cam_03"}
+        confused.append(found)
+    (finding,) = confusion_findings([*confused, ConfusedImages("exchanged", ("cam_01", "cam_02"))], "0001-specimen")
+    assert (finding.code, finding.cameras, finding.step) == ("images-exchanged", ("cam_02", "cam_03"), "0001-specimen")
+    assert finding.verdict is Verdict.DO_NOT_USE
     calm = DepthImages.of(cameras, lambda c: taken[c], SETTINGS)
-    assert [exchanged_or_mirrored(calm, k, partner, SPACE) for k, partner in ((0, 1), (1, 2), (2, 1))] == [""] * 3
+    assert [exchanged_or_mirrored(calm, k, partner, SPACE) for k, partner in ((0, 1), (1, 2), (2, 1))] == [None] * 3
 
 
 def test_mirrored_images_are_told_by_their_camera(images) -> None:
     mirrored = [np.ascontiguousarray(image[:, ::-1]) for image in images]
     assert "the image of camera cam_01 is mirrored" in evidence([mirrored[0], images[1]]).sentence
     assert "the image of camera cam_01 is mirrored" in evidence([mirrored[0], images[1]], k=1).sentence
-    both = evidence(mirrored).sentence
-    assert "cam_01, like that of camera cam_02, is mirrored" in both
+    both = evidence(mirrored)
+    assert "cam_01, like that of camera cam_02, is mirrored" in both.sentence
+    (finding,) = confusion_findings([both.confused], "0001-specimen")
+    assert (finding.code, finding.cameras) == ("image-turned", ("cam_01", "cam_02"))
+
+
+def test_an_image_that_is_upside_down_is_told_by_its_camera(images) -> None:
+    turned = np.ascontiguousarray(images[0][::-1, ::-1])
+    for k in (0, 1):
+        found = evidence([turned, images[1]], k=k)
+        assert "the image of camera cam_01 is upside down" in found.sentence
+    (finding,) = confusion_findings([found.confused], "0001-specimen")
+    assert (finding.code, finding.cameras) == ("image-turned", ("cam_01",))
+
+
+def test_what_follows_from_exchanged_images_is_not_said_beside_them() -> None:
+    confused = [ConfusedImages("exchanged", ("cam_01", "cam_02"))]
+    lens = Finding("image-blurred", "focus camera cam_03", ("cam_03",), "0002-specimen")
+    follow = [
+        Finding("camera-unmatched", f"camera cam_01 does not match: {confused[0].sentence} (0 matched)", ("cam_01",)),
+        Finding("camera-moved-unknown", "lines of sight miss one another", ("cam_01", "cam_04"), "0001-specimen"),
+        Finding("camera-moved", "camera cam_04 moved", ("cam_04",), "0002-specimen"),
+    ]
+    assert without_consequences([lens, *follow], confused) == [lens]
+    assert without_consequences([lens, *follow], []) == [lens, *follow]

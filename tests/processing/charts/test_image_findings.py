@@ -11,7 +11,7 @@ from ringdic.findings import Finding, Verdict
 
 CALM = ImageState(1000, 980, 0.1, 20.0, -0.1, 0.95, 0.01, 0.0, 120.0)
 CAMERAS, STEPS = ("1", "2", "3"), ("0001-specimen", "0002-specimen", "0003-specimen")
-REFERENCES = tuple(ReferenceState(CALM, 4.0, True, (), f"reference {camera}") for camera in CAMERAS)
+REFERENCES = tuple(ReferenceState(CALM, 4.0, True, True, (), f"reference {camera}", 1.3) for camera in CAMERAS)
 PLACES = [(c, step) for c in range(3) for step in (1, 2)]
 
 
@@ -19,7 +19,7 @@ def run_images(**changed: ImageState) -> RunImages:
     """Calm images of three cameras but for some: changed.c1s2 is that of the second camera at the third capture."""
     states = {(c, step): changed.get(f"c{c}s{step}", CALM) for c, step in PLACES}
     digests = {place: f"image {place}" for place in PLACES}
-    return RunImages(CAMERAS, STEPS, REFERENCES, states, digests, np.ones(3), 10)
+    return RunImages(CAMERAS, STEPS, REFERENCES, states, digests, np.ones(3), 10, lambda: 1.4)
 
 
 def only(images: RunImages) -> Finding:
@@ -67,6 +67,15 @@ def test_a_camera_out_of_focus_is_known_by_its_speckles() -> None:
     assert finding.value == pytest.approx(1.5, abs=0.01)
     further = replace(REFERENCES[1], speckle=4.4)
     assert replace(run_images(), references=(REFERENCES[0], further, REFERENCES[2])).findings() == []
+
+
+def test_cameras_that_are_all_out_of_focus_are_named_unless_the_target_is_no_sharper() -> None:
+    """Two of three show edges that are twice as wide as those of the target."""
+    soft = (*(replace(one, edge=2.6) for one in REFERENCES[:2]), REFERENCES[2])
+    finding = only(replace(run_images(), references=soft))
+    assert (finding.code, finding.cameras, finding.step, finding.value) == ("image-blurred", ("1", "2"), STEPS[0], 2.6)
+    assert "those of the target 1.4 px" in finding.sentence
+    assert replace(run_images(), references=soft, target_edge=lambda: 2.5).findings() == []
 
 
 def test_clipped_and_dark_images_are_named() -> None:
@@ -135,17 +144,17 @@ def test_a_step_without_points_has_the_cause_that_most_images_show() -> None:
     assert "as sharp and as bright as the reference" in unknown.sentence
 
 
-@pytest.mark.parametrize(("size", "code"), [(1.2, "fine-speckle"), (20.0, "coarse-speckle")])
+@pytest.mark.parametrize(("size", "code"), [(1.2, "fine-speckle"), (9.8, "coarse-speckle"), (20.0, "coarse-speckle")])
 def test_speckles_that_do_not_suit_the_subset_or_the_pixels_are_named(size: float, code: str) -> None:
     references = tuple(replace(one, speckle=size) for one in REFERENCES)
     finding = only(replace(run_images(), references=references))
     assert (finding.code, finding.value) == (code, size)
-    background = tuple(replace(one, certain=False) for one in references)
+    background = tuple(replace(one, certain=False, sized=False) for one in references)
     assert replace(run_images(), references=background).findings() == []
 
 
 def test_the_state_of_a_reference_survives_its_storage() -> None:
     finding = Finding("repeating-pattern", "camera 1: it repeats", ("1",), None, 0.98, 0.65, "ZNCC")
-    state = ReferenceState(CALM, 4.5, False, (finding,), "digest")
+    state = ReferenceState(CALM, 4.5, False, True, (finding,), "digest", 1.2)
     assert ReferenceState.of_arrays(state.arrays()) == state
     assert ReferenceState.of_arrays(REFERENCES[0].arrays()) == REFERENCES[0]
