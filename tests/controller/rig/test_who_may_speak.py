@@ -26,7 +26,15 @@ from ringdic_controller.rig.router import router_config
 from ringdic_node.cameras.pattern import PatternCamera
 from ringdic_node.clock import SystemClock
 from ringdic_node.config import NodeConfig
-from ringdic_node.endpoint import AUTHORITY, CERTIFICATE, KEY, EndpointError, handshake_fault, node_name
+from ringdic_node.endpoint import (
+    AUTHORITY,
+    CERTIFICATE,
+    KEY,
+    EndpointError,
+    controller_name,
+    handshake_fault,
+    node_name,
+)
 from ringdic_node.link import NodeLink, node_config
 from ringdic_node.service import NodeService
 from ringdic_node.spool import Spool
@@ -225,12 +233,18 @@ def test_without_a_certificate_nobody_is_let_in_and_with_one_a_node_is(guarded: 
         assert list(session.info.routers_zid())
 
 
-def test_a_node_cannot_pass_for_the_controller(guarded: Guarded) -> None:
-    """Neither with its own certificate nor where the controller's names another address."""
-    for folder, host in ((guarded.certificates(ROGUE), "127.0.0.1"), (guarded.folder / "controller", "127.0.0.2")):
+def test_nobody_else_passes_for_the_controller(
+    guarded: Guarded, authority: tuple[Authority, Path], tmp_path: Path
+) -> None:
+    """Neither a node, nor where the controller's certificate has expired or names another address."""
+    expired = RigMachine("controller", controller_name(RIG), tmp_path, ("127.0.0.1",))
+    authority[0].issue(expired, NOW, life=timedelta(minutes=-1))
+    mine = tls_of(guarded.certificates(VICTIM), guarded.folder / AUTHORITY)
+    own = guarded.folder / "controller"
+    for folder, host in ((guarded.certificates(ROGUE), "127.0.0.1"), (expired.folder, "127.0.0.1"), (own, "127.0.0.2")):
         endpoint = f"tls/{host}:{free_port()}"
         with zenoh.open(router_config(endpoint, RIG, [VICTIM], folder)), pytest.raises(zenoh.ZError):
-            open_as_client(endpoint, tls_of(guarded.certificates(VICTIM), guarded.folder / AUTHORITY))
+            open_as_client(endpoint, mine)
 
 
 @pytest.mark.parametrize("name", ["other-ring/node/01", "ring/node/99", "ring/controller"])
