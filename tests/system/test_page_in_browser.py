@@ -241,7 +241,8 @@ def test_the_images_of_a_capture_can_be_looked_at_and_had(page: Page, station: S
     capture.locator("summary").click()
     images = capture.locator(".thumb img")
     expect(images).to_have_count(len(CAMERAS))
-    page.wait_for_function("[...document.querySelectorAll('.thumb img')].every((image) => image.naturalWidth > 0)")
+    loaded = "[...document.querySelectorAll('.thumb img')].every((image) => image.naturalWidth > 0)"
+    station.until(lambda: page.evaluate(loaded), "the pictures")  # what waits inside the page needs its eval
     capture.get_by_role("button", name="Show camera 02").click()
     expect(page.locator("#picture")).to_be_visible()
     expect(page.locator("#picture-title")).to_have_text("0001-board, camera 02")
@@ -336,7 +337,8 @@ def test_what_was_not_measured_is_told_by_reason_and_shown_on_the_photographs(pa
         ["the images do not look alike: 0.7 cm²", "the lines of sight miss one another: 0.5 cm²"]
     )
     expect(part.locator("figcaption")).to_have_text(["01"])
-    page.wait_for_function("document.querySelector('#unmeasured-pictures img').naturalWidth > 0")
+    shown = "document.querySelector('#unmeasured-pictures img').naturalWidth > 0"
+    station.until(lambda: page.evaluate(shown), "the picture")
 
 
 def test_processing_is_started_watched_and_cancelled(page: Page, station: Station) -> None:
