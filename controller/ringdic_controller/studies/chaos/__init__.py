@@ -2,6 +2,7 @@
 
 ``plan``        what goes wrong in which capture, from a seed
 ``processes``   nodes and controller as processes that can be killed, frozen and started anew
+``proxy``       links between nodes and controller that can be cut and slowed down
 ``controller``  the controller's process: captures without a page
 ``rogue``       somebody else on the network
 ``audit``       every image that a node had stored is archived once, everything else has its reason

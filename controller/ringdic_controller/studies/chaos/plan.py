@@ -14,6 +14,8 @@ KINDS = {
     "freeze the controller": "controller",
     "full disk of a node": "node",
     "full disk of the controller": "controller",
+    "cut link of a node": "node",
+    "slow link of a node": "node",
     "two nodes of one id": "node",
     "manifests of another release": "node",
     "forged acknowledgements and broken messages": "network",

@@ -16,6 +16,7 @@ from ringdic_controller.service.service import free_endpoint
 from ringdic_controller.studies.chaos.audit import waiting_images
 from ringdic_controller.studies.chaos.controller import RIG
 from ringdic_controller.studies.chaos.plan import READOUT
+from ringdic_controller.studies.chaos.proxy import LinkProxy
 
 CONTROLLER = ""  # its name among the processes
 _END = 10.0  # s for a process to end by itself
@@ -26,7 +27,7 @@ class ChaosRig:
 
     Parameters
     ----------
-    folder : receives logs, spools and the archive.
+    folder : receives logs, spools and the archive. `links` has the proxy that each node is connected through.
     cameras : ids of the nodes.
     session, captures : name of the session, and how many captures the controller takes.
     size : width and height of the images, px.
@@ -41,8 +42,10 @@ class ChaosRig:
         self._captures = captures
         self._size = size
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self.links: dict[str, LinkProxy] = {}
 
     def __enter__(self) -> ChaosRig:
+        self.links = {camera: LinkProxy(int(self.endpoint.rsplit(":", 1)[1])) for camera in self.cameras}
         for name in (CONTROLLER, *self.cameras):
             self.start(name)
         return self
@@ -60,6 +63,8 @@ class ChaosRig:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+        for link in self.links.values():
+            link.close()
 
     def spool(self, name: str) -> Path:
         """Folder of a node's spool."""
@@ -79,9 +84,10 @@ class ChaosRig:
 
     def _node_config(self, name: str) -> Path:
         width, height = self._size
+        endpoint = f"tcp/127.0.0.1:{self.links[name].port}" if name in self.links else self.endpoint
         path = self.folder / f"{name}.toml"
         path.write_text(
-            f'rig = "{RIG}"\nid = "{name.split("+")[0]}"\ncontroller = "{self.endpoint}"\n'
+            f'rig = "{RIG}"\nid = "{name.split("+")[0]}"\ncontroller = "{endpoint}"\n'
             f'spool = "{self.spool(name).name}"\nspool_keep_mb = 1000000\ncamera = "pattern"\n'
             f"resend_s = 1.0\nstatus_s = 0.5\n[pattern]\nwidth = {width}\nheight = {height}\ndelay = {READOUT}\n",
             encoding="utf-8",

@@ -24,6 +24,7 @@ from ringdic_controller.studies.chaos.processes import CONTROLLER, ChaosRig
 from ringdic_controller.studies.chaos.rogue import RoguePeer
 
 _SESSION = "chaos"
+_SLOW = 500_000.0  # bytes a second that pass a slow link
 _STALLED = 180.0  # s without a new capture
 _SETTLED = 120.0  # s from the last mishap until everything is archived
 
@@ -168,6 +169,12 @@ class _Mischief:
         if mishap.kind.startswith("full disk"):
             rig.fill_disk(name)
             return lambda: rig.empty_disk(name)
+        if mishap.kind.startswith("cut link"):
+            rig.links[name].cut()
+            return rig.links[name].restore
+        if mishap.kind.startswith("slow link"):
+            rig.links[name].slow_down(_SLOW)
+            return rig.links[name].restore
         if mishap.kind.startswith("two nodes"):
             twin = f"{name}+twin"
             self.twins += [twin] if twin not in self.twins else []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import socket
 from collections import Counter
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from ringdic.session.writer import Archive, SessionWriter
 from ringdic_controller.studies.chaos import run_chaos
 from ringdic_controller.studies.chaos.audit import audit_session
 from ringdic_controller.studies.chaos.plan import KINDS, plan_mishaps
+from ringdic_controller.studies.chaos.proxy import LinkProxy
 from ringdic_node.spool import Spool
 from ringdic_node.wire import CaptureKey, Manifest
 
@@ -71,9 +73,29 @@ def test_the_audit_finds_what_is_lost_changed_or_left_behind(session: SessionWri
 
 
 def test_a_short_chaos_loses_nothing(tmp_path: Path) -> None:
-    """Seed 3 kills a node and the controller, doubles a node, forges and fills a disk."""
-    result = run_chaos(tmp_path, cameras=3, captures=5, size=(64, 48), seed=3)
+    """Seed 294 cuts a link, forges, kills the controller, fills a disk and doubles a node."""
+    result = run_chaos(tmp_path, cameras=3, captures=5, size=(64, 48), seed=294)
     assert result["captures"] == 5
     assert len(result["mishaps"]) == 5
     assert result["spooled"] + sum(result["named"].values()) >= 15
     assert result["faults"] == ()
+
+
+def test_a_link_that_is_cut_passes_nothing_and_then_everything() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = LinkProxy(server.getsockname()[1])
+        with socket.create_connection(("127.0.0.1", link.port), timeout=5) as client:
+            away = server.accept()[0]
+            client.sendall(b"one")
+            assert away.recv(9) == b"one"
+            link.cut()
+            client.sendall(b"two")
+            away.settimeout(0.2)
+            with pytest.raises(TimeoutError):
+                away.recv(9)
+            link.restore()
+            away.settimeout(5)
+            assert away.recv(9) == b"two"
+            link.close()
+            assert client.recv(9) == b"", "the end is passed on"
+            away.close()
