@@ -6,12 +6,16 @@ States and what moves them (anything not listed leaves the state alone)::
     idle        ArmAsked                    arming      LockCamera
     arming      CameraLocked                armed       Answer(armed) to every waiting question
     arming      CameraRefused               idle        Answer(not armed)
+    arming      LOCK_LIMIT_NS have passed   idle        Answer(not armed)
     armed       ArmAsked, same settings     armed       Answer(armed)
     armed       ArmAsked, other settings    arming      LockCamera
     armed       Triggered, in time          capturing   Answer(accepted), TakeFrame
-    armed       Triggered, too late         armed       Answer(late), Report(failure)
+    armed       Triggered, moment passed    armed       Answer(missed), Report(failure)
+    armed       Triggered, too far ahead    armed       Answer(refused), Report(failure)
     capturing   FrameSpooled                armed       Publish
     capturing   FrameLost                   idle        Report(failure); the camera must be locked anew
+    capturing   CAPTURE_LIMIT_NS beyond     idle        Report(failure); a frame that comes later is spooled
+                the moment have passed
 
 Laws: a capture is taken at most once, however often its trigger arrives. A spooled image is published
 again and again, each time after a longer wait, until an acknowledgement with its own hash arrives; only then may it
@@ -50,7 +54,7 @@ from ringdic_node.agent_events import (
     TakeFrame,
     Triggered,
 )
-from ringdic_node.clock import Instant
+from ringdic_node.clock import Instant, RigClock
 from ringdic_node.wire import (
     Ack,
     Arm,
@@ -65,6 +69,9 @@ from ringdic_node.wire import (
 
 REMEMBERED = 200  # failures and answers kept for repeated questions
 LISTED_NEWEST, LISTED_IN_TURN = 16, 48  # delivered images in one inventory
+FURTHEST_NS = 60_000_000_000  # a trigger whose moment is further ahead is refused: a node waits no longer for a moment
+CAPTURE_LIMIT_NS = 60_000_000_000  # beyond the moment of a capture, for its frame to be in the spool
+LOCK_LIMIT_NS = 90_000_000_000  # for a camera to be locked or refused
 
 
 @dataclass
@@ -114,6 +121,7 @@ class Agent:
         self._resend_at_most = resend_at_most_ns
         self._lock_reply: ArmReply | None = None
         self._arming: Arm | None = None
+        self._until_ns = 0  # end of the wait for the camera, by the monotonic clock
         self._waiting: list[tuple[int, str]] = []
         self._capturing: Trigger | None = None
         self._parcels = {m.key: _Parcel(m, now.monotonic_ns, resend_after_ns) for m in spooled}
@@ -151,7 +159,7 @@ class Agent:
         """Take one event at the moment ``now``; return the actions to perform, in order."""
         match event:
             case ArmAsked():
-                return self._arm(event)
+                return self._arm(event, now)
             case CameraLocked():
                 return self._locked(event.reply)
             case CameraRefused():
@@ -175,7 +183,7 @@ class Agent:
             case FetchAsked():
                 return self._fetch(event)
             case AgentTick():
-                return self._due(now)
+                return [*self._overdue(now), *self._due(now)]
 
     def inventory(self) -> Inventory:
         """The answer to an inventory query: images in the spool, failures, the capture under way.
@@ -199,7 +207,7 @@ class Agent:
 
     # Arming
 
-    def _arm(self, event: ArmAsked) -> list[Action]:
+    def _arm(self, event: ArmAsked, now: Instant) -> list[Action]:
         wanted, obstacle = event.message, event.obstacle
         if self._capturing is not None:
             obstacle = f"a capture is under way ({self._capturing.key})"
@@ -215,6 +223,7 @@ class Agent:
             return [Answer(event.question, self._lock_reply)]
         self._lock_reply = None
         self._arming = wanted
+        self._until_ns = now.monotonic_ns + LOCK_LIMIT_NS
         self._waiting = [(event.question, wanted.settings_hash)]
         return [LockCamera(wanted.settings, wanted.settings_hash)]
 
@@ -254,16 +263,41 @@ class Agent:
                 f"({trigger.settings_hash[:8]}…), because somebody armed it in between; capture again"
             )
             return [Answer(event.question, TriggerReply(self.node, key, "not armed", reason))]
-        behind = now.wall_ns - key.fire_at_ns
-        if behind > 0:
-            reason = f"the trigger arrived {behind / 1e6:.1f} ms after its moment by this node's clock"
-            verdict = TriggerReply(self.node, key, "late", reason)
-            self._remember(self._verdicts, key, verdict)
-            return [Answer(event.question, verdict), *self._fail(key, reason)]
+        ahead = key.fire_at_ns - RigClock(trigger.clock_zero_ns).time_ns(now)
+        whose = "this node's clock" if trigger.clock_zero_ns is None else "the controller's clock"
+        if ahead < 0:
+            return self._dismiss(event, "missed", f"the trigger arrived {_span(-ahead)} after its moment by {whose}")
+        if ahead > FURTHEST_NS:
+            reason = (
+                f"the trigger's moment is {_span(ahead)} ahead by {whose}, and a node waits at most "
+                f"{_span(FURTHEST_NS)}; check the clocks of controller and node"
+            )
+            return self._dismiss(event, "refused", reason)
         verdict = TriggerReply(self.node, key, "accepted")
         self._remember(self._verdicts, key, verdict)
         self._capturing = trigger
+        self._until_ns = now.monotonic_ns + ahead + CAPTURE_LIMIT_NS
         return [Answer(event.question, verdict), TakeFrame(trigger)]
+
+    def _dismiss(self, event: Triggered, word: str, reason: str) -> list[Action]:
+        """Answer a trigger whose capture is not taken, now or when it is repeated."""
+        verdict = TriggerReply(self.node, event.message.key, word, reason)
+        self._remember(self._verdicts, event.message.key, verdict)
+        return [Answer(event.question, verdict), *self._fail(event.message.key, reason)]
+
+    def _overdue(self, now: Instant) -> list[Action]:
+        """Give up a camera that has neither delivered nor refused for too long."""
+        if now.monotonic_ns < self._until_ns:
+            return []
+        if self._capturing is not None:
+            reason = (
+                f"no frame was in the spool {_span(CAPTURE_LIMIT_NS)} after the moment; the camera or the disk hangs"
+            )
+            return self._frame_lost(FrameLost(self._capturing.key, reason))
+        if self._arming is not None:
+            reason = f"the camera was not locked within {_span(LOCK_LIMIT_NS)}; it hangs"
+            return self._refused(CameraRefused(self._arming.settings_hash, reason))
+        return []
 
     def _frame_spooled(self, manifest: Manifest, now: Instant) -> list[Action]:
         if self._capturing is not None and self._capturing.key == manifest.key:
@@ -329,3 +363,8 @@ class Agent:
         if parcel.sending:
             return [Decline(event.question, f"node {self.node} is sending the image of {event.key} at this moment")]
         return [AnswerImage(event.question, parcel.manifest)]
+
+
+def _span(duration_ns: int) -> str:
+    """A duration in words: ms below a second, else s."""
+    return f"{duration_ns / 1e6:.1f} ms" if duration_ns < 1e9 else f"{duration_ns / 1e9:.0f} s"

@@ -75,7 +75,7 @@ def _run(config: NodeConfig) -> int:
     except ServiceError as error:
         sys.stderr.write(f"{error}\n")
         sys.stderr.flush()
-        os._exit(1)  # a thread that hangs in a driver must not keep the process
+        os._exit(error.exit_code)  # a thread that hangs in a driver must not keep the process
     return 0
 
 

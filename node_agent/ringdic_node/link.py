@@ -21,7 +21,7 @@ from ringdic_node.wire import NETWORK, Keys, Manifest, Message, encode
 
 log = logging.getLogger(__name__)
 
-VERBS = ("arm", "trigger", "inventory", "fetch", "preview", "status")
+VERBS = ("arm", "trigger", "inventory", "fetch", "clock", "preview", "status")
 RETRY = "retry_period_init_ms=200;retry_period_max_ms=1000"
 SMALL_BUFFER = "so_sndbuf=65536"  # so that a trigger need not queue behind megabytes of image
 

@@ -1,7 +1,8 @@
 """The node's service: it performs what the state machine `Agent` decides, on a camera, a spool and a link.
 
 Three threads: the main loop feeds the agent one event at a time; one thread uses the camera and the disk;
-one thread sends images, because sending blocks while the network is busy.
+one thread sends images, because sending blocks while the network is busy. Questions for the clock are answered in the
+thread that receives them, because the answer is about that moment.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ import numpy.typing as npt
 
 from ringdic_node import agent as steps
 from ringdic_node.agent import Agent
-from ringdic_node.cameras.camera import CameraError, Frame, NodeCamera, Shot
-from ringdic_node.clock import Clock, clock_offset
+from ringdic_node.cameras.camera import CameraError, CameraGoneError, Frame, FreeRunningCamera, NodeCamera, Shot
+from ringdic_node.clock import STEP_NS, Clock, Instant, RigClock, clock_offset
 from ringdic_node.config import NodeConfig
 from ringdic_node.identity import Identity
 from ringdic_node.image_file import image_digest
@@ -31,6 +32,7 @@ from ringdic_node.wire import (
     Ack,
     Arm,
     ArmReply,
+    ClockReading,
     Fetch,
     Keys,
     Manifest,
@@ -45,10 +47,18 @@ from ringdic_node.wire import (
 log = logging.getLogger(__name__)
 
 PREVIEW_WIDTH = 480
+CAMERA_LIMIT_NS = 100_000_000_000  # a camera that works longer, beyond the moment of a capture, hangs
 
 
 class ServiceError(RuntimeError):
-    """The node cannot go on; the text says why. systemd, or whatever started it, should start it again."""
+    """The node cannot go on; the text says why. systemd, or whatever started it, should start it again.
+
+    exit_code : 1 for a bug, 3 for a camera that delivers nothing any more.
+    """
+
+    def __init__(self, text: str, exit_code: int = 1) -> None:
+        super().__init__(text)
+        self.exit_code = exit_code
 
 
 class NodeService:
@@ -64,6 +74,9 @@ class NodeService:
         self._parcels: queue.Queue[steps.Publish | steps.AnswerImage | None] = queue.Queue()
         self._stop = threading.Event()
         self._preview: npt.NDArray[np.uint8] | None = None
+        # Why this process cannot use its camera any more: as found, and as told to the main loop.
+        self._camera_gone = self._camera_fault = ""
+        self._camera_began_ns: int | None = None  # when the camera began its present work, by the monotonic clock
         self._offset = clock_offset()
         self._versions = {**_versions(), **camera.versions()}
         self._identity = Identity(config.controller)
@@ -84,13 +97,13 @@ class NodeService:
         self._stop.set()
 
     def run(self) -> None:
-        """Serve until stopped. Raises ServiceError if one of its threads has died."""
+        """Serve until stopped. Raises ServiceError if one of its threads has died, or the camera cannot be revived."""
         keys = Keys(self.config.rig)
         config, instance = self.config, self._identity.instance
-        with NodeLink(
+        self._link = NodeLink(
             keys, config.id, config.controller, self._receive, self._receive_ack, instance, config.certificates
-        ) as link:
-            self._link = link
+        )
+        with self._link:
             workers = [
                 threading.Thread(target=self._use_camera, name="camera", daemon=True),
                 threading.Thread(target=self._send_images, name="sender", daemon=True),
@@ -126,9 +139,19 @@ class NodeService:
             if state != published_state or now >= next_status:
                 published_state, next_status = state, now + round(self.config.status_s * 1e9)
                 self._link.publish_status(self._status())
-            for worker in workers:
-                if not worker.is_alive():
-                    raise ServiceError(f"the node's {worker.name} thread has died; its traceback is above")
+            self._check(workers)
+
+    def _check(self, workers: list[threading.Thread]) -> None:
+        """Raise ServiceError where only a new process helps; what the agent had to tell has been sent."""
+        for worker in workers:
+            if not worker.is_alive():
+                raise ServiceError(f"the node's {worker.name} thread has died; its traceback is above")
+        began = self._camera_began_ns
+        if began is not None and self._clock.now().monotonic_ns - began > CAMERA_LIMIT_NS:
+            self._camera_fault = f"the camera has not returned for {CAMERA_LIMIT_NS / 1e9:.0f} s; it hangs"
+        if self._camera_fault and self._events.empty():
+            self._link.publish_status(self._status())
+            raise ServiceError(f"{self._camera_fault}; the node ends, to be started anew", exit_code=3)
 
     def _handle(self, event: steps.Event) -> None:
         for action in self._agent.handle(event, self._clock.now()):
@@ -144,13 +167,16 @@ class NodeService:
             spool_images=self._agent.spooled,
             versions=self._versions,
             clock_offset_ms=self._offset[0] if self._offset else None,
-            detail=self._room.detail(self._agent.unwanted),
+            detail="; ".join(each for each in (self._camera_fault, self._room.detail(self._agent.unwanted)) if each),
             **self._identity.fields(),
         )
 
     # Called from Zenoh's threads: decode and enqueue only
 
     def _receive(self, verb: str, payload: bytes, question: int) -> None:
+        if verb == "clock":
+            self._answer_clock(self._clock.now(), question)
+            return
         try:
             self._events.put(self._event(verb, payload, question))
         except WireError as error:
@@ -172,6 +198,20 @@ class NodeService:
             case "preview":
                 return lambda: self._answer_preview(question)
         raise WireError(f"no such question: {verb}")
+
+    def _answer_clock(self, received: Instant, question: int) -> None:
+        """Answer at once with the node's clocks, and its newest frame where the sensor runs freely."""
+        frame = self._camera.newest_frame() if isinstance(self._camera, FreeRunningCamera) else None
+        sent = self._clock.now()
+        reading = ClockReading(
+            node=self.config.id,
+            received_ns=received.monotonic_ns,
+            sent_ns=max(sent.monotonic_ns, received.monotonic_ns),
+            wall_ns=sent.wall_ns,
+            frame_time_ns=frame[0] if frame else None,
+            frame_period_ns=frame[1] if frame else None,
+        )
+        self._link.answer(question, encode(reading))
 
     def _receive_ack(self, payload: bytes) -> None:
         try:
@@ -208,17 +248,27 @@ class NodeService:
 
     def _use_camera(self) -> None:
         while (work := self._camera_work.get()) is not None:
-            if isinstance(work, steps.LockCamera):
-                self._events.put(self._lock(work))
-            else:
-                self._events.put(self._take(work.trigger))
+            ahead_ns = self._ahead_ns(work.trigger) if isinstance(work, steps.TakeFrame) else 0
+            self._camera_began_ns = self._clock.now().monotonic_ns + max(ahead_ns, 0)
+            self._events.put(self._lock(work) if isinstance(work, steps.LockCamera) else self._take(work.trigger))
+            self._camera_began_ns = None
+            self._camera_fault = self._camera_gone  # after the event, so that the failure is told before the end
+
+    def _ahead_ns(self, trigger: Trigger) -> int:
+        return trigger.key.fire_at_ns - RigClock(trigger.clock_zero_ns).time_ns(self._clock.now())
+
+    def _camera_error(self, error: CameraError) -> str:
+        """The camera's complaint; where only a new process can help, the main loop is told."""
+        if isinstance(error, CameraGoneError):
+            self._camera_gone = str(error)
+        return str(error)
 
     def _lock(self, work: steps.LockCamera) -> steps.Event:
         self._locked_to = ""
         try:
             lock = self._camera.lock(work.settings)
         except CameraError as error:
-            return steps.CameraRefused(work.settings_hash, str(error))
+            return steps.CameraRefused(work.settings_hash, self._camera_error(error))
         self._locked_to = hash_of_settings(work.settings)
         if self._locked_to != work.settings_hash:
             return steps.CameraRefused(
@@ -246,13 +296,19 @@ class NodeService:
         )
 
     def _take(self, trigger: Trigger) -> steps.Event:
-        shot = Shot(trigger.key.fire_at_ns, trigger.kind, trigger.scene)
+        rig_clock = RigClock(trigger.clock_zero_ns)
+        offset_ns = rig_clock.offset_ns(self._clock.now())
+        shot = Shot(trigger.key.fire_at_ns + offset_ns, trigger.kind, trigger.scene)
         try:
             frame = self._camera.capture(shot)
             parts = frame.pgm()
-            manifest = make_manifest(self.config.id, trigger, frame, parts, self._locked_to)
+            timed = replace(frame, time_ns=max(frame.time_ns - offset_ns, 0))
+            manifest = make_manifest(self.config.id, trigger, timed, parts, self._locked_to)
+            manifest = with_clock(manifest, trigger, offset_ns, rig_clock.offset_ns(self._clock.now()))
             self._spool.store(manifest, parts)
-        except (CameraError, SpoolError, WireError) as error:
+        except CameraError as error:
+            return steps.FrameLost(trigger.key, self._camera_error(error))
+        except (SpoolError, WireError) as error:
             return steps.FrameLost(trigger.key, str(error))
         self._room.image_bytes = manifest.bytes
         self._preview = preview_image(frame)
@@ -298,6 +354,27 @@ def make_manifest(
         exposure_us=frame.exposure_us,
         metadata=frame.metadata,
         settings_hash=settings_hash,
+        row_time_ns=frame.row_time_ns,
+    )
+
+
+def with_clock(manifest: Manifest, trigger: Trigger, offset_ns: int, offset_after_ns: int) -> Manifest:
+    """The manifest with what is known of the node's clock, whose offset has been subtracted from the frame's time.
+
+    offset_ns, offset_after_ns : offset of the wall clock from the controller's before and after the frame, ns. A clock
+    that was set in between leaves the frame's time uncertain by that much; one that was set since the node was armed
+    is noted.
+    """
+    if trigger.clock_zero_ns is None or trigger.clock_offset_ns is None:
+        return manifest
+    during, since = offset_after_ns - offset_ns, offset_after_ns - trigger.clock_offset_ns
+    if abs(since) > STEP_NS:
+        log.warning("the clock was set by %+.1f ms between arming and capture %s", since / 1e6, manifest.key)
+    return replace(
+        manifest,
+        clock_offset_ns=offset_ns,
+        clock_error_ns=(trigger.clock_error_ns or 0) + (abs(during) if abs(during) > STEP_NS else 0),
+        clock_step_ns=since if abs(since) > STEP_NS else 0,
     )
 
 

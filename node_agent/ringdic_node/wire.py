@@ -8,6 +8,7 @@ Keys
 ``rig/<rig>/node/<id>/trigger``    query: Trigger -> TriggerReply
 ``rig/<rig>/node/<id>/inventory``  query: (empty) -> Inventory
 ``rig/<rig>/node/<id>/fetch``      query: Fetch -> image bytes, Manifest as attachment
+``rig/<rig>/node/<id>/clock``      query: (empty) -> ClockReading, at once
 ``rig/<rig>/node/<id>/preview``    query: (empty) -> a small PGM of the newest frame
 ``rig/<rig>/node/<id>/ack``        put by the controller: Ack
 ``rig/<rig>/node/<id>/status``     put by the node: Status or Failure; as a query: (empty) -> Status
@@ -17,17 +18,26 @@ Keys
 
 Messages are JSON objects with ``schema`` and ``type``; image bytes travel raw. A message is checked when it is built,
 so an invalid one cannot exist on either side. Fields that one side does not know are ignored by it. All times are
-integers, ns since the Unix epoch.
+integers, ns since the Unix epoch on the controller's clock, except where a field says that it is of the node's clocks.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import re
 from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
+from ringdic_node.checks import (
+    require_hash,
+    require_hash_if_given,
+    require_in,
+    require_int,
+    require_optional,
+    require_table,
+    require_texts,
+    valid_name,
+)
 from ringdic_node.json_document import WireError, build, document_of, plain, read_document, shown
 
 SCHEMA = 1
@@ -36,7 +46,7 @@ SCHEMA = 1
 # no package `ringdic`. A test compares the two.
 CAPTURE_KINDS = ("board", "target", "specimen", "static")
 NODE_STATES = ("idle", "arming", "armed", "capturing")
-TRIGGER_VERDICTS = ("accepted", "late", "not armed")
+TRIGGER_VERDICTS = ("accepted", "missed", "refused", "not armed")
 ACK_VERDICTS = ("archived", "unknown")
 
 MAX_MESSAGE = 64 << 20
@@ -53,19 +63,6 @@ NETWORK: dict[str, object] = {
     "transport/link/tx/queue/congestion_control/block/wait_before_close": 8_000_000,
 }
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-_HASH = re.compile(r"[0-9a-f]{64}")
-
-
-def valid_name(what: str, name: object) -> str:
-    """Return `name` if it may stand in a key and in a file name, else raise WireError."""
-    if not isinstance(name, str) or not _NAME.fullmatch(name):
-        raise WireError(
-            f"{what} {shown(name)} is not a name: use 1 to 64 letters, digits, dots, dashes or underscores, "
-            "beginning with a letter or a digit"
-        )
-    return name
-
 
 @dataclass(frozen=True)
 class Keys:
@@ -77,7 +74,7 @@ class Keys:
         valid_name("rig", self.rig)
 
     def node(self, node: str, verb: str) -> str:
-        """Key of one verb of a node: arm, trigger, inventory, fetch, preview, ack or status."""
+        """Key of one verb of a node: arm, trigger, inventory, fetch, clock, preview, ack or status."""
         return f"rig/{self.rig}/node/{node}/{verb}"
 
     def image(self, node: str) -> str:
@@ -104,7 +101,7 @@ class CaptureKey:
     def __post_init__(self) -> None:
         valid_name("session", self.session)
         valid_name("capture_id", self.capture_id)
-        _require_int("fire_at_ns", self.fire_at_ns, at_least=0)
+        require_int("fire_at_ns", self.fire_at_ns, at_least=0)
 
     def __str__(self) -> str:
         return f"{self.session}/{self.capture_id}"
@@ -113,38 +110,6 @@ class CaptureKey:
     def stem(self) -> str:
         """File name of the capture without its suffix; the parts are joined by ``~``, which no name contains."""
         return f"{self.session}~{self.capture_id}~{self.fire_at_ns}"
-
-
-def _require_int(what: str, value: object, *, at_least: int) -> None:
-    if not isinstance(value, int) or isinstance(value, bool) or not at_least <= value < 1 << 63:
-        raise WireError(f"{what} must be an integer of at least {at_least} and of 63 bits, not {shown(value)}")
-
-
-def _require_in(what: str, value: object, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
-        raise WireError(f"{what} {shown(value)} is none of {', '.join(allowed)}")
-
-
-def _require_hash(what: str, value: object) -> None:
-    if not isinstance(value, str) or not _HASH.fullmatch(value):
-        raise WireError(f"{what} must be 64 hexadecimal digits (SHA-256), not {shown(value)}")
-
-
-def _require_hash_if_given(what: str, value: object) -> None:
-    if value != "":
-        _require_hash(what, value)
-
-
-def _require_table(what: str, value: object) -> None:
-    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        raise WireError(f"{what} must be a table with text keys, not {shown(value)}")
-
-
-def _require_texts(what: str, value: object) -> None:
-    _require_table(what, value)
-    assert isinstance(value, dict)
-    if not all(isinstance(text, str) for text in value.values()):
-        raise WireError(f"{what} must be a table of texts, not {shown(value)}")
 
 
 def hash_of_settings(settings: dict[str, Any]) -> str:
@@ -171,9 +136,9 @@ class Arm(_Message):
 
     def __post_init__(self) -> None:
         valid_name("session", self.session)
-        _require_in("kind", self.kind, CAPTURE_KINDS)
-        _require_table("settings", self.settings)
-        _require_hash("settings_hash", self.settings_hash)
+        require_in("kind", self.kind, CAPTURE_KINDS)
+        require_table("settings", self.settings)
+        require_hash("settings_hash", self.settings_hash)
         for node in self.expected:
             valid_name("node", node)
 
@@ -205,9 +170,10 @@ class ArmReply(_Message):
 
     def __post_init__(self) -> None:
         valid_name("node", self.node)
-        _require_hash("settings_hash", self.settings_hash)
-        _require_table("locked", self.locked)
-        _require_texts("versions", self.versions)
+        require_hash("settings_hash", self.settings_hash)
+        require_table("locked", self.locked)
+        require_texts("versions", self.versions)
+        require_optional(self, "frame_time_ns", "frame_period_ns")
         if not self.armed and not self.reason:
             raise WireError("an ArmReply that is not armed must give the reason")
 
@@ -217,7 +183,10 @@ class Trigger(_Message):
     """Request to keep the frame nearest to `key.fire_at_ns`.
 
     `scene` counts the captures of this kind, for simulated rigs. `settings_hash` is that of the settings that the
-    camera must be locked to; empty from a controller that does not say.
+    camera must be locked to; empty from a controller that does not say. `clock_zero_ns` is the controller's time at
+    which the node's monotonic clock was zero, by which the node finds the moment; `clock_offset_ns` the offset of
+    the node's wall clock when it was armed, `clock_error_ns` the bound of the error of both, as the controller
+    measured them.
     """
 
     TYPE: ClassVar[str] = "trigger"
@@ -225,16 +194,24 @@ class Trigger(_Message):
     kind: str
     scene: int = 0
     settings_hash: str = ""
+    clock_zero_ns: int | None = None
+    clock_offset_ns: int | None = None
+    clock_error_ns: int | None = None
 
     def __post_init__(self) -> None:
-        _require_hash_if_given("settings_hash", self.settings_hash)
-        _require_in("kind", self.kind, CAPTURE_KINDS)
-        _require_int("scene", self.scene, at_least=0)
+        require_hash_if_given("settings_hash", self.settings_hash)
+        require_in("kind", self.kind, CAPTURE_KINDS)
+        require_int("scene", self.scene, at_least=0)
+        require_optional(self, "clock_zero_ns", "clock_offset_ns")
+        require_optional(self, "clock_error_ns", at_least=0)
 
 
 @dataclass(frozen=True)
 class TriggerReply(_Message):
-    """Answer to `Trigger`: accepted, late (the moment had passed when it came) or not armed."""
+    """Answer to `Trigger`: accepted, missed (the moment had passed when it came), refused or not armed.
+
+    ``late``, the word of earlier releases for ``missed``, is read as such.
+    """
 
     TYPE: ClassVar[str] = "trigger-reply"
     node: str
@@ -244,16 +221,21 @@ class TriggerReply(_Message):
 
     def __post_init__(self) -> None:
         valid_name("node", self.node)
-        _require_in("verdict", self.verdict, TRIGGER_VERDICTS)
+        if self.verdict == "late":
+            object.__setattr__(self, "verdict", "missed")
+        require_in("verdict", self.verdict, TRIGGER_VERDICTS)
 
 
 @dataclass(frozen=True)
 class Manifest(_Message):
     """Description of one image file: capture, checksum, size, time, metadata.
 
-    `time_ns` is the measured wall-clock time of the frame. `settings_hash` is that of the settings that the camera was
-    locked to; empty from a node that does not say. `unknown` are fields that another release has added; they stay with
-    the manifest wherever it goes.
+    `time_ns` is the measured time of the frame; on the controller's clock, unless `clock_offset_ns` is None: then
+    on the node's own. `clock_offset_ns` is what was subtracted for that, the offset of the node's wall clock;
+    `clock_error_ns` bounds its error, and `clock_step_ns` is by how much the node's clock was set since it was
+    armed. `row_time_ns` is the time from one row of the image to the next of a rolling shutter, ns. `settings_hash`
+    is that of the settings that the camera was locked to; empty from a node that does not say. `unknown` are fields
+    that another release has added; they stay with the manifest wherever it goes.
     """
 
     TYPE: ClassVar[str] = "manifest"
@@ -269,21 +251,27 @@ class Manifest(_Message):
     format: str = "pgm"
     metadata: dict[str, Any] = field(default_factory=dict)
     settings_hash: str = ""
+    clock_offset_ns: int | None = None
+    clock_error_ns: int | None = None
+    clock_step_ns: int | None = None
+    row_time_ns: float | None = None
     unknown: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _require_hash_if_given("settings_hash", self.settings_hash)
+        require_hash_if_given("settings_hash", self.settings_hash)
         valid_name("node", self.node)
-        _require_in("kind", self.kind, CAPTURE_KINDS)
-        _require_hash("sha256", self.sha256)
-        _require_int("bytes", self.bytes, at_least=1)
+        require_in("kind", self.kind, CAPTURE_KINDS)
+        require_hash("sha256", self.sha256)
+        require_int("bytes", self.bytes, at_least=1)
         if self.bytes > IMAGE_LIMIT:
             raise WireError(f"an image of {self.bytes} bytes is too large to be sent; the limit is {IMAGE_LIMIT}")
-        _require_int("width", self.width, at_least=1)
-        _require_int("height", self.height, at_least=1)
-        _require_int("time_ns", self.time_ns, at_least=0)
-        _require_in("format", self.format, ("pgm",))
-        _require_table("metadata", self.metadata)
+        require_int("width", self.width, at_least=1)
+        require_int("height", self.height, at_least=1)
+        require_int("time_ns", self.time_ns, at_least=0)
+        require_optional(self, "clock_offset_ns", "clock_step_ns")
+        require_optional(self, "clock_error_ns", at_least=0)
+        require_in("format", self.format, ("pgm",))
+        require_table("metadata", self.metadata)
 
 
 @dataclass(frozen=True)
@@ -351,8 +339,8 @@ class Ack(_Message):
 
     def __post_init__(self) -> None:
         valid_name("node", self.node)
-        _require_hash("sha256", self.sha256)
-        _require_in("verdict", self.verdict, ACK_VERDICTS)
+        require_hash("sha256", self.sha256)
+        require_in("verdict", self.verdict, ACK_VERDICTS)
 
 
 @dataclass(frozen=True)
@@ -379,18 +367,43 @@ class NodeStatus(_Message):
 
     def __post_init__(self) -> None:
         valid_name("node", self.node)
-        _require_in("state", self.state, NODE_STATES)
-        _require_int("time_ns", self.time_ns, at_least=0)
-        _require_int("spool_free", self.spool_free, at_least=0)
-        _require_int("spool_images", self.spool_images, at_least=0)
-        _require_texts("versions", self.versions)
+        require_in("state", self.state, NODE_STATES)
+        require_int("time_ns", self.time_ns, at_least=0)
+        require_int("spool_free", self.spool_free, at_least=0)
+        require_int("spool_images", self.spool_images, at_least=0)
+        require_texts("versions", self.versions)
 
 
-Message = Arm | ArmReply | Trigger | TriggerReply | Manifest | Failure | Inventory | Fetch | Ack | NodeStatus
-_TYPES: dict[str, type[Any]] = {
-    cls.TYPE: cls
-    for cls in (Arm, ArmReply, Trigger, TriggerReply, Manifest, Failure, Inventory, Fetch, Ack, NodeStatus)
-}
+@dataclass(frozen=True)
+class ClockReading(_Message):
+    """Answer to a question for the node's clocks, given at once, by which the controller measures their offset.
+
+    `received_ns` and `sent_ns` are readings of the node's monotonic clock when the question came and when the answer
+    left, `wall_ns` is its wall clock at the latter. `frame_time_ns` and `frame_period_ns` are the time of the newest
+    frame on the node's wall clock, and the period, of a sensor that takes frames continuously.
+    """
+
+    TYPE: ClassVar[str] = "clock"
+    node: str
+    received_ns: int
+    sent_ns: int
+    wall_ns: int
+    frame_time_ns: int | None = None
+    frame_period_ns: int | None = None
+
+    def __post_init__(self) -> None:
+        valid_name("node", self.node)
+        require_int("received_ns", self.received_ns, at_least=0)
+        require_int("sent_ns", self.sent_ns, at_least=self.received_ns)
+        require_int("wall_ns", self.wall_ns, at_least=0)
+        require_optional(self, "frame_time_ns")
+        require_optional(self, "frame_period_ns", at_least=1)
+
+
+Message = (
+    Arm | ArmReply | Trigger | TriggerReply | Manifest | Failure | Inventory | Fetch | Ack | NodeStatus | ClockReading
+)
+_TYPES: dict[str, type[Any]] = {cls.TYPE: cls for cls in get_args(Message)}
 # Fields that hold nested records or sequences of them, which JSON alone does not tell from tables.
 _NESTED: dict[tuple[str, str], type[Any]] = {
     ("trigger", "key"): CaptureKey,

@@ -161,6 +161,7 @@ MESSAGES: tuple[wire.Message, ...] = (
     wire.Fetch(KEY),
     wire.Ack("a", KEY, HASH),
     wire.NodeStatus("a", "idle", False, 1, 0, 0),
+    wire.ClockReading("a", 1, 2, 3),
 )
 
 

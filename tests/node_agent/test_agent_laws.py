@@ -6,6 +6,9 @@ from dataclasses import replace
 
 import pytest
 from ringdic_node.agent import (
+    CAPTURE_LIMIT_NS,
+    FURTHEST_NS,
+    LOCK_LIMIT_NS,
     Acknowledged,
     Agent,
     AgentTick,
@@ -110,10 +113,10 @@ def test_an_unarmed_node_takes_nothing_but_may_still_be_armed_in_time():
     assert any(isinstance(a, TakeFrame) for a in agent.handle(trigger(), NOW))
 
 
-def test_a_trigger_after_its_moment_is_late_and_reported():
+def test_a_trigger_after_its_moment_is_missed_and_reported():
     agent = armed_agent()
     answer, report = agent.handle(trigger(), at(1.5))
-    assert answer.message.verdict == "late"
+    assert answer.message.verdict == "missed"
     assert "500.0 ms" in answer.message.reason
     assert isinstance(report, Report)
     assert report.failure.key == KEY
@@ -236,3 +239,50 @@ def test_a_node_without_room_refuses_to_arm_though_its_camera_is_locked():
     assert (answer.message.armed, answer.message.reason) == (False, "no room")
     (answer,) = agent.handle(arm(question=3), NOW)
     assert answer.message.armed is True
+
+
+@pytest.mark.parametrize("ahead", [FURTHEST_NS + 1, 3600 * SECOND, 2**62], ids=["a little", "an hour", "absurd"])
+def test_a_trigger_too_far_ahead_is_refused_with_a_sentence_and_the_node_stays_armed(ahead):
+    agent = armed_agent()
+    key = replace(KEY, fire_at_ns=NOW.wall_ns + ahead)
+    for _ in range(2):
+        answer, *_ = agent.handle(Triggered(Trigger(key, "board"), 7), NOW)
+        assert answer.message.verdict == "refused"
+        assert "ahead" in answer.message.reason
+        assert agent.state == "armed"
+    assert agent.inventory().failures[0].key == key
+    assert any(isinstance(a, TakeFrame) for a in agent.handle(trigger(), NOW)), "the next trigger is taken"
+
+
+def test_the_moment_is_that_of_the_controllers_clock_where_it_is_known():
+    """The node's wall clock is an hour ahead: by it, the moment would have passed."""
+    hour = 3600 * SECOND
+    now = Instant(NOW.wall_ns + hour, 5 * SECOND)
+    known = Trigger(KEY, "board", clock_zero_ns=NOW.wall_ns - 5 * SECOND, clock_offset_ns=hour, clock_error_ns=9)
+    (answer, _) = armed_agent().handle(Triggered(known, 7), now)
+    assert answer.message.verdict == "accepted"
+    (answer, _) = armed_agent().handle(Triggered(Trigger(KEY, "board"), 7), now)
+    assert answer.message.verdict == "missed"
+
+
+def test_a_node_does_not_stay_capturing_for_longer_than_the_limit():
+    agent = capturing_agent()
+    end = 1.0 + CAPTURE_LIMIT_NS / SECOND
+    assert agent.handle(AgentTick(), at(end - 0.1)) == []
+    assert agent.state == "capturing"
+    hour_back = Instant(NOW.wall_ns - 3600 * SECOND, at(end).monotonic_ns)
+    (report,) = agent.handle(AgentTick(), hour_back)
+    assert "hangs" in report.failure.reason
+    assert agent.state == "idle"
+    assert agent.handle(FrameSpooled(MANIFEST), at(end + 1)) == [Publish(MANIFEST)], (
+        "a frame that comes after all is kept"
+    )
+
+
+def test_a_node_does_not_stay_arming_for_longer_than_the_limit():
+    agent = Agent("n", NOW)
+    agent.handle(arm(), NOW)
+    assert agent.handle(AgentTick(), at(LOCK_LIMIT_NS / SECOND - 1)) == []
+    (answer,) = agent.handle(AgentTick(), at(LOCK_LIMIT_NS / SECOND))
+    assert (answer.message.armed, agent.state) == (False, "idle")
+    assert "hangs" in answer.message.reason

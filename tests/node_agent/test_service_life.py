@@ -6,6 +6,7 @@ import threading
 
 import pytest
 from ringdic_node.agent import ArmAsked
+from ringdic_node.cameras.camera import CameraGoneError
 from ringdic_node.cameras.pattern import PatternCamera
 from ringdic_node.clock import SystemClock
 from ringdic_node.config import NodeConfig
@@ -44,3 +45,35 @@ def test_a_bug_in_the_cameras_thread_ends_the_node(tmp_path):
     service._events.put(ArmAsked(Arm("s", "board", {}, "0" * 64, ("201",)), 1))
     with pytest.raises(ServiceError, match="camera thread has died"):
         service.run()
+
+
+class GoneCamera(PatternCamera):
+    """A camera that delivers nothing, not even after a restart."""
+
+    def lock(self, settings):
+        raise CameraGoneError("the camera gives no frames, not even after a restart")
+
+
+class HangingCamera(PatternCamera):
+    """A driver that does not return."""
+
+    def lock(self, settings):
+        threading.Event().wait(5)
+        return super().lock(settings)
+
+
+@pytest.mark.parametrize(
+    ("camera_type", "told"), [(GoneCamera, "not even after a restart"), (HangingCamera, "it hangs")]
+)
+def test_a_dead_camera_is_told_and_ends_the_process_for_a_new_one(tmp_path, monkeypatch, camera_type, told):
+    monkeypatch.setattr("ringdic_node.service.CAMERA_LIMIT_NS", 100_000_000)
+    service = service_of(tmp_path, camera_type)
+    sent = []
+    service._events.put(ArmAsked(Arm("s", "board", {}, "0" * 64, ("201",)), 1))
+    monkeypatch.setattr("ringdic_node.link.NodeLink.publish_status", lambda link, message: sent.append(message))
+    with pytest.raises(ServiceError, match=told) as ended:
+        service.run()
+    assert ended.value.exit_code == 3
+    assert told in sent[-1].detail
+    if camera_type is GoneCamera:
+        assert service._agent.state == "idle", "the refusal was told before the end"

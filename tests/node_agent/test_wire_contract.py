@@ -14,10 +14,12 @@ from ringdic_node.wire import (
     CAPTURE_KINDS,
     IMAGE_LIMIT,
     NETWORK,
+    TRIGGER_VERDICTS,
     Ack,
     Arm,
     ArmReply,
     CaptureKey,
+    ClockReading,
     Failure,
     Fetch,
     Inventory,
@@ -38,6 +40,7 @@ hashes = st.from_regex(r"\A[0-9a-f]{64}\Z")
 texts = st.text(min_size=1, max_size=20)
 counts = st.integers(0, 2**62)
 tables = st.dictionaries(st.text(max_size=5), st.one_of(st.integers(), st.text(max_size=5), st.none()), max_size=3)
+moments = st.integers(-(2**62), 2**62)
 keys = st.builds(CaptureKey, names, names, counts)
 kinds = st.sampled_from(CAPTURE_KINDS)
 manifests = st.builds(
@@ -57,8 +60,9 @@ failures = st.builds(Failure, names, keys, texts)
 messages = st.one_of(
     st.builds(Arm, names, kinds, tables, hashes, st.lists(names, max_size=3).map(tuple)),
     st.builds(ArmReply, names, st.booleans(), hashes, texts, tables, clock_offset_ms=st.none() | st.floats(-9, 9)),
-    st.builds(Trigger, keys, kinds, counts),
-    st.builds(TriggerReply, names, keys, st.sampled_from(["accepted", "late", "not armed"]), texts),
+    st.builds(Trigger, keys, kinds, counts, clock_zero_ns=st.none() | moments, clock_offset_ns=st.none() | moments),
+    st.builds(TriggerReply, names, keys, st.sampled_from(TRIGGER_VERDICTS), texts),
+    st.builds(ClockReading, names, counts, st.just(2**62), counts, st.none() | moments, st.none() | st.integers(1, 99)),
     manifests,
     failures,
     st.builds(
@@ -210,3 +214,13 @@ def test_a_name_is_one_in_messages_where_it_is_one_in_a_session(name):
             return str(error)
 
     assert verdict(valid_name, WireError) == verdict(session_names.checked_name, InputError)
+
+
+def test_the_earlier_word_for_a_missed_trigger_is_read():
+    assert TriggerReply("n", KEY, "late").verdict == "missed"
+
+
+@pytest.mark.parametrize("number", [2**63, 10**400, -1])
+def test_a_moment_beyond_all_clocks_is_refused(number):
+    with pytest.raises(WireError, match="fire_at_ns must be an integer"):
+        CaptureKey("s", "0001-board", number)

@@ -1,8 +1,9 @@
 """The controller's capture round as a state machine without input or output: an event comes in, actions go out.
 
-Needs the standard library only. Times are wall-clock times of the controller, ns since the Unix epoch::
+Needs the standard library only. Times are ns since the Unix epoch by the controller's wall clock as it stood when the
+round began, and go on evenly from there, so that a clock that is set meanwhile lengthens or shortens no wait::
 
-    arming       SendArm until every expected camera has answered or the arm deadline passes
+    arming       SendArm until every expected camera is armed with a measured clock or the arm deadline passes
                  → refused     a camera is not armed and the operator did not override
                  → triggering  OpenCapture (the record exists before any camera fires), SendTrigger
     triggering   SendTrigger again to whoever has not answered, until the planned moment
@@ -10,8 +11,8 @@ Needs the standard library only. Times are wall-clock times of the controller, n
     collecting   images are pushed by the nodes; after a while AskInventory and FetchImage pull what is missing
                  → closed      nothing is pending, or whoever is pending has gone, or the deadline passed
 
-Every expected camera ends ok, late or failed with a reason. An image that arrives after the close is archived as well
-and turns the camera's status to late; `ringdic_controller.rig.judgement` decides about every image by itself.
+Every expected camera ends ok or failed with a reason. An image that arrives after the close is archived as well and
+turns the camera's status to delivered-late; `ringdic_controller.rig.judgement` decides about every image by itself.
 """
 
 from __future__ import annotations
@@ -19,13 +20,32 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from ringdic_node.wire import (
-    ArmReply,
-    CaptureKey,
-    Failure,
-    Inventory,
-    Manifest,
-    TriggerReply,
+from ringdic_node.wire import ArmReply, CaptureKey, Failure, Inventory, TriggerReply
+
+from ringdic_controller.rig.clocks import NodeTiming, clock_fault
+from ringdic_controller.rig.frame_grid import FrameTiming, common_grid, frame_timing
+from ringdic_controller.rig.round_steps import (
+    Action,
+    ArmAnswered,
+    AskInventory,
+    CameraOutcome,
+    CaptureOpened,
+    CloseCapture,
+    Event,
+    FailureReported,
+    FetchImage,
+    ImageArchived,
+    InventoryAnswered,
+    NodeBack,
+    NodeDoubled,
+    NodeGone,
+    NoteOutcome,
+    OpenCapture,
+    RefuseRound,
+    RoundTick,
+    SendArm,
+    SendTrigger,
+    TriggerAnswered,
 )
 
 MS = 1_000_000
@@ -51,175 +71,6 @@ class Timing:
                 raise ValueError(f"the round's wait '{name}' must be positive, not {value} ns")
 
 
-# Events ------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class ArmAnswered:
-    """A node has answered whether its camera is armed."""
-
-    reply: ArmReply
-
-
-@dataclass(frozen=True)
-class CaptureOpened:
-    """The archive has created the capture's folder and record."""
-
-    key: CaptureKey
-
-
-@dataclass(frozen=True)
-class TriggerAnswered:
-    """A node has accepted or rejected the trigger."""
-
-    reply: TriggerReply
-
-
-@dataclass(frozen=True)
-class ImageArchived:
-    """An image is durable in the archive."""
-
-    manifest: Manifest
-
-
-@dataclass(frozen=True)
-class FailureReported:
-    """A node has reported that it took no image, and why."""
-
-    failure: Failure
-
-
-@dataclass(frozen=True)
-class InventoryAnswered:
-    """A node has listed the images and failures that it holds."""
-
-    inventory: Inventory
-
-
-@dataclass(frozen=True)
-class NodeGone:
-    """A camera's node has lost its connection."""
-
-    camera: str
-
-
-@dataclass(frozen=True)
-class NodeBack:
-    """A camera's node is connected again."""
-
-    camera: str
-
-
-@dataclass(frozen=True)
-class NodeDoubled:
-    """Two processes speak as one camera's node, or no longer: `reason` says which; empty if it is one again."""
-
-    camera: str
-    reason: str
-
-
-@dataclass(frozen=True)
-class RoundTick:
-    """Time has passed."""
-
-
-Event = (
-    ArmAnswered
-    | CaptureOpened
-    | TriggerAnswered
-    | ImageArchived
-    | FailureReported
-    | InventoryAnswered
-    | NodeGone
-    | NodeBack
-    | NodeDoubled
-    | RoundTick
-)
-
-
-# Actions -----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class SendArm:
-    """Ask nodes to arm their cameras; answers come back as ArmAnswered."""
-
-    cameras: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class OpenCapture:
-    """Create the capture's record; CaptureOpened follows.
-
-    unarmed : by camera, why it takes no part. armed : by camera, what it answered when it armed.
-    """
-
-    fire_at_ns: int
-    unarmed: dict[str, str]
-    armed: dict[str, ArmReply]
-
-
-@dataclass(frozen=True)
-class SendTrigger:
-    """Ask nodes to capture at the key's planned moment; answers come back as TriggerAnswered."""
-
-    cameras: tuple[str, ...]
-    key: CaptureKey
-
-
-@dataclass(frozen=True)
-class AskInventory:
-    """Ask nodes which images they hold; answers come back as InventoryAnswered."""
-
-    cameras: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class FetchImage:
-    """Pull an image that a node holds."""
-
-    manifest: Manifest
-
-
-@dataclass(frozen=True)
-class NoteOutcome:
-    """Record a camera's new outcome and report it."""
-
-    camera: str
-    outcome: CameraOutcome
-
-
-@dataclass(frozen=True)
-class RefuseRound:
-    """End the round without a capture. reasons : by camera, why it is not armed."""
-
-    reasons: dict[str, str]
-
-
-@dataclass(frozen=True)
-class CloseCapture:
-    """Close the capture's record with the outcome of every camera."""
-
-    outcomes: dict[str, CameraOutcome]
-
-
-Action = SendArm | OpenCapture | SendTrigger | AskInventory | FetchImage | NoteOutcome | RefuseRound | CloseCapture
-
-
-@dataclass(frozen=True)
-class CameraOutcome:
-    """Outcome of a round for one camera: ``status`` pending, ok or failed, the last with the reason in words."""
-
-    status: str = "pending"
-    reason: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.status not in ("pending", "ok", "failed"):
-            raise ValueError(f"no such outcome: {self.status!r}")
-        if self.status == "failed" and not self.reason:
-            raise ValueError("a failed outcome must have a reason")
-
-
 class CaptureRound:
     """One capture of all cameras, from arming to the close.
 
@@ -239,6 +90,9 @@ class CaptureRound:
         Fire although cameras are not armed; those end as failed with their reason.
     settings_hash
         Hash of the settings that the cameras must be locked to; a camera that is locked to others is not armed.
+    tolerance
+        Largest skew that is not flagged, ns: a camera whose clock is not known as well as that is not armed. None:
+        clocks are not asked for.
 
     Raises ValueError if there is no camera or one is named twice.
     """
@@ -253,6 +107,7 @@ class CaptureRound:
         doubled: Mapping[str, str] | None = None,
         override: bool = False,
         settings_hash: str | None = None,
+        tolerance: int | None = None,
     ) -> None:
         self.cameras = tuple(cameras)
         if not self.cameras or len(set(self.cameras)) != len(self.cameras):
@@ -264,6 +119,8 @@ class CaptureRound:
         self._override = override
         self._settings_hash = settings_hash
         self._doubled = dict(doubled or {})
+        self._tolerance = tolerance
+        self._timings: dict[str, NodeTiming] = {}
         self._arm_deadline = now + timing.arm
         self._next_send = now
         self._armed: dict[str, ArmReply] = {}
@@ -294,7 +151,7 @@ class CaptureRound:
         actions: list[Action] = []
         match event:
             case ArmAnswered():
-                self._note_arm(event.reply)
+                self._note_arm(event)
             case CaptureOpened():
                 actions += self._opened(event.key, now)
             case TriggerAnswered():
@@ -335,15 +192,21 @@ class CaptureRound:
 
     # Arming
 
-    def _note_arm(self, reply: ArmReply) -> None:
+    def _note_arm(self, event: ArmAnswered) -> None:
+        reply = event.reply
         if reply.node not in self.outcomes or self.state != "arming":
             return
+        fault = clock_fault(event.timing, self._tolerance) if reply.armed and self._tolerance is not None else None
         if reply.armed and self._settings_hash not in (None, reply.settings_hash):
             self._armed.pop(reply.node, None)
             self._refusals[reply.node] = f"the camera is locked to other settings ({reply.settings_hash[:8]}…)"
-        elif reply.armed:
+        elif reply.armed and fault is None:
             self._armed[reply.node] = reply
             self._refusals.pop(reply.node, None)
+            if event.timing is not None:
+                self._timings[reply.node] = event.timing
+        elif fault is not None:
+            self._refusals[reply.node] = fault
         elif reply.node not in self._armed:
             self._refusals[reply.node] = reply.reason
 
@@ -365,7 +228,9 @@ class CaptureRound:
         for camera, reason in reasons.items():
             notes += self._settle(camera, CameraOutcome("failed", reason))
         armed = {camera: reply for camera, reply in self._armed.items() if camera not in reasons}
-        return [*notes, OpenCapture(self._moment(now), reasons, armed)]
+        grid = common_grid(self._frames(), self._tolerance)
+        earliest = now + self.timing.lead
+        return [*notes, OpenCapture(grid.at_or_after(earliest) if grid else earliest, reasons, armed, grid)]
 
     def _why_not_armed(self, camera: str) -> str:
         if self._doubled.get(camera):
@@ -376,15 +241,18 @@ class CaptureRound:
             return "not armed: the node is not connected"
         return f"not armed: no answer within {self.timing.arm / SECOND:g} s"
 
-    def _moment(self, now: int) -> int:
-        """The moment to capture at, ns: `Timing.lead` ahead, moved to a frame's start if a node gave its frames."""
-        earliest = now + self.timing.lead
-        for camera in self.cameras:
-            reply = self._armed.get(camera)
-            if reply and reply.frame_time_ns is not None and reply.frame_period_ns:
-                frames = -((reply.frame_time_ns - earliest) // reply.frame_period_ns)
-                return reply.frame_time_ns + frames * reply.frame_period_ns
-        return earliest
+    def _frames(self) -> dict[str, FrameTiming]:
+        """Frame times of the armed cameras that take frames continuously: as measured with the clock, or as armed."""
+        frames = {}
+        for camera, reply in self._armed.items():
+            timing = self._timings.get(camera)
+            if timing is not None and timing.frames is not None:
+                frames[camera] = timing.frames
+            else:
+                armed_at = frame_timing(reply.frame_time_ns, reply.frame_period_ns, timing.offset_ns if timing else 0)
+                if armed_at is not None:
+                    frames[camera] = armed_at
+        return frames
 
     # Triggering
 
@@ -403,8 +271,8 @@ class CaptureRound:
         earlier = self._verdicts.get(reply.node)
         if earlier is None or earlier.verdict == "not armed":
             self._verdicts[reply.node] = reply
-        if reply.verdict == "late":
-            return self._settle(reply.node, CameraOutcome("failed", reply.reason or "the trigger came too late"))
+        if reply.verdict in ("missed", "refused"):
+            return self._settle(reply.node, CameraOutcome("failed", reply.reason or f"the trigger was {reply.verdict}"))
         return []
 
     def _advance_triggering(self, now: int) -> list[Action]:
@@ -439,7 +307,7 @@ class CaptureRound:
         for failure in inventory.failures:
             if failure.key == key:
                 return self._note_failure(failure)
-        # The node was asked after the planned moment: it will reject a trigger that is still on its way as late.
+        # The node was asked after the planned moment: it will reject a trigger that is still on its way.
         if inventory.capturing != key and now > key.fire_at_ns + self.timing.pull_after:
             return self._settle(camera, CameraOutcome("failed", self._why_missing(camera)))
         return []

@@ -184,7 +184,7 @@ class Intake:
 
 
 def description_of(manifest: Manifest) -> ImageDescription:
-    """The part of a node's manifest that the session's record keeps: checksum, size, time, exposure, metadata."""
+    """The part of a node's manifest that the record keeps: checksum, size, time, exposure, clock, metadata."""
     return ImageDescription(
         manifest.sha256,
         manifest.width,
@@ -194,6 +194,10 @@ def description_of(manifest: Manifest) -> ImageDescription:
         manifest.metadata,
         manifest.format,
         manifest.settings_hash or None,
+        manifest.clock_offset_ns,
+        manifest.clock_error_ns,
+        manifest.clock_step_ns,
+        manifest.row_time_ns,
     )
 
 

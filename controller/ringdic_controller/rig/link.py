@@ -26,6 +26,7 @@ from ringdic_node.wire import (
     Arm,
     ArmReply,
     CaptureKey,
+    ClockReading,
     Failure,
     Fetch,
     Inventory,
@@ -42,8 +43,11 @@ from ringdic_node.wire import (
 
 from ringdic_controller.rig import capture as steps
 from ringdic_controller.rig.capture import Timing
+from ringdic_controller.rig.clock_watch import ARM_EXCHANGES, TIMEOUT, ClockWatch
+from ringdic_controller.rig.clocks import NodeTiming, wall_start_ns
 from ringdic_controller.rig.intake import Intake
 from ringdic_controller.rig.presence import NodePresence
+from ringdic_controller.rig.replies import decoded
 from ringdic_controller.rig.rounds import run_round
 from ringdic_controller.rig.router import router_config
 from ringdic_controller.rig.unclosed import UnclosedCaptures
@@ -115,6 +119,7 @@ class RigLink:
         )
         self._unclosed = UnclosedCaptures(on_event)
         self._visits = NodeVisits(self._visit, self._alive, self._unclosed.close, reconcile_s)
+        self._clocks = ClockWatch(self.cameras, self._ask_clock, self._alive, tolerance_ns)
 
     def __enter__(self) -> RigLink:
         for name in self._archive.close_unfinished("the controller was restarted before the image arrived"):
@@ -140,6 +145,7 @@ class RigLink:
         ]
         self._intake.start()
         self._visits.start()
+        self._clocks.start()
         return self
 
     def __exit__(
@@ -148,6 +154,7 @@ class RigLink:
         self._visits.end()
         self._intake.stop(timeout=INVENTORY_TIMEOUT)
         self._visits.join(timeout=INVENTORY_TIMEOUT)
+        self._clocks.end(timeout=INVENTORY_TIMEOUT)
         self._unclosed.close()
         self._session.close()
 
@@ -156,7 +163,10 @@ class RigLink:
     def roster(self) -> list[dict[str, Any]]:
         """One dictionary for each expected camera, in ring order, with the present state of its node."""
         with self._lock:
-            return [node.entry(camera) for camera, node in self._nodes.items()]
+            return [node.entry(camera, self._timing_now(camera)) for camera, node in self._nodes.items()]
+
+    def _timing_now(self, camera: str) -> NodeTiming | None:
+        return self._clocks.timing(camera, wall_start_ns())
 
     def _alive(self) -> list[str]:
         with self._lock:
@@ -203,7 +213,7 @@ class RigLink:
             alive, contradicts = node.alive, node.processes.contradiction(camera)
             if alive != before:
                 node.seen_ns = time.time_ns()
-            entry = node.entry(camera)
+            entry = node.entry(camera, self._timing_now(camera))
         if alive != before:
             log.info("node %s %s", camera, "appeared" if alive else "disappeared")
             self._pass_to_round(steps.NodeBack(camera) if alive else steps.NodeGone(camera))
@@ -238,9 +248,9 @@ class RigLink:
             node = self._nodes.get(status.node)
             if node is None:
                 return
-            before = node.entry(status.node)
+            before = node.entry(status.node, self._timing_now(status.node))
             node.status, node.seen_ns = status, time.time_ns()
-            entry = node.entry(status.node)
+            entry = node.entry(status.node, self._timing_now(status.node))
         shown = ("alive", "state", "armed", "spool_images", "detail")
         if any(before[name] != entry[name] for name in shown):
             self._on_event({"type": "node", "node": entry})
@@ -282,11 +292,7 @@ class RigLink:
 
     def _reconcile_node(self, camera: str) -> None:
         """Ask one node for its status and its inventory; pull the images that the archive lacks."""
-        sent = time.time_ns()
         for status in self._answers(camera, "status", NodeStatus):
-            received = time.time_ns()
-            with self._lock:
-                self._nodes[camera].note_offset(received - sent, status.time_ns - (sent + received) // 2)
             self._note_status(status)
         for inventory in self._answers(camera, "inventory", Inventory):
             for failure in inventory.failures:
@@ -345,9 +351,28 @@ class RigLink:
             priority=zenoh.Priority.INTERACTIVE_HIGH,
         )
         for reply in replies:
-            message = _decoded(reply, answer)
+            message = decoded(reply, answer)
             if message is not None and message.node == camera:
                 yield message
+
+    # Clocks
+
+    def timing(self, camera: str, start_ns: int) -> NodeTiming | None:
+        """What is known of a node's clock and frames, as `ClockWatch.timing` describes."""
+        return self._clocks.timing(camera, start_ns)
+
+    def _ask_clock(self, camera: str, on_answer: Callable[[ClockReading | None], None]) -> None:
+        """Ask a node for its clock; ``on_answer`` is called from Zenoh's thread, or never."""
+        try:
+            self._session.get(
+                self._keys.node(camera, "clock"),
+                lambda reply: on_answer(decoded(reply, ClockReading)),
+                timeout=TIMEOUT,
+                priority=zenoh.Priority.REAL_TIME,
+                express=True,
+            )
+        except zenoh.ZError as error:
+            log.warning("node %s could not be asked for its clock: %s", camera, error)
 
     # Captures
 
@@ -427,10 +452,27 @@ class RigLink:
 
         ``on_answer`` is called from Zenoh's thread with a well-formed answer within ``timeout`` seconds, or never.
         """
+        if isinstance(question, Arm):  # its clock is measured first, since it is a condition of arming
+            threading.Thread(
+                target=self._arm, args=(camera, question, on_answer, timeout), name=f"arm-{camera}", daemon=True
+            ).start()
+        else:
+            self._ask(camera, question, on_answer, timeout)
+
+    def _arm(self, camera: str, question: Arm, on_answer: Callable[[Any], None], timeout: float) -> None:
+        try:
+            self._clocks.measure(camera, ARM_EXCHANGES)
+            self._ask(camera, question, on_answer, timeout)
+        except zenoh.ZError as error:
+            log.warning("node %s could not be asked to arm: %s", camera, error)
+
+    def _ask(
+        self, camera: str, question: Arm | Trigger | None, on_answer: Callable[[Any], None], timeout: float
+    ) -> None:
         verb, answer = ("inventory", Inventory) if question is None else _ANSWERS[type(question)]
 
         def receive(reply: zenoh.Reply) -> None:
-            message = _decoded(reply, answer)
+            message = decoded(reply, answer)
             if message is not None and message.node == camera:
                 if isinstance(message, ArmReply):
                     self._note_heard(message)
@@ -458,17 +500,3 @@ def _speaks_for_itself(message: Failure | NodeStatus | Manifest, sample: zenoh.S
         return True
     log.error("a message on %s speaks for node %s and is ignored", sample.key_expr, message.node)
     return False
-
-
-def _decoded(reply: zenoh.Reply, answer: type[Any]) -> Any | None:
-    """The message in a reply; None, with a line in the log, for an error or a message that breaks the contract."""
-    if reply.ok is None:
-        reason = reply.err.payload.to_string() if reply.err else "no reason given"
-        log.warning("a question to a node went without its answer: %s", reason)
-        return None
-    try:
-        message = decode_as(answer, reply.ok.payload.to_bytes())
-    except WireError as error:
-        log.warning("an answer on %s breaks the contract: %s", reply.ok.key_expr, error)
-        return None
-    return message.own_part() if isinstance(message, Inventory) else message

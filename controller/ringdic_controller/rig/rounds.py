@@ -16,6 +16,10 @@ from ringdic_node.wire import Arm, ArmReply, CaptureKey, Manifest, Trigger, hash
 
 from ringdic_controller.rig import capture as steps
 from ringdic_controller.rig.capture import SECOND, CaptureRound, Timing
+from ringdic_controller.rig.clocks import NodeTiming, wall_start_ns
+from ringdic_controller.rig.frame_grid import off_grid
+
+log = logging.getLogger(__name__)
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +39,12 @@ class CaptureRefusedError(ComputationError):
 
 class NodeQueries(Protocol):
     """What a round asks of the nodes; `ringdic_controller.rig.link.RigLink` does it over the network."""
+
+    def timing(self, camera: str, start_ns: int) -> NodeTiming | None:
+        """What is known of a node's clock and frames; None if it was not measured.
+
+        start_ns : time at which the controller's monotonic clock was zero, ns since the Unix epoch.
+        """
 
     def ask(
         self, camera: str, question: Arm | Trigger | None, on_answer: Callable[[Any], None], timeout: float
@@ -66,6 +76,7 @@ def run_round(
     settings: dict[str, Any],
     on_event: Callable[[dict[str, Any]], None],
     wall_ns: Callable[[], int] = time.time_ns,
+    monotonic_ns: Callable[[], int] = time.monotonic_ns,
 ) -> CaptureRecord:
     """Run one capture round to its end and return the closed record.
 
@@ -89,20 +100,26 @@ def run_round(
         Camera settings (exposure, gain, …) that the cameras are locked to.
     on_event
         Called with `capture_event` when the capture has changed.
-    wall_ns
-        Present time, ns since the Unix epoch.
+    wall_ns, monotonic_ns
+        Present time, ns since the Unix epoch, asked at the beginning; and a clock that nobody sets, ns, by which the
+        round waits.
 
     Raises CaptureRefusedError if cameras are not armed and ``override`` is not given, or none is armed.
     """
+    start_ns = wall_start_ns(wall_ns, monotonic_ns)
+    now = lambda: start_ns + monotonic_ns()  # noqa: E731
     wanted = hash_of_settings(settings)
     machine = CaptureRound(
-        cameras, timing, wall_ns(), absent=absent, doubled=doubled, override=override, settings_hash=wanted
+        cameras, timing, now(), absent=absent, doubled=doubled, override=override, settings_hash=wanted,
+        tolerance=tolerance_ns,
+    )  # fmt: skip
+    performer = _Performer(
+        nodes, events, session, kind, tuple(cameras), timing, tolerance_ns, settings, on_event, start_ns
     )
-    performer = _Performer(nodes, events, session, kind, tuple(cameras), timing, tolerance_ns, settings, on_event)
     performer.report_without_record("arming")
     event: steps.Event = steps.RoundTick()
     while True:
-        for action in machine.handle(event, wall_ns()):
+        for action in machine.handle(event, now()):
             performer.perform(action)
         if machine.over:
             break
@@ -127,8 +144,11 @@ class _Performer:
         tolerance_ns: int,
         settings: dict[str, Any],
         on_event: Callable[[dict[str, Any]], None],
+        start_ns: int,
     ) -> None:
         self._nodes = nodes
+        self._start_ns = start_ns  # the round's time at which the controller's monotonic clock was zero
+        self._armed: dict[str, NodeTiming] = {}
         self._events = events
         self._session = session
         self._kind = kind
@@ -149,14 +169,17 @@ class _Performer:
         """Perform one action; raises CaptureRefusedError for RefuseRound."""
         match action:
             case steps.SendArm():
-                self._ask(action.cameras, self._arm, steps.ArmAnswered, self._timing.arm / SECOND)
+                for camera in action.cameras:
+                    self._ask(camera, self._arm, self._arm_answered, self._timing.arm / SECOND)
             case steps.OpenCapture():
                 self._open(action)
             case steps.SendTrigger():
-                trigger = Trigger(action.key, self._kind, self._scene, self._arm.settings_hash)
-                self._ask(action.cameras, trigger, steps.TriggerAnswered, TRIGGER_ANSWER_TIMEOUT)
+                for camera in action.cameras:
+                    trigger = self._trigger(camera, action.key)
+                    self._ask(camera, trigger, steps.TriggerAnswered, TRIGGER_ANSWER_TIMEOUT)
             case steps.AskInventory():
-                self._ask(action.cameras, None, steps.InventoryAnswered, INVENTORY_TIMEOUT)
+                for camera in action.cameras:
+                    self._ask(camera, None, steps.InventoryAnswered, INVENTORY_TIMEOUT)
             case steps.FetchImage():
                 self._nodes.fetch(action.manifest)
             case steps.NoteOutcome():
@@ -170,14 +193,35 @@ class _Performer:
 
     def _ask(
         self,
-        cameras: tuple[str, ...],
+        camera: str,
         question: Arm | Trigger | None,
         event: Callable[[Any], steps.Event],
         timeout: float,
     ) -> None:
-        """Put a question to nodes; their answers come back to the state machine as events."""
-        for camera in cameras:
-            self._nodes.ask(camera, question, lambda answer: self._events.put(event(answer)), timeout)
+        """Put a question to a node; its answer comes back to the state machine as an event."""
+        self._nodes.ask(camera, question, lambda answer: self._events.put(event(answer)), timeout)
+
+    def _arm_answered(self, reply: ArmReply) -> steps.Event:
+        timing = self._nodes.timing(reply.node, self._start_ns)
+        if timing is not None and reply.armed:
+            self._armed[reply.node] = timing
+        return steps.ArmAnswered(reply, timing)
+
+    def _trigger(self, camera: str, key: CaptureKey) -> Trigger:
+        """The trigger for one node, with what is known of its clock now, and its offset when it was armed."""
+        timing = self._nodes.timing(camera, self._start_ns)
+        if timing is None:
+            return Trigger(key, self._kind, self._scene, self._arm.settings_hash)
+        armed = self._armed.get(camera, timing)
+        return Trigger(
+            key,
+            self._kind,
+            self._scene,
+            self._arm.settings_hash,
+            clock_zero_ns=timing.zero_ns,
+            clock_offset_ns=armed.offset_ns,
+            clock_error_ns=timing.error_ns,
+        )
 
     def _open(self, action: steps.OpenCapture) -> None:
         try:
@@ -190,12 +234,15 @@ class _Performer:
                 settings=self._arm.settings,
                 settings_hash=self._arm.settings_hash,
                 armed={camera: armed_state(reply) for camera, reply in action.armed.items()},
+                frame_grid=action.grid.to_json() if action.grid else None,
             )
         except OSError as error:
             raise ComputationError(
                 f"not captured, because the archive takes no record ({error.strerror or error}); "
                 "make room on its disk, or make it writable"
             ) from error
+        if action.grid is not None and action.grid.off:
+            log.warning("%s: %s", self._writer.capture_id, off_grid(action.grid))
         self._events.put(
             steps.CaptureOpened(CaptureKey(self._session.name, self._writer.capture_id, action.fire_at_ns))
         )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -15,13 +15,20 @@ import numpy.typing as npt
 SETTINGS = ("exposure_us", "gain", "colour_gains", "period_us", "tolerance_us")
 
 
+LIMITS = {"exposure_us": 10e6, "gain": 1000.0, "period_us": 10e6, "tolerance_us": 3.6e9}  # largest sensible values
+
+
 class CameraError(RuntimeError):
     """The camera cannot do what was asked; the text says what and why."""
 
 
+class CameraGoneError(CameraError):
+    """The camera delivers nothing even after it was restarted; only a new process can try again."""
+
+
 @dataclass(frozen=True)
 class Shot:
-    """A request for the frame nearest to the moment `fire_at_ns`, ns since the Unix epoch.
+    """A request for the frame nearest to the moment `fire_at_ns` of this node's wall clock, ns since the Unix epoch.
 
     kind : of the capture. scene : number of captures of this kind before. Simulated cameras choose their scene by both.
     """
@@ -56,14 +63,17 @@ class Frame:
     pixels : (height, width) uint8 or uint16
         The luminance plane, or raw values.
     time_ns : int
-        Measured wall-clock time of the frame, ns since the Unix epoch.
+        Measured time of the frame on this node's wall clock, ns since the Unix epoch.
     exposure_us : float or None
+    row_time_ns : float or None
+        Time from one row of the image to the next, ns, of a sensor with a rolling shutter.
     """
 
     pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
     time_ns: int
     exposure_us: float | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
+    row_time_ns: float | None = None
 
     def __post_init__(self) -> None:
         if self.pixels.ndim != 2 or 0 in self.pixels.shape:
@@ -111,10 +121,32 @@ class NodeCamera(Protocol):
         """Release the camera; it is not used any more."""
 
 
+@runtime_checkable
+class FreeRunningCamera(Protocol):
+    """A camera whose sensor takes frames continuously, whether or not they are asked for."""
+
+    def newest_frame(self) -> tuple[int, int] | None:
+        """Time on this node's wall clock and period of the newest frame, ns; None if there was none lately.
+
+        Called from any thread, and returns at once.
+        """
+        ...
+
+
 def check_settings(settings: Mapping[str, Any]) -> None:
     """Raise CameraError for a setting whose name is unknown or whose value is impossible."""
     for name, value in settings.items():
         if name not in SETTINGS:
             raise CameraError(f"unknown camera setting '{name}'; known are {', '.join(SETTINGS)}")
-        if name in ("exposure_us", "gain", "period_us") and not (isinstance(value, int | float) and value > 0):
-            raise CameraError(f"the camera setting '{name}' must be a positive number, not {value!r}")
+        if name in LIMITS and not _is_number(value, LIMITS[name]):
+            raise CameraError(
+                f"the camera setting '{name}' must be a positive number of at most {LIMITS[name]:g}, not {value!r}"
+            )
+        if name == "colour_gains" and not (
+            isinstance(value, list | tuple) and len(value) == 2 and all(_is_number(gain, 100.0) for gain in value)
+        ):
+            raise CameraError(f"the camera setting 'colour_gains' must be two positive numbers, not {value!r}")
+
+
+def _is_number(value: object, largest: float) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value <= largest

@@ -17,11 +17,16 @@ from ringdic.session.names import capture_id, is_file_name
 
 SCHEMA = 1
 
-_STATUSES = ("pending", "ok", "late", "failed")
+_STATUSES = ("pending", "ok", "delivered-late", "failed")
+_EARLIER_WORDS = {"late": "delivered-late"}  # of a status in records of earlier releases
 #: What to do about a damaged session.
 REMEDY = "copy it back, or import the session again"
 _UNKNOWN = "unknown"
-_OMITTED = ("settings", "settings_hash", "armed", "conflicts")  # are left out of the file where there is nothing to say
+# Fields that are left out of the file where there is nothing to say, so that earlier records stay as they are.
+_OMITTED = (
+    "settings", "settings_hash", "armed", "conflicts", "clock_offset_ns", "clock_error_ns", "clock_step_ns",
+    "row_time_ns", "skew_error_ns", "readout_ns", "frame_grid",
+)  # fmt: skip
 
 R = TypeVar("R", bound="_Record")
 
@@ -63,7 +68,8 @@ class _Record:
     def _fields(self) -> dict[str, Any]:
         names = [each.name for each in fields(self) if each.name != _UNKNOWN]
         values = {name: getattr(self, name) for name in names}
-        return {**{name: value for name, value in values.items() if value or name not in _OMITTED}, **self.unknown}
+        told = {name: value for name, value in values.items() if name not in _OMITTED or value not in (None, "", {})}
+        return {**told, **self.unknown}
 
 
 _TYPES: dict[str, tuple[str, tuple[type, ...]]] = {
@@ -112,7 +118,8 @@ class ImageDescription:
 
     sha256 : hexadecimal digits. width, height : px. time_ns : measured time of the exposure. exposure_us : µs.
     metadata : JSON values from the camera. format : extension of the file, without the dot. settings_hash : of the
-    settings that the camera was locked to.
+    settings that the camera was locked to. clock_offset_ns, clock_error_ns, clock_step_ns, row_time_ns : as in
+    `CameraRecord`.
     """
 
     sha256: str
@@ -123,18 +130,26 @@ class ImageDescription:
     metadata: Mapping[str, Any] = field(default_factory=dict)
     format: str = "pgm"
     settings_hash: str | None = None
+    clock_offset_ns: int | None = None
+    clock_error_ns: int | None = None
+    clock_step_ns: int | None = None
+    row_time_ns: float | None = None
 
 
 @dataclass(frozen=True)
 class CameraRecord(_Record):
     """One camera's entry in the record of a capture.
 
-    status : "pending" while the image is awaited, "ok", "late" where it came after the close, "failed".
-    reason : why it is late or failed, or what speaks against the image. file : name of the image in the capture's
-    folder. sha256, bytes : of that file. width, height : px. time_ns : measured time of the exposure. exposure_us : µs.
-    metadata : JSON values from the camera. original : the file that was imported. settings_hash : of the settings that
-    the camera was locked to. armed : what the camera's node answered when it armed. conflicts : checksums of other
-    images that came for this camera, by the names of their files.
+    status : "pending" while the image is awaited, "ok", "delivered-late" where it came after the close, "failed";
+    "late" of earlier releases is read as "delivered-late". reason : why it was delivered late or failed, or what
+    speaks against the image. file : name of the image in the capture's folder. sha256, bytes : of that file. width,
+    height : px. time_ns : measured time of the exposure, on the controller's clock where `clock_offset_ns` is
+    known. exposure_us : µs. metadata : JSON values from the camera. original : the file that was imported. The rest
+    is written only where there is something to say. settings_hash : of the settings that the camera was locked to.
+    armed : what the camera's node answered when it armed. conflicts : checksums of other images that came for this
+    camera, by the names of their files. clock_offset_ns : offset of the node's clock that `time_ns` is corrected
+    by; clock_error_ns : bound of its error; clock_step_ns : by how much that clock was set after the node was
+    armed. row_time_ns : from one row of the image to the next, of a sensor with a rolling shutter.
     """
 
     status: str = "pending"
@@ -151,9 +166,14 @@ class CameraRecord(_Record):
     settings_hash: str | None = None
     armed: Mapping[str, Any] = field(default_factory=dict)
     conflicts: Mapping[str, Any] = field(default_factory=dict)
+    clock_offset_ns: int | None = None
+    clock_error_ns: int | None = None
+    clock_step_ns: int | None = None
+    row_time_ns: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        object.__setattr__(self, "status", _EARLIER_WORDS.get(self.status, self.status))
         if self.status not in _STATUSES:
             raise SessionError(f"'status' is one of {', '.join(_STATUSES)}, not {self.status!r}")
         if self.file is not None and not is_file_name(self.file):
@@ -163,6 +183,13 @@ class CameraRecord(_Record):
                 raise SessionError(
                     f"'conflicts' must have a checksum by the name of each file, not {name!r}: {sha256!r}"
                 )
+
+    @property
+    def readout_ns(self) -> int | None:
+        """Time from the first to the last row of the image, ns; None where it is not known."""
+        if self.row_time_ns is None or self.height is None:
+            return None
+        return round(self.row_time_ns * (self.height - 1))
 
     @property
     def lacks_image(self) -> bool:
@@ -193,8 +220,12 @@ class CaptureRecord(_Record):
     capture_id : ``NNNN-kind``, of `number` and `kind`. session : name of the session. state : "open" or "closed".
     opened_at, closed_at : ISO 8601. fire_at_ns : planned moment of the exposure. skew_ns : spread of the cameras'
     measured times, None where fewer than two measured one. tolerance_ns : skew that is not flagged. skew_exceeded :
-    whether it is larger. override : captured although cameras were missing. cameras : an entry for each camera that
-    an image is expected of. settings, settings_hash : camera settings that were asked for, and their hash.
+    whether it is larger, or a camera's clock is not known as well as that. override : captured although cameras
+    were missing. cameras : an entry for each camera that an image is expected of. settings, settings_hash : camera
+    settings that were asked for, and their hash. skew_error_ns : bound of the skew's error from the cameras'
+    clocks. readout_ns : time from the first to the last row of an image, of the slowest rolling shutter: within one
+    image a moving body is seen over so long, whatever the skew. frame_grid : period, spread and each camera's
+    deviation, ns, of sensors that run freely.
     """
 
     capture_id: str
@@ -212,6 +243,9 @@ class CaptureRecord(_Record):
     cameras: Mapping[str, CameraRecord] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     settings_hash: str | None = None
+    skew_error_ns: int | None = None
+    readout_ns: int | None = None
+    frame_grid: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -240,6 +274,14 @@ class CaptureRecord(_Record):
         entries = {camera: entry.to_json() for camera, entry in self.cameras.items()}
         return {"schema": SCHEMA, **self._fields(), "cameras": entries}
 
+    def exposed_late_ns(self, camera: str) -> int | None:
+        """Time from the planned moment to a camera's measured exposure, ns; None where either is not known.
+
+        It is negative if the exposure was early. It says nothing of when the image was delivered.
+        """
+        time_ns = self.cameras[camera].time_ns
+        return None if time_ns is None or self.fire_at_ns is None else time_ns - self.fire_at_ns
+
     def with_entry(self, camera: str, entry: CameraRecord) -> CaptureRecord:
         """The record with another entry for a camera; the skew of a closed capture is computed again."""
         changed = replace(self, cameras={**self.cameras, camera: entry})
@@ -263,7 +305,7 @@ class CaptureRecord(_Record):
             reasons.append(_conflict_sentence(before.conflicts))
         entry = replace(
             image,
-            status="late" if late else "ok",
+            status="delivered-late" if late else "ok",
             reason="; ".join(reasons) or None,
             armed=before.armed,
             conflicts=before.conflicts,
@@ -305,12 +347,18 @@ class CaptureRecord(_Record):
         return closed._with_skew()
 
     def _with_skew(self) -> CaptureRecord:
-        times = [entry.time_ns for entry in self.cameras.values() if entry.time_ns is not None]
+        timed = [entry for entry in self.cameras.values() if entry.time_ns is not None]
+        readouts = [entry.readout_ns for entry in timed if entry.readout_ns is not None]
+        readout = max(readouts, default=None)
+        times = [entry.time_ns for entry in timed if entry.time_ns is not None]
         if len(times) < 2:
-            return replace(self, skew_ns=None, skew_exceeded=None)
+            return replace(self, skew_ns=None, skew_error_ns=None, skew_exceeded=None, readout_ns=readout)
         skew = max(times) - min(times)
-        exceeded = None if self.tolerance_ns is None else skew > self.tolerance_ns
-        return replace(self, skew_ns=skew, skew_exceeded=exceeded)
+        errors = sorted(entry.clock_error_ns for entry in timed if entry.clock_error_ns is not None)
+        worst = max([skew, *errors[-1:]])
+        exceeded = None if self.tolerance_ns is None else worst > self.tolerance_ns
+        error = sum(errors[-2:]) if errors else None
+        return replace(self, skew_ns=skew, skew_error_ns=error, skew_exceeded=exceeded, readout_ns=readout)
 
 
 def _conflict_sentence(conflicts: Mapping[str, Any]) -> str:

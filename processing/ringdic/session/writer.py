@@ -209,6 +209,7 @@ class SessionWriter:
         settings: Mapping[str, Any] | None = None,
         settings_hash: str | None = None,
         armed: Mapping[str, Mapping[str, Any]] | None = None,
+        frame_grid: Mapping[str, Any] | None = None,
     ) -> CaptureWriter:
         """Begin a capture: a folder with an open record in which every camera is pending.
 
@@ -221,6 +222,7 @@ class SessionWriter:
         override : whether it is captured although cameras are missing.
         settings, settings_hash : camera settings that were asked for, and their hash.
         armed : by camera, what its node answered when it armed.
+        frame_grid : of sensors that run freely, as in `CaptureRecord`.
         """
         if kind not in CAPTURE_KINDS:
             raise InputError(f"the capture kind '{kind}' is none of {', '.join(CAPTURE_KINDS)}")
@@ -240,6 +242,7 @@ class SessionWriter:
                 cameras={camera: CameraRecord(armed=(armed or {}).get(camera, {})) for camera in expected},
                 settings=settings or {},
                 settings_hash=settings_hash,
+                frame_grid=frame_grid or {},
             )
             path = self.path / "captures" / record.capture_id
             path.mkdir()
@@ -291,7 +294,7 @@ class CaptureWriter:
         """Archive an image under its camera's name.
 
         An identical repeat changes nothing; another image of the same camera is stored under another name. After
-        the close, the camera's status becomes late.
+        the close, the camera's status becomes delivered-late.
 
         Parameters
         ----------
@@ -317,6 +320,10 @@ class CaptureWriter:
             exposure_us=description.exposure_us,
             metadata=description.metadata,
             settings_hash=description.settings_hash,
+            clock_offset_ns=description.clock_offset_ns,
+            clock_error_ns=description.clock_error_ns,
+            clock_step_ns=description.clock_step_ns,
+            row_time_ns=description.row_time_ns,
         )
         return self._store(camera, entry, image)
 

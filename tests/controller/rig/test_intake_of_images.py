@@ -136,7 +136,7 @@ def test_what_a_node_still_holds_is_wanted_only_if_the_closed_capture_lacks_it(r
     recorded.acks.clear()
     assert not recorded.intake.wants(manifest_of())
     assert recorded.acks == [("201", "archived")], "the acknowledgement had been lost"
-    assert recorded.capture.record().cameras["201"].status == "late"
+    assert recorded.capture.record().cameras["201"].status == "delivered-late"
 
 
 def test_a_full_inbox_drops_and_a_worked_off_one_takes_again(tmp_path):

@@ -161,7 +161,7 @@ def test_a_forged_acknowledgement_loses_no_image(rig: Rig, monkeypatch: pytest.M
         subscriber.undeclare()
     archived.set()
     records = rig.session.capture("0001-board").record
-    assert until(lambda: {entry.status for entry in records().cameras.values()} == {"late"}), records()
+    assert until(lambda: {entry.status for entry in records().cameras.values()} == {"delivered-late"}), records()
     for camera in CAMERAS:
         content = (rig.session.path / f"captures/0001-board/{camera}.pgm").read_bytes()
         assert hashlib.sha256(content).hexdigest() == records().cameras[camera].sha256
@@ -181,7 +181,7 @@ def test_a_damaged_record_keeps_no_other_image_from_the_archive(rig: Rig) -> Non
         spool.deliver(key, manifest.sha256)
     rig.stop(rig.node("a"))
     rig.start("a")
-    assert until(lambda: records[1].record().cameras["a"].status == "late")
+    assert until(lambda: records[1].record().cameras["a"].status == "delivered-late")
 
 
 def test_two_nodes_of_one_id_are_refused_and_shown_and_a_restarted_one_is_not(rig: Rig) -> None:
@@ -232,7 +232,9 @@ def test_an_archive_that_was_full_closes_its_record_when_there_is_room(
         rig.link.capture(rig.session, "board")
     full.clear()
     assert until(lambda: records().state == "closed")
-    assert until(lambda: {entry.status for entry in records().cameras.values()} == {"late"}), "the images come, too"
+    assert until(lambda: {entry.status for entry in records().cameras.values()} == {"delivered-late"}), (
+        "the images come, too"
+    )
     assert sorted(path.name for path in (rig.session.path / "captures").iterdir()) == ["0001-board"]
 
 

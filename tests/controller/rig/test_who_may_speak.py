@@ -343,6 +343,7 @@ QUESTIONS = {
     "trigger": encode(Trigger(CaptureKey("s", "0001-board", 50), "board")),
     "inventory": b"",
     "fetch": b"",
+    "clock": b"",
     "preview": b"",
     "status": b"",
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from dataclasses import replace
 
 import pytest
 from ringdic.errors import InputError
@@ -138,7 +139,7 @@ def test_the_close_names_every_missing_camera_and_measures_the_skew(capture):
     # The late image counts in the skew: 1060 - 60 = 1000 is not beyond the tolerance of 1000.
     capture.store("202", described(b"late", 1060), b"late")
     record = capture.record()
-    assert record.cameras["202"].status == "late"
+    assert record.cameras["202"].status == "delivered-late"
     assert (record.skew_ns, record.skew_exceeded) == (1000, False)
 
 
@@ -171,3 +172,29 @@ def test_a_damaged_record_is_named(capture):
     (capture.path / "capture.json").write_text("{")
     with pytest.raises(SessionError, match=r"capture\.json"):
         capture.record()
+
+
+def test_delivered_late_and_exposed_late_are_two_things(capture):
+    fire = capture.record().fire_at_ns
+    capture.store("201", described(b"a", fire + 700), b"a")
+    capture.close()
+    capture.store("202", described(b"b", fire), b"b")
+    record = capture.record()
+    assert (record.cameras["201"].status, record.exposed_late_ns("201")) == ("ok", 700)
+    assert (record.cameras["202"].status, record.exposed_late_ns("202")) == ("delivered-late", 0)
+
+
+def test_the_error_of_the_clocks_and_the_rolling_shutter_are_stated_beside_the_skew(capture):
+    slow = replace(described(b"a", 0), height=101, row_time_ns=20.0, clock_offset_ns=-7, clock_error_ns=300)
+    capture.store("201", slow, b"a")
+    capture.store("202", replace(described(b"b", 100), clock_offset_ns=5, clock_error_ns=400), b"b")
+    record = capture.close()
+    assert (record.skew_ns, record.skew_error_ns, record.skew_exceeded) == (100, 700, False)
+    assert record.readout_ns == 2000
+    assert record.cameras["201"].clock_offset_ns == -7
+
+
+def test_a_clock_that_is_not_known_to_within_the_tolerance_is_flagged(capture):
+    capture.store("201", replace(described(b"a", 0), clock_error_ns=1001), b"a")
+    capture.store("202", described(b"b", 0), b"b")
+    assert capture.close().skew_exceeded is True

@@ -65,7 +65,10 @@ def test_fields_of_a_later_version_survive_what_the_writer_changes(tmp_path) -> 
         ({"state": "ajar"}, "'state' is 'open' or 'closed', not 'ajar'"),
         ({"cameras": []}, "'cameras' must have one record a camera"),
         ({"cameras": {"201": 3}}, "camera '201': a table of fields is wanted, not 3"),
-        ({"cameras": {"201": {"status": "lost"}}}, "camera '201': 'status' is one of pending, ok, late, failed"),
+        (
+            {"cameras": {"201": {"status": "lost"}}},
+            "camera '201': 'status' is one of pending, ok, delivered-late, failed",
+        ),
         ({"cameras": {"201": {"file": "../202.pgm"}}}, "camera '201': 'file' must be a name in the capture's folder"),
         ({"cameras": {"201": {"bytes": True}}}, "'bytes' must be a whole number or null, not True"),
     ],
@@ -148,3 +151,10 @@ def test_a_damaged_record_keeps_no_other_capture_open(tmp_path) -> None:
     (damaged.path / "capture.json").write_text("{")
     assert archive.close_unfinished("restarted") == ["first/0002-board"]
     assert sound.record().state == "closed"
+
+
+def test_the_word_of_earlier_releases_for_an_image_delivered_late_is_read(tmp_path) -> None:
+    file = tmp_path / "capture.json"
+    file.write_text(json.dumps({**CAPTURE, "cameras": {"201": {"status": "late", "reason": "after the close"}}}))
+    entry = read_capture_record(file).cameras["201"]
+    assert (entry.status, entry.reason, entry.lacks_image) == ("delivered-late", "after the close", False)

@@ -72,13 +72,25 @@ function openPicture(record, camera) {
 function skewText(record) {
   if (record.skew_ns === null || record.skew_ns === undefined) return "";
   const us = record.skew_ns / 1000;
-  const text = us < 1000 ? `skew ${us.toFixed(0)} µs` : `skew ${(us / 1000).toFixed(2)} ms`;
-  return record.skew_exceeded ? `${text}, beyond the tolerance` : text;
+  const parts = [us < 1000 ? `skew ${us.toFixed(0)} µs` : `skew ${(us / 1000).toFixed(2)} ms`];
+  if (Number.isFinite(record.skew_error_ns)) parts[0] += ` ± ${(record.skew_error_ns / 1e6).toFixed(2)} ms`;
+  if (record.skew_exceeded) parts.push("beyond the tolerance");
+  if (record.readout_ns) parts.push(`rows read over ${(record.readout_ns / 1e6).toFixed(1)} ms`);
+  return parts.join(", ");
+}
+
+const word = (status) => status.replace("-", " ");
+
+function exposedLate(record, entry) {
+  if (!entry.time_ns || !record.fire_at_ns || !record.tolerance_ns) return null;
+  const late = entry.time_ns - record.fire_at_ns;
+  if (Math.abs(late) <= record.tolerance_ns) return null;
+  return `exposed ${Math.abs(late / 1e6).toFixed(1)} ms ${late > 0 ? "late" : "early"}`;
 }
 
 function countText(cameras) {
   const counts = Object.entries(Object.groupBy(cameras, ([, entry]) => entry.status));
-  return counts.map(([status, entries]) => `${entries.length} ${status}`).join(", ");
+  return counts.map(([status, entries]) => `${entries.length} ${word(status)}`).join(", ");
 }
 
 function cameraCell(record, [id, entry]) {
@@ -89,19 +101,20 @@ function cameraCell(record, [id, entry]) {
         element("img", { loading: "lazy", alt: "", src: `${imageUrl(record, id)}/preview?width=160` }),
       )
     : element("span", { class: "thumb none" }, "no image");
+  const notes = [entry.reason, exposedLate(record, entry)].filter(Boolean);
   return element(
     "li",
-    { class: `camera ${entry.status}`, title: entry.reason ?? "" },
+    { class: `camera ${entry.status}`, title: notes.join("\n") },
     picture,
-    element("span", {}, `${id} `, element("b", {}, entry.status)),
-    entry.reason ? element("small", {}, entry.reason) : null,
+    element("span", {}, `${id} `, element("b", {}, word(entry.status))),
+    ...notes.map((note) => element("small", {}, note)),
   );
 }
 
 function captureItem(record, open) {
   const cameras = Object.entries(record.cameras);
   const dots = cameras.map(([id, { status, reason }]) =>
-    element("i", { class: `dot ${status}`, title: `${id}: ${status}${reason ? `, ${reason}` : ""}` }),
+    element("i", { class: `dot ${status}`, title: `${id}: ${word(status)}${reason ? `, ${reason}` : ""}` }),
   );
   const skew = skewText(record);
   const box = element(

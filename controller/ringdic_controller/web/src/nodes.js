@@ -25,8 +25,10 @@ function tile(node) {
   const details = [
     `camera ${node.id}`,
     node.azimuth_deg === undefined ? null : `azimuth ${node.azimuth_deg}°`,
-    Number.isFinite(node.clock_offset_ms) ? `clock offset ${node.clock_offset_ms.toFixed(2)} ms` : null,
-    node.detail,
+    Number.isFinite(node.clock_offset_ms)
+      ? `clock offset ${node.clock_offset_ms.toFixed(2)} ± ${(node.clock_error_ms ?? NaN).toFixed(2)} ms`
+      : null,
+    node.detail || null,
     last?.reason,
   ].filter(Boolean);
   return element(
@@ -34,7 +36,7 @@ function tile(node) {
     { class: `node ${kind}`, "data-node": node.id, title: details.join("\n") },
     element("span", { class: "node-id" }, node.id),
     element("span", { class: "node-state" }, word),
-    element("span", { class: `node-last ${last?.status ?? ""}` }, last ? `last: ${last.status}` : "no capture"),
+    element("span", { class: `node-last ${last?.status ?? ""}` }, last ? `last: ${last.status.replace("-", " ")}` : "no capture"),
     element("span", { class: "node-spool" }, spool.join(", ") || " "),
     node.detail ? element("span", { class: "node-spool" }, node.detail) : null,
   );
