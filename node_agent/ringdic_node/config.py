@@ -36,7 +36,16 @@ class ConfigError(ValueError):
 
 
 _CAMERA_KEYS: dict[str, dict[str, type | tuple[type, ...]]] = {
-    "pi": {"size": list, "raw": bool, "sync": str, "tuning": str, "period_us": (int, float), "settle_frames": int},
+    "pi": {
+        "size": list,
+        "raw": bool,
+        "sync": str,
+        "tuning": str,
+        "period_us": (int, float),
+        "settle_frames": int,
+        "buffers": int,
+        "row_time_us": (int, float),
+    },
     "virtual": {
         "cameras": int,
         "scale": (int, float),

@@ -8,38 +8,40 @@ and capturing then would be wrong by up to a frame.
 from __future__ import annotations
 
 import logging
-import math
+import shutil
+import subprocess
 import threading
 from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ringdic_node.cameras.camera import CameraError, Frame, Lock, Shot, check_settings
+from ringdic_node.cameras.camera import CameraError, CameraGoneError, Frame, Lock, Shot, check_settings
+from ringdic_node.cameras.pi_metadata import (
+    Settling,
+    frame_monotonic_ns,
+    frame_time,
+    lacks_memory,
+    moved,
+    raw_format,
+    recorded,
+)
 from ringdic_node.clock import Clock
+
+__all__ = ["PiCamera", "frame_time"]
 
 log = logging.getLogger(__name__)
 
-RECORDED = (
-    "SensorTimestamp",
-    "FrameWallClock",
-    "ExposureTime",
-    "AnalogueGain",
-    "DigitalGain",
-    "ColourGains",
-    "FrameDuration",
-    "Lux",
-    "SensorTemperature",
-    "LensPosition",
-    "SyncReady",
-    "SyncTimer",
-)
-FROZEN = ("ExposureTime", "AnalogueGain", "ColourGains")
+FROZEN = ("ExposureTime", "AnalogueGain", "ColourGains", "LensPosition")
 SYNC_MODES = {"off": 0, "server": 1, "client": 2}
-LOCK_TIMEOUT = 10.0  # s, for the locked values to reach the sensor
+MODES = {"ExposureTime": "ExposureTimeMode", "AnalogueGain": "AnalogueGainMode"}  # 0 automatic, 1 manual
+LOCK_TIMEOUT = 10.0  # s, for the automatics to converge, and for the locked values to reach the sensor
+SYNC_FRAMES = 60  # periods that a client is given beyond that: the server tells its grid every 30 of its frames
+RESTART_TIMEOUT = 10.0  # s, for a camera to stop and start
+SPARE_TIME = 1.0  # s beyond that, for a busy machine
 FRAMES_AFTER = 3  # frame periods to wait beyond the moment before the frame is given up
-EXPOSURE_TOLERANCE = 0.01  # the sensor rounds exposures to whole lines
 
 
 class PiCamera:
@@ -59,6 +61,11 @@ class PiCamera:
         Frame period unless the settings say otherwise; it must not be shorter than the sensor mode allows.
     settle_frames : int
         Consecutive frames that must show the locked values before the camera counts as locked.
+    buffers : int
+        Frames in the contiguous memory, from 2 on: one is held for the capture, the others keep the sensor running.
+    row_time_us : float
+        Time from one row of the image to the next of the rolling shutter; 0: what the shortest frame period of the
+        sensor's mode allows at most.
     """
 
     def __init__(
@@ -71,7 +78,11 @@ class PiCamera:
         tuning: str = "",
         period_us: float = 100_000.0,
         settle_frames: int = 5,
+        buffers: int = 4,
+        row_time_us: float = 0.0,
     ) -> None:
+        if buffers < 2:
+            raise CameraError(f"a camera needs at least 2 buffers, not {buffers}: one frame is held, one is filled")
         if sync not in SYNC_MODES:
             raise CameraError(f"sync '{sync}' is none of {', '.join(SYNC_MODES)}")
         try:
@@ -87,59 +98,76 @@ class PiCamera:
         self._sync = sync
         self._period_us = period_us
         self._settle_frames = settle_frames
-        self._wanted: dict[str, Any] = {}
-        self._frames = threading.Condition()
-        self._matching = 0
+        self._buffers = buffers
+        self._row_time_us = row_time_us
+        self._raw_format: dict[str, Any] = {}
+        self._fixed: set[str] = set()  # controls that a lock has taken from the automatics
+        self._locked: dict[str, Any] = {}
+        self._frames = threading.Condition()  # guards what follows
+        self._settling = Settling({})
         self._newest: dict[str, Any] = {}
+        self._newest_ns: int | None = None  # by the monotonic clock, like the next two
         self._moment: int | None = None
         self._best: Any = None
-        self._best_distance = 0
+        self._best_ns = 0
         self._passed = False
-        self._version = str(getattr(picamera2, "__version__", "unknown"))
         try:
             loaded = picamera2.Picamera2.load_tuning_file(tuning) if tuning else None
             self._camera = picamera2.Picamera2(tuning=loaded)
             self._configure()
-        except (RuntimeError, IndexError, OSError) as error:
-            raise CameraError(f"no camera can be opened: {error}; check the ribbon cable and other programs") from error
+        except (RuntimeError, IndexError, OSError, MemoryError) as error:
+            remedy = self._memory_remedy(error) or "check the ribbon cable and other programs"
+            raise CameraError(f"no camera can be opened: {error}; {remedy}") from error
 
     def _configure(self) -> None:
         raw = {"size": self._size, "format": "SBGGR10"} if self._raw else None
         configuration = self._camera.create_still_configuration(
-            main={"size": self._size, "format": "YUV420"}, raw=raw, buffer_count=4, queue=False
+            main={"size": self._size, "format": "YUV420"}, raw=raw, buffer_count=self._buffers, queue=False
         )
         self._camera.configure(configuration)
         self._camera.pre_callback = self._receive
+        if self._raw:
+            actual = self._camera.camera_configuration()  # the sensor's own order of colours, and its depth
+            bits = (actual.get("sensor") or {}).get("bit_depth")
+            self._raw_format = raw_format(str(actual["raw"]["format"]), bits)
+
+    def _memory_remedy(self, error: Exception) -> str:
+        """What to do against a lack of contiguous memory; nothing for another error."""
+        if not lacks_memory(error):
+            return ""
+        width, height = self._size
+        megabytes = self._buffers * width * height * (3.5 if self._raw else 1.5) / 1e6
+        return (
+            f"the contiguous memory (CMA) is too small for {self._buffers} buffers of {width} x {height}, about "
+            f"{megabytes:.0f} MB: lower buffers or size in node.toml, or enlarge it (cma= in "
+            "/boot/firmware/cmdline.txt), and restart the node if another program has used it up"
+        )
 
     # picamera2 calls `_receive` for every completed request, under the camera's lock: keep or drop it, no more
 
     def _receive(self, request: Any) -> None:
         metadata = request.get_metadata()
+        try:
+            time_ns = frame_monotonic_ns(metadata, self._clock.now())
+        except CameraError as error:
+            log.error("%s", error)
+            time_ns = None
         with self._frames:
-            self._newest = metadata
-            self._matching = self._matching + 1 if self._matches(metadata) else 0
-            self._consider(request, metadata)
+            self._newest, self._newest_ns = metadata, time_ns
+            self._settling.take(metadata)
+            if time_ns is not None:
+                self._consider(request, time_ns)
             self._frames.notify_all()
 
-    def _matches(self, metadata: Mapping[str, Any]) -> bool:
-        exposure, gain = self._wanted.get("ExposureTime"), self._wanted.get("AnalogueGain")
-        held = metadata.get("ExposureTime"), metadata.get("AnalogueGain")
-        if exposure is not None and not _near(held[0], exposure, EXPOSURE_TOLERANCE):
-            return False
-        if gain is not None and not _near(held[1], gain, 0.02):
-            return False
-        return self._sync != "client" or bool(metadata.get("SyncReady"))
-
-    def _consider(self, request: Any, metadata: Mapping[str, Any]) -> None:
+    def _consider(self, request: Any, time_ns: int) -> None:
         if self._moment is None or self._passed:
             return
-        time_ns = frame_time(metadata, self._clock)
         distance = abs(time_ns - self._moment)
-        if self._best is None or distance < self._best_distance:
+        if self._best is None or distance < abs(self._best_ns - self._moment):
             request.acquire()
             if self._best is not None:
                 self._best.release()
-            self._best, self._best_distance = request, distance
+            self._best, self._best_ns = request, time_ns
         self._passed = time_ns >= self._moment
 
     # The camera's protocol
@@ -151,43 +179,68 @@ class PiCamera:
         """
         check_settings(settings)
         self._period_us = float(settings.get("period_us", self._period_us))
-        self._wanted = self._controls(settings)
         if not self._camera.started:
             self._start()
-        metadata = self._hold()
+        given = self._controls(settings)
+        automatic = tuple(name for name in FROZEN[:3] if name not in given)
+        metadata = self._hold({**given, **self._automatics(automatic)}, automatic)
         # The values that the automatics found become fixed ones, and the frames must show them like any other.
-        frozen = {name: metadata[name] for name in FROZEN if name not in self._wanted and name in metadata}
+        frozen = {name: metadata[name] for name in FROZEN if name not in given and self._can_freeze(name, metadata)}
         if frozen:
-            self._wanted.update(frozen, AwbEnable=False)
-            metadata = self._hold()
-        sync = self._sync if self._sync != "client" else "client, locked"
+            fixed = {MODES[name]: 1 for name in MODES if MODES[name] in self._camera.camera_controls}
+            metadata = self._hold({**given, **frozen, **fixed, "AwbEnable": False})
+        self._locked = dict(metadata)
+        self._fixed.update(name for name in MODES if name in given or name in frozen)
         period_ns = round(1000 * float(metadata.get("FrameDuration", self._period_us)))
         image_bytes = self._size[0] * self._size[1] * (2 if self._raw else 1)
+        sync = self._sync if self._sync != "client" else "client, locked"
         return Lock(recorded(metadata), sync, frame_time(metadata, self._clock), period_ns, image_bytes)
+
+    def _can_freeze(self, name: str, metadata: Mapping[str, Any]) -> bool:
+        return name in metadata and (name != "LensPosition" or name in self._camera.camera_controls)
+
+    def _automatics(self, names: tuple[str, ...]) -> dict[str, Any]:
+        """Controls that let the automatics find values, which an earlier lock may have fixed."""
+        controls: dict[str, Any] = {"AwbEnable": True} if "ColourGains" in names else {}
+        for name, mode in MODES.items():
+            if mode in self._camera.camera_controls:
+                controls[mode] = 0 if name in names else 1
+            elif name in names and name in self._fixed:
+                controls[name] = 0  # how libcamera asked for the automatics before it had these modes
+        return controls
 
     def _start(self) -> None:
         try:
             self._camera.start()
-        except RuntimeError as error:
-            raise CameraError(f"the camera does not start: {error}") from error
+        except (RuntimeError, OSError, MemoryError) as error:
+            remedy = self._memory_remedy(error) or "another program may use it"
+            raise CameraError(f"the camera does not start: {error}; {remedy}") from error
 
-    def _hold(self) -> dict[str, Any]:
-        """Set the wanted controls; return the metadata of the last of several frames in a row that show them."""
+    def _hold(self, wanted: dict[str, Any], automatic: tuple[str, ...] = ()) -> dict[str, Any]:
+        """Set controls; return the metadata of the last of several frames in a row that show them, all at rest.
+
+        automatic : names of the values that the automatics are to find meanwhile.
+        """
+        client = self._sync == "client"
+        wait = LOCK_TIMEOUT + (SYNC_FRAMES * self._period_us / 1e6 if client else 0.0)
+        shown = {name: value for name, value in wanted.items() if name not in automatic}
         try:
-            self._camera.set_controls(self._wanted)
+            self._camera.set_controls(wanted)
         except RuntimeError as error:
             raise CameraError(f"the camera does not take its settings: {error}") from error
         with self._frames:
-            self._matching = 0
+            self._settling = settling = Settling(shown, automatic, client)
             self._newest = {}
-            done = self._frames.wait_for(lambda: self._matching >= self._settle_frames, LOCK_TIMEOUT)
-            metadata = dict(self._newest)
+            done = self._frames.wait_for(lambda: settling.frames >= self._settle_frames, wait)
+            metadata, fault = dict(self._newest), settling.fault
         if not metadata:
-            raise CameraError(f"no frame came within {LOCK_TIMEOUT:g} s; check the camera's cable")
+            self._revive()
+            raise CameraError(f"no frame came within {wait:g} s; the camera was restarted: arm again, check its cable")
         if not done:
+            aid = "; set exposure_us, gain and colour_gains under [capture] in rig.toml" if automatic else ""
             raise CameraError(
-                f"the camera did not hold its settings over {self._settle_frames} frames within {LOCK_TIMEOUT:g} s: "
-                f"wanted {self._wanted}, newest frame {recorded(metadata)}"
+                f"the camera did not hold its settings over {self._settle_frames} frames within {wait:g} s: "
+                f"{fault}{aid} (newest frame {recorded(metadata)})"
             )
         return metadata
 
@@ -206,57 +259,108 @@ class PiCamera:
             red, blue = settings["colour_gains"]
             controls.update(AwbEnable=False, ColourGains=(float(red), float(blue)))
         if "AfMode" in self._camera.camera_controls:
-            controls["AfMode"] = 0  # manual: the lens stays where it is
+            controls["AfMode"] = 0  # manual: the lens stays where it is, and is held there
         if self._sync != "off":
             controls["SyncMode"] = SYNC_MODES[self._sync]
         return controls
 
     def capture(self, shot: Shot) -> Frame:
-        """The frame nearest to the shot's moment, as `NodeCamera.capture` describes; restarts a stream that stopped."""
+        """The frame nearest to the shot's moment, as `NodeCamera.capture` describes; restarts a stream that stopped.
+
+        The wait and the frames' times are by the monotonic clock: a wall clock that is set meanwhile changes neither.
+        """
         period_s = self._period_us / 1e6
-        wait = max((shot.fire_at_ns - self._clock.now().wall_ns) / 1e9, 0.0) + FRAMES_AFTER * period_s + 1.0
+        start = self._clock.now()
+        wait = max((shot.fire_at_ns - start.wall_ns) / 1e9, 0.0) + FRAMES_AFTER * period_s + SPARE_TIME
+        offset_ns = start.wall_ns - start.monotonic_ns
         with self._frames:
-            self._moment, self._best, self._passed = shot.fire_at_ns, None, False
+            self._moment, self._best, self._passed = shot.fire_at_ns - offset_ns, None, False
             self._frames.wait_for(lambda: self._passed, wait)
-            request, passed = self._best, self._passed
+            request, passed, time_ns = self._best, self._passed, self._best_ns + offset_ns
             self._moment = self._best = None
-        if request is None:
-            self._revive()
-            raise CameraError(f"no frame came within {wait:.1f} s of waiting; the camera was restarted")
         try:
             if not passed:
-                raise CameraError(f"the frames stopped before the moment, within {wait:.1f} s of waiting")
-            return self._frame(request)
+                self._revive()
+                came = "no frame came" if request is None else "the frames stopped before the moment"
+                raise CameraError(f"{came}, within {wait:.1f} s of waiting; the camera was restarted")
+            return self._frame(request, time_ns)
         finally:
-            request.release()
+            if request is not None:
+                request.release()
 
-    def _frame(self, request: Any) -> Frame:
+    def _frame(self, request: Any, time_ns: int) -> Frame:
         metadata = request.get_metadata()
         width, height = self._size
         pixels: npt.NDArray[Any] = request.make_array("raw" if self._raw else "main")
         if self._raw and pixels.dtype == np.uint8:
             pixels = pixels.view(np.uint16)
         exposure = metadata.get("ExposureTime")
+        changes = moved(self._locked, metadata)
+        if changes:
+            log.warning("the camera does not hold its settings: %s", ", ".join(changes))
         return Frame(
             pixels=np.array(pixels[:height, :width]),  # a copy: the buffer goes back to the camera
-            time_ns=frame_time(metadata, self._clock),
+            time_ns=time_ns,
             exposure_us=float(exposure) if exposure is not None else None,
-            metadata=recorded(metadata),
+            metadata={**recorded(metadata), **self._raw_format, **({"NotHeld": changes} if changes else {})},
+            row_time_ns=self._row_time_ns(),
         )
 
+    def _row_time_ns(self) -> float | None:
+        """Time from one row of the image to the next, ns: as configured, else from the mode's shortest frame period."""
+        if self._row_time_us > 0:
+            return 1000 * self._row_time_us
+        limits = self._camera.camera_controls.get("FrameDurationLimits")
+        return 1000 * float(limits[0]) / self._size[1] if limits else None
+
+    def newest_frame(self) -> tuple[int, int] | None:
+        """Time on the wall clock and period of the newest frame, ns, as `FreeRunningCamera.newest_frame` describes."""
+        now = self._clock.now()
+        with self._frames:
+            time_ns, period_us = self._newest_ns, self._newest.get("FrameDuration", self._period_us)
+        period_ns = round(1000 * float(period_us))
+        if time_ns is None or now.monotonic_ns - time_ns > FRAMES_AFTER * period_ns + 1_000_000_000:
+            return None
+        return time_ns + now.wall_ns - now.monotonic_ns, period_ns
+
     def _revive(self) -> None:
+        """Restart a camera that gives no frames. Raises CameraGoneError if it gives none even then, or hangs."""
         log.error("the camera gives no frames and is restarted")
-        try:
-            self._camera.cancel_all_and_flush()
-            self._camera.stop()
-            self._camera.start()
-        except RuntimeError as error:
-            raise CameraError(f"the camera cannot be restarted: {error}") from error
+        failures: list[Exception] = []
+
+        def restart() -> None:
+            try:
+                self._camera.cancel_all_and_flush()
+                self._camera.stop()
+                self._camera.start()
+            except (RuntimeError, OSError, MemoryError) as error:
+                failures.append(error)
+
+        with self._frames:
+            self._newest_ns = None
+        worker = threading.Thread(target=restart, name="restart", daemon=True)  # a driver that hangs hangs it alone
+        worker.start()
+        worker.join(RESTART_TIMEOUT)
+        if worker.is_alive():
+            raise CameraGoneError(f"the camera gives no frames and does not stop within {RESTART_TIMEOUT:g} s")
+        if failures:
+            remedy = self._memory_remedy(failures[0]) or "check its cable"
+            raise CameraGoneError(f"the camera gives no frames and cannot be restarted: {failures[0]}; {remedy}")
+        wait = RESTART_TIMEOUT + FRAMES_AFTER * self._period_us / 1e6
+        with self._frames:
+            if not self._frames.wait_for(lambda: self._newest_ns is not None, wait):
+                raise CameraGoneError(
+                    f"the camera gives no frames, not even {wait:g} s after a restart; check its cable"
+                )
 
     def versions(self) -> dict[str, str]:
-        """Model of the sensor and version of picamera2."""
+        """Model of the sensor and versions of picamera2 and libcamera, which must fit each other."""
         model = self._camera.camera_properties.get("Model", "unknown")
-        return {"camera": f"pi {model}", "picamera2": self._version}
+        return {
+            "camera": f"pi {model}",
+            "picamera2": package_version("picamera2", "python3-picamera2"),
+            "libcamera": package_version("libcamera", "python3-libcamera"),
+        }
 
     def close(self) -> None:
         """Stop the stream and release the camera."""
@@ -264,30 +368,18 @@ class PiCamera:
         self._camera.close()
 
 
-def frame_time(metadata: Mapping[str, Any], clock: Clock) -> int:
-    """Wall-clock time of a frame, ns since the Unix epoch, from libcamera's metadata.
-
-    Without ``FrameWallClock`` it is ``SensorTimestamp``, on the boot clock, plus the present offset of the two clocks.
-    """
-    stamp = metadata.get("FrameWallClock")
-    if stamp:
-        return int(stamp)
-    now = clock.now()
-    return int(metadata["SensorTimestamp"]) + now.wall_ns - now.monotonic_ns
-
-
-def recorded(metadata: Mapping[str, Any]) -> dict[str, Any]:
-    """The part of a frame's metadata that is archived (`RECORDED`), as JSON values."""
-    return {name: _plain(metadata[name]) for name in RECORDED if name in metadata}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, tuple | list):
-        return [_plain(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value if isinstance(value, int | str | bool | type(None)) else str(value)
-
-
-def _near(value: Any, wanted: float, tolerance: float) -> bool:
-    return value is not None and abs(float(value) - wanted) <= tolerance * wanted
+def package_version(distribution: str, package: str) -> str:
+    """Version of a Python distribution or, where Python knows none, of a Debian package; ``unknown`` without either."""
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        pass
+    query = shutil.which("dpkg-query")
+    if query is None:
+        return "unknown"
+    command = [query, "-W", "-f", "${Version}", package]
+    try:
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=5.0, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return answer.stdout.strip() or "unknown"
