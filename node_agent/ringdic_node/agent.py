@@ -69,7 +69,7 @@ from ringdic_node.wire import (
 
 REMEMBERED = 200  # failures and answers kept for repeated questions
 LISTED_NEWEST, LISTED_IN_TURN = 16, 48  # delivered images in one inventory
-FURTHEST_NS = 60_000_000_000  # a trigger whose moment is further ahead is refused: a node waits no longer for a moment
+FURTHEST_NS = 30_000_000_000  # a trigger whose moment is further ahead is refused: a node waits no longer for a moment
 CAPTURE_LIMIT_NS = 60_000_000_000  # beyond the moment of a capture, for its frame to be in the spool
 LOCK_LIMIT_NS = 90_000_000_000  # for a camera to be locked or refused
 
