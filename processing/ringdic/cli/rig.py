@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from ringdic.cli.console import print_json, say
-from ringdic.cli.options import AsJson
+from ringdic.cli.options import AsJson, Run, Session
 from ringdic.errors import InputError
 
 rig_app = typer.Typer(name="rig", help="Build a rig: what to print, to write and to check.", no_args_is_help=True)
@@ -45,6 +45,24 @@ def target_command(
             say(f"written {path}, {width:.0f} × {height:.0f} mm: {sheets[name].name}")
     if as_json:
         print_json({name: str(path) for name, path in written.items()})
+
+
+@rig_app.command("synchrony")
+def synchrony_command(
+    session: Session,
+    run: Run = None,
+    period: Annotated[float | None, typer.Option(metavar="S", help="Time between steps, of imported images.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure each camera's true time of exposure from a moving body: at rest first, then at six steps or more."""
+    from ringdic.measure.synchrony_of_session import session_synchrony
+
+    report = session_synchrony(session, run, period)
+    if as_json:
+        print_json(report.to_json())
+        return
+    for line in report.lines():
+        say(line)
 
 
 def _two_lengths(text: str) -> tuple[float, float]:
