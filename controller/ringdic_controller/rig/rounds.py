@@ -106,12 +106,10 @@ def run_round(
 
     Raises CaptureRefusedError if cameras are not armed and ``override`` is not given, or none is armed.
     """
-    start_ns = wall_start_ns(wall_ns, monotonic_ns)
-    now = lambda: start_ns + monotonic_ns()  # noqa: E731
-    wanted = hash_of_settings(settings)
+    start_ns, wanted = wall_start_ns(wall_ns, monotonic_ns), hash_of_settings(settings)
     machine = CaptureRound(
-        cameras, timing, now(), absent=absent, doubled=doubled, override=override, settings_hash=wanted,
-        tolerance=tolerance_ns,
+        cameras, timing, start_ns + monotonic_ns(), absent=absent, doubled=doubled, override=override,
+        settings_hash=wanted, tolerance=tolerance_ns,
     )  # fmt: skip
     performer = _Performer(
         nodes, events, session, kind, tuple(cameras), timing, tolerance_ns, settings, on_event, start_ns
@@ -119,15 +117,19 @@ def run_round(
     performer.report_without_record("arming")
     event: steps.Event = steps.RoundTick()
     while True:
-        for action in machine.handle(event, now()):
+        for action in machine.handle(event, start_ns + monotonic_ns()):
             performer.perform(action)
         if machine.over:
-            break
-        try:
-            event = events.get(timeout=HEARTBEAT)
-        except queue.Empty:
-            event = steps.RoundTick()
-    return performer.record()
+            return performer.record()
+        event = _next(events)
+
+
+def _next(events: queue.Queue[steps.Event]) -> steps.Event:
+    """The next event, or after a short while that time has passed."""
+    try:
+        return events.get(timeout=HEARTBEAT)
+    except queue.Empty:
+        return steps.RoundTick()
 
 
 class _Performer:
