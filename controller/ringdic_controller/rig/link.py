@@ -442,11 +442,7 @@ class RigLink:
             events.put(event)
 
     def ask(
-        self,
-        camera: str,
-        question: Arm | Trigger | None,
-        on_answer: Callable[[Any], None],
-        timeout: float,
+        self, camera: str, question: Arm | Trigger | None, on_answer: Callable[[Any], None], timeout: float
     ) -> None:
         """Ask one node to arm, to capture or, with None, for its inventory; returns at once.
 

@@ -101,8 +101,7 @@ def run_round(
     on_event
         Called with `capture_event` when the capture has changed.
     wall_ns, monotonic_ns
-        Present time, ns since the Unix epoch, asked at the beginning; and a clock that nobody sets, ns, by which the
-        round waits.
+        Clocks, ns: the first is read at the beginning only, the round waits by the second, which nobody sets.
 
     Raises CaptureRefusedError if cameras are not armed and ``override`` is not given, or none is armed.
     """

@@ -45,8 +45,9 @@ class Rig:
         self.rig_toml = rig_toml
         self.session: SessionWriter
         self.link = RigLink(
-            "ring", CAMERAS, self.endpoint, self.archive, self.events.append, timing=TIMING, reconcile_s=0.3
-        )
+            "ring", CAMERAS, self.endpoint, self.archive, self.events.append, timing=TIMING, tolerance_ns=50 * MS,
+            reconcile_s=0.3,
+        )  # fmt: skip
         self.nodes: dict[NodeService, threading.Thread] = {}
 
     def start(self, camera: str, spool: str = "", **more: Any) -> NodeService:
