@@ -16,7 +16,9 @@ from dataclasses import dataclass
 from ringdic_controller.rig.frame_grid import FrameTiming
 
 EXCHANGES = 32  # that are remembered
-DRIFT = 50e-6  # largest difference of the rates of two machines' clocks, each of which may be slewed
+DRIFT = 50e-6  # largest difference of the rates of two machines' clocks that are left alone
+SLEWED = 0.2  # largest difference while one of them is driven to another time, as chrony does
+QUIET_NS = 10_000_000_000  # without a contradiction, until a clock counts as left alone again
 READINGS = 3  # pairs of readings of the wall clock and the monotonic clock
 STEP_NS = 1_000_000  # a larger change of a node's wall clock against its monotonic one: the clock was set
 
@@ -91,13 +93,15 @@ class NodeClock:
     """A node's clock as measured by repeated exchanges, of which the one with the least delay counts.
 
     An exchange that contradicts the earlier ones beyond their errors and the clocks' drift tells that one of the two
-    machines was started anew or that its clock was driven elsewhere: the earlier ones are dropped.
+    machines was started anew or that its clock is being driven to another time: the earlier ones are dropped, and for a
+    while the error that is stated grows as fast as a clock can be driven.
     """
 
     def __init__(self) -> None:
         self._exchanges: deque[ClockExchange] = deque(maxlen=EXCHANGES)
         self._start_ns: int | None = None
         self._steps = 0
+        self._contradicted_ns: int | None = None  # the last time, by the controller's monotonic clock
         self.last_step_ns = 0  # by how much the node's wall clock was set the last time, ns
 
     def note(self, exchange: ClockExchange) -> bool:
@@ -110,6 +114,7 @@ class NodeClock:
             allowed = self._bound(best, exchange.answered_ns) + exchange.delay_ns / 2
             if abs(exchange.lead_ns - best.lead_ns) > allowed:
                 self._exchanges.clear()
+                self._contradicted_ns = exchange.answered_ns
                 self._steps += 1
                 changed = True
         self._exchanges.append(exchange)
@@ -131,10 +136,10 @@ class NodeClock:
     def _best(self, now_ns: int) -> ClockExchange | None:
         return min(self._exchanges, key=lambda exchange: self._bound(exchange, now_ns), default=None)
 
-    @staticmethod
-    def _bound(exchange: ClockExchange, now_ns: int) -> float:
+    def _bound(self, exchange: ClockExchange, now_ns: int) -> float:
         """Largest error of the lead that an exchange measured, at a moment, ns."""
-        return exchange.delay_ns / 2 + DRIFT * abs(now_ns - exchange.answered_ns)
+        driven = self._contradicted_ns is not None and exchange.answered_ns - self._contradicted_ns < QUIET_NS
+        return exchange.delay_ns / 2 + (SLEWED if driven else DRIFT) * abs(now_ns - exchange.answered_ns)
 
 
 @dataclass(frozen=True)

@@ -108,6 +108,22 @@ def test_exchanges_that_contradict_each_other_leave_the_newer_ones(lead):
     assert abs(node.monotonic(5 * SECOND) + estimate.zero_ns(START) - START - 5 * SECOND) <= estimate.error_ns
 
 
+def test_a_clock_that_is_driven_to_another_time_is_not_believed_for_long():
+    """As chrony does it, by up to 8 % of the time; the next exchange comes 2 s later, a trigger in between."""
+    node, clock = Node(), NodeClock()
+    for k in range(4):
+        clock.note(node.exchange(2 * k * SECOND, MS // 10, MS // 10))
+    for k in range(4, 9):
+        node.lead += 160 * MS
+        clock.note(node.exchange(2 * k * SECOND, MS // 10, MS // 10))
+        just, later = clock.estimate(2 * k * SECOND + MS), clock.estimate(2 * k * SECOND + 500 * MS)
+        assert just.error_ns < MS
+        assert later.error_ns > 40 * MS, "which it may have been driven by meanwhile"
+    for k in range(9, 15):
+        clock.note(node.exchange(2 * k * SECOND, MS // 10, MS // 10))
+    assert clock.estimate(2 * 14 * SECOND + 500 * MS).error_ns < MS, "left alone, it is believed again"
+
+
 def test_an_answer_from_before_its_question_measures_nothing():
     clock = NodeClock()
     assert not clock.note(ClockExchange(asked_ns=10, received_ns=0, sent_ns=50, answered_ns=20, wall_ns=0))
