@@ -5,14 +5,14 @@ from __future__ import annotations
 import threading
 
 import pytest
-from ringdic_node.agent import ArmAsked
+from ringdic_node.agent import ArmAsked, CameraRefused, LockCamera
 from ringdic_node.cameras.camera import CameraGoneError
 from ringdic_node.cameras.pattern import PatternCamera
 from ringdic_node.clock import SystemClock
 from ringdic_node.config import NodeConfig
 from ringdic_node.service import NodeService, ServiceError
 from ringdic_node.spool import Spool
-from ringdic_node.wire import Arm
+from ringdic_node.wire import Arm, hash_of_settings
 
 
 class BrokenCamera(PatternCamera):
@@ -37,6 +37,14 @@ def test_a_node_without_a_controller_waits_and_ends_when_told(tmp_path):
     service.stop()
     thread.join(10)
     assert not thread.is_alive()
+
+
+def test_settings_with_the_hash_of_others_lock_no_camera(tmp_path):
+    """The hash goes into the manifest: it must be that of what the camera was locked to."""
+    service = service_of(tmp_path, PatternCamera)
+    refused = service._lock(LockCamera({"exposure_us": 77}, hash_of_settings({"exposure_us": 4000})))
+    assert isinstance(refused, CameraRefused)
+    assert "not theirs" in refused.reason
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")

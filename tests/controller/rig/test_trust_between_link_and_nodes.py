@@ -168,21 +168,46 @@ def test_a_forged_acknowledgement_loses_no_image(rig: Rig, monkeypatch: pytest.M
         assert hashlib.sha256(content).hexdigest() == records().cameras[camera].sha256
 
 
+def put_into_spool(rig: Rig, capture_id: str, fire_at_ns: int) -> tuple[Spool, Manifest]:
+    """A small image of camera a, stored as if its node had taken it; the node sees it when it starts anew."""
+    image = b"P5\n1 1\n255\n!"
+    key = CaptureKey(rig.session.name, capture_id, fire_at_ns)
+    manifest = Manifest("a", key, "board", hashlib.sha256(image).hexdigest(), len(image), 1, 1, 1)
+    spool = Spool(rig.folder / "spool-a")
+    spool.store(manifest, [image])
+    return spool, manifest
+
+
 def test_a_damaged_record_keeps_no_other_image_from_the_archive(rig: Rig) -> None:
     """The node lists an image of a capture whose record is unreadable before one that the archive lacks."""
     records = [rig.session.begin_capture("board", CAMERAS, fire_at_ns=n) for n in (1, 2)]
     (records[0].path / "capture.json").write_text("{")
     records[1].close()
-    image = b"P5\n1 1\n255\n!"
-    spool = Spool(rig.folder / "spool-a")
-    for capture in records:
-        key = CaptureKey(rig.session.name, capture.capture_id, records.index(capture) + 1)
-        manifest = Manifest("a", key, "board", hashlib.sha256(image).hexdigest(), len(image), 1, 1, 1)
-        spool.store(manifest, [image])
-        spool.deliver(key, manifest.sha256)
+    for number, capture in enumerate(records, start=1):
+        spool, manifest = put_into_spool(rig, capture.capture_id, number)
+        spool.deliver(manifest.key, manifest.sha256)
     rig.stop(rig.node("a"))
     rig.start("a")
     assert until(lambda: records[1].record().cameras["a"].status == "delivered-late")
+
+
+def test_an_image_that_the_nodes_release_cannot_read_is_told_and_delivered_by_the_one_that_can(rig: Rig) -> None:
+    capture = rig.session.begin_capture("board", CAMERAS, fire_at_ns=3)
+    capture.close()
+    _, manifest = put_into_spool(rig, capture.capture_id, 3)
+    path = rig.folder / "spool-a" / f"{manifest.key.stem}.json"
+    readable = path.read_bytes()
+    path.write_bytes(readable.replace(b'"width"', b'"breadth"').replace(b'"schema":1', b'"schema":9'))
+    for _ in range(2):
+        rig.stop(rig.node("a"))
+        rig.start("a")
+        assert until(lambda: "'width' is missing" in rig.entry("a")["detail"])
+    assert until(lambda: "stays in the node's spool" in (capture.record().cameras["a"].reason or ""))
+    assert "schema 9" in (capture.record().cameras["a"].reason or "")
+    path.write_bytes(readable)
+    rig.stop(rig.node("a"))
+    rig.start("a")
+    assert until(lambda: capture.record().cameras["a"].status == "late")
 
 
 def test_two_nodes_of_one_id_are_refused_and_shown_and_a_restarted_one_is_not(rig: Rig) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -85,5 +86,5 @@ def _unclosed(records: Sequence[CaptureRecord]) -> list[str]:
 
 
 def _kind_of(reason: str | None) -> str:
-    """A reason without what differs from case to case."""
-    return (reason or "").split(":")[0].split(" (")[0][:70]
+    """A reason without what differs from case to case: its beginning, with "…" for words that have digits."""
+    return re.sub(r"\S*\d\S*", "…", (reason or "").split(":")[0].split(" (")[0])[:70]
