@@ -175,12 +175,9 @@ class RigLink:
     def wait_for_nodes(self, timeout: float) -> list[str]:
         """Wait until every expected node is alive, at most ``timeout`` seconds; ids of those that are not."""
         deadline = time.monotonic() + timeout
-        while True:
-            with self._lock:
-                absent = [camera for camera, node in self._nodes.items() if not node.alive]
-            if not absent or time.monotonic() >= deadline:
-                return absent
+        while len(alive := self._alive()) < len(self.cameras) and time.monotonic() < deadline:
             time.sleep(0.05)
+        return [camera for camera in self.cameras if camera not in alive]
 
     def preview(self, camera: str, timeout: float = 3.0) -> bytes | None:
         """The camera's newest frame as a small PGM (bytes); None if no answer comes within ``timeout`` seconds."""

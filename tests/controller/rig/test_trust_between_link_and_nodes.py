@@ -207,7 +207,7 @@ def test_an_image_that_the_nodes_release_cannot_read_is_told_and_delivered_by_th
     path.write_bytes(readable)
     rig.stop(rig.node("a"))
     rig.start("a")
-    assert until(lambda: capture.record().cameras["a"].status == "late")
+    assert until(lambda: capture.record().cameras["a"].status == "delivered-late")
 
 
 def test_two_nodes_of_one_id_are_refused_and_shown_and_a_restarted_one_is_not(rig: Rig) -> None:
