@@ -18,6 +18,7 @@ from ringdic_node.cameras.camera import CameraError, Shot
 from ringdic_node.clock import SystemClock, clock_offset
 from ringdic_node.config import ConfigError, NodeConfig, make_camera, read_node_config
 from ringdic_node.endpoint import EndpointError, endpoint_security, handshake_fault
+from ringdic_node.room import SpoolRoom
 from ringdic_node.spool import Spool
 
 DEFAULT_CONFIG = Path("/etc/ringdic/node.toml")
@@ -122,7 +123,9 @@ def _probe_spool(config: NodeConfig) -> tuple[bool, str]:
         spool = _spool_of(config)
     except OSError as error:
         return False, f"{config.spool} cannot be used: {error}"
-    return spool.free > 0, f"{config.spool}, {spool.free >> 20} MiB free, {len(spool.manifests())} images wait"
+    room = SpoolRoom(spool, config.id, config.arm_captures)
+    text = f"{config.spool}, {spool.free >> 20} MiB free, {len(room.waiting)} images wait"
+    return not room.obstacle(), "; ".join(part for part in (text, room.detail(0)) if part)
 
 
 def _probe_controller(config: NodeConfig) -> tuple[bool, str]:

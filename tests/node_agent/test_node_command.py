@@ -87,12 +87,15 @@ def test_shoot_writes_one_still_and_never_replaces_it(config, tmp_path, capsys):
     assert "exists already" in capsys.readouterr().err
 
 
-def test_check_names_what_is_missing(config, capsys):
+def test_check_names_what_is_missing(config, tmp_path, capsys):
+    (tmp_path / "spool").mkdir()
+    (tmp_path / "spool/s~0001-board~5.json").write_text('{"schema": 9, "type": "manifest"}')
     assert main(["check", "--config", str(config)]) == 3
     lines = {line.split()[1]: line for line in capsys.readouterr().out.splitlines()}
     assert set(lines) == {"camera", "clock", "spool", "controller"}
     assert lines["camera"].startswith("ok")
     assert lines["controller"].startswith("FAIL")
+    assert "1 images stay in the spool because they cannot be used, first s~0001-board~5.json" in lines["spool"]
 
 
 def test_a_node_needs_none_of_the_pc_packages():
