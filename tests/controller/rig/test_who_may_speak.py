@@ -364,12 +364,12 @@ def test_only_the_controller_arms_triggers_fetches_and_acknowledges(
     for key in (KEYS.node(VICTIM, "ack"), KEYS.node("*", "ack"), f"rig/{RIG}/**"):
         rogue.put(key, ack, congestion_control=zenoh.CongestionControl.BLOCK)
     say_and_wait(guarded, rogue)
-    assert victim == []
+    # The controller itself asks for status, clock and inventory from time to time.
+    assert not {"arm", "trigger", "fetch", "preview", "ack"} & set(victim)
     # The controller is heard, so the silence above says something.
     guarded.link.ask(VICTIM, Arm("s", "board", {}, "0" * 64, (VICTIM,)), print, 1.0)
     guarded.link._acknowledge(manifest_of(guarded, VICTIM), "archived")
     assert until(lambda: {"ack", "arm"} <= set(victim)), victim
-    assert not {"trigger", "fetch", "preview"} & set(victim), "the controller itself asks for clocks and inventories"
 
 
 def test_a_node_does_not_answer_for_another_nor_hear_what_is_not_for_it(
