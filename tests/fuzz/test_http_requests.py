@@ -27,7 +27,7 @@ from schemathesis import GenerationMode
 from schemathesis.schemas import APIOperation
 
 STAND_IN = Path(__file__).parents[1] / "controller" / "stand_in_processing.py"
-EXAMPLES = 5  # of each operation, in each mode
+EXAMPLES = 3  # of each operation, in each mode
 RAW = 60  # requests as bytes
 IMAGE = b"P5\n40 30\n255\n" + bytes(1200)
 # Names that exist, for parameters in paths: else all requests would end with 404.
@@ -84,8 +84,9 @@ def test_no_request_of_the_described_form_or_near_it_fails(
     faults: list[str] = []
     with requests.Session() as session:
         for operation in operations(served):
-            for mode in (GenerationMode.POSITIVE, GenerationMode.NEGATIVE):
-                _try(operation, mode, served, session, EXAMPLES * scale, statuses, faults)
+            _try(operation, GenerationMode.POSITIVE, served, session, EXAMPLES * scale, statuses, faults)
+            if operation.body or operation.query:  # any text is a name in a path: there is nothing else to negate
+                _try(operation, GenerationMode.NEGATIVE, served, session, EXAMPLES * scale, statuses, faults)
     assert faults == []
     assert statuses[200] > 0.1 * statuses.total(), "not everything ends with 404"
     figures("requests made from the OpenAPI document", str(statuses.total()), f"5xx: 0; {dict(statuses)}")
@@ -100,24 +101,28 @@ def _try(
     statuses: Counter[int],
     faults: list[str],
 ) -> None:
-    """Send requests of one operation, with names that exist for some of its parameters."""
-    strategy = operation.as_strategy(generation_mode=mode)
+    """Send requests of one operation, each as it is and with names that exist in its path."""
 
     @settings(
         max_examples=examples, database=None, deadline=None, derandomize=True, phases=[Phase.generate],
         suppress_health_check=list(HealthCheck),
     )  # fmt: skip
-    @given(case=strategy, real=st.fixed_dictionaries({name: st.sampled_from(names) for name, names in REAL.items()}),
-           replace=st.integers(0, 3))  # fmt: skip
-    def send(case: schemathesis.Case, real: dict[str, str], replace: int) -> None:
-        if replace and case.path_parameters:
-            case.path_parameters = {name: real.get(name, value) for name, value in case.path_parameters.items()}
-        answer = case.call(base_url=address, session=session, timeout=30)
-        statuses[answer.status_code] += 1
-        if answer.status_code >= 500:
-            faults.append(f"{answer.status_code} {case.as_curl_command()}: {answer.text[:200]}")
-        elif answer.status_code >= 400:
-            assert isinstance(json.loads(answer.content)["detail"], str)
+    @given(
+        case=operation.as_strategy(generation_mode=mode),
+        real=st.fixed_dictionaries({name: st.sampled_from(names) for name, names in REAL.items()}),
+    )
+    def send(case: schemathesis.Case, real: dict[str, str]) -> None:
+        for names in (
+            case.path_parameters,
+            {name: real.get(name, value) for name, value in case.path_parameters.items()},
+        ):
+            case.path_parameters = names
+            answer = case.call(base_url=address, session=session, timeout=30)
+            statuses[answer.status_code] += 1
+            if answer.status_code >= 500:
+                faults.append(f"{answer.status_code} {case.as_curl_command()}: {answer.text[:200]}")
+            elif answer.status_code >= 400:
+                assert isinstance(json.loads(answer.content)["detail"], str)
 
     with suppress(Unsatisfiable):  # there is nothing to negate
         send()
