@@ -28,6 +28,8 @@ from ringdic.results.unmeasured import UnmeasuredPlaces
 from ringdic.session.json_text import parse_json
 from ringdic.strain.rigid_motion import RigidMotion
 
+_DEEPEST = 8  # groups within groups; a results file has three
+
 
 def read_results(path: Path, matches: bool = True) -> Results:
     """Read all results in a file; fields are not read, since they follow from the positions.
@@ -178,7 +180,16 @@ def _open(path: Path) -> Iterator[h5py.File]:
             yield file
         except InputError:
             raise
-        except (LookupError, ValueError, TypeError, AttributeError, OSError, RuntimeError, MemoryError) as error:
+        except (
+            LookupError,
+            ValueError,
+            TypeError,
+            AttributeError,
+            OSError,
+            RuntimeError,
+            SystemError,
+            MemoryError,
+        ) as error:
             raise InputError(f"{path}: the results are damaged ({error}); process the session again") from error
 
 
@@ -186,15 +197,26 @@ def _open(path: Path) -> Iterator[h5py.File]:
 def _check_that_it_stands_alone(path: Path, _changed_ns: int, _size: int) -> None:
     """Refuse a file whose data lie in other files, which HDF5 would read whatever they are. Nothing of ours does so."""
 
-    def elsewhere(name: str, link: object) -> str | None:
-        item = file[name] if isinstance(link, h5py.HardLink) else link
-        apart = isinstance(item, h5py.Dataset) and (item.is_virtual or item.external)
-        return name if apart or isinstance(item, h5py.ExternalLink) else None
-
     with h5py.File(path, "r") as file:
-        name = file.visititems_links(elsewhere)  # the first of which it returns something
-    if name is not None:
-        raise InputError(f"{path}: '{name}' lies in another file, as no results of RingDIC do; it is not read")
+        for name, item in _links_of(file, ""):
+            apart = isinstance(item, h5py.Dataset) and (item.is_virtual or item.external)
+            if apart or isinstance(item, h5py.ExternalLink):
+                raise InputError(f"{path}: '{name}' lies in another file, as no results of RingDIC do; it is not read")
+
+
+def _links_of(group: h5py.Group, prefix: str, depth: int = 0) -> Iterator[tuple[str, object]]:
+    """Names of everything in a group and below, with the datasets, and the links to elsewhere in place of their ends.
+
+    h5py's own walk ends with an error of the interpreter in a damaged file.
+    """
+    if depth > _DEEPEST:
+        raise InputError(f"{prefix}: groups within groups, as no results of RingDIC have; process the session again")
+    for name in group:
+        link = group.get(name, getlink=True)
+        item = group[name] if isinstance(link, h5py.HardLink) else link
+        yield f"{prefix}{name}", item
+        if isinstance(item, h5py.Group):
+            yield from _links_of(item, f"{prefix}{name}/", depth + 1)
 
 
 def _check_schema(path: Path, file: h5py.File) -> None:
