@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import random
 import time
@@ -13,6 +14,8 @@ import cv2
 import numpy as np
 import pytest
 from ringdic.errors import InputError
+from ringdic.results.reader import read_field, read_mesh, read_positions, read_summary, read_unmeasured
+from ringdic.results.writer import write_results
 from ringdic.session.images import read_gray
 from ringdic.session.json_text import read_json
 from ringdic.session.records import (
@@ -46,6 +49,7 @@ from ringdic_node.wire import (
 )
 from starlette.datastructures import Headers
 
+STAND_IN = Path(__file__).parents[1] / "controller" / "stand_in_processing.py"
 LONGEST = 5.0  # seconds that one input may take on a loaded machine
 
 HASH, KEY = "a" * 64, CaptureKey("limb", "0001-board", 1_700_000_000_000_000_000)
@@ -123,6 +127,29 @@ def showable(value: object) -> None:
     json.dumps(value, allow_nan=False).encode()
 
 
+def every_array(path: Path) -> None:
+    read_summary(path)
+    read_mesh(path)
+    read_positions(path, 1, rigid_motion_removed=True)
+    read_field(path, "lambda1", 1)
+    read_unmeasured(path)
+
+
+def seeds_of(name: str, folder: Path, rig: str) -> list[bytes]:
+    """Valid inputs of a target."""
+    if name == "rig.toml":
+        return [rig.encode()]
+    if name != "results.h5":
+        return TARGETS[name].seeds
+    spec = importlib.util.spec_from_file_location("stand_in", STAND_IN)
+    assert spec is not None
+    assert spec.loader is not None
+    stand_in = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(stand_in)
+    write_results(folder / "results.h5", stand_in.tube(("0003-specimen", "0004-specimen")))
+    return [(folder / "results.h5").read_bytes()]
+
+
 def guarded(path: Path) -> None:
     lines = path.read_bytes().split(b"\n")
     names = (b"host", b"origin", b"referer", b"sec-fetch-site")
@@ -151,6 +178,7 @@ TARGETS = {
     "controller.toml": Target([CONTROLLER], read_controller_config, share=0.3),
     "node.toml": Target([NODE], read_node_config, (ConfigError,)),
     "images": Target(IMAGES, read_gray),
+    "results.h5": Target([], every_array, share=0.02),
     "headers of requests": Target([b"127.0.0.1:8000\nhttp://127.0.0.1:8000\nhttp://a/b\nnone"], guarded, ()),
 }
 INPUTS = 100  # of a target of share 1
@@ -178,7 +206,7 @@ def spoilt(random_: random.Random, seeds: list[bytes]) -> bytes:
                 content[at:] = other[random_.randrange(len(other) + 1) :]
             case _:
                 del content[at:]
-        content = content[:200_000]
+        content = content[:1_000_000]
     return bytes(content)
 
 
@@ -187,7 +215,7 @@ def test_every_input_is_read_or_refused(
     tmp_path: Path, rig_toml: Callable[..., str], name: str, scale: int, seed: int
 ) -> None:
     target = TARGETS[name]
-    seeds = target.seeds or [rig_toml("ring", ("01", "02")).encode()]
+    seeds = seeds_of(name, tmp_path, rig_toml("ring", ("01", "02")))
     random_, path = random.Random(f"{seed} {name}"), tmp_path / "input"
     count = round(INPUTS * target.share * scale)
     longest = 0.0

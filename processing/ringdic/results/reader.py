@@ -28,6 +28,8 @@ from ringdic.results.unmeasured import UnmeasuredPlaces
 from ringdic.session.json_text import parse_json
 from ringdic.strain.rigid_motion import RigidMotion
 
+# What h5py and numpy raise for a file whose parts are damaged or missing.
+_DAMAGE = (LookupError, ValueError, TypeError, AttributeError, OSError, RuntimeError, SystemError, MemoryError)
 _DEEPEST = 8  # groups within groups; a results file has three
 
 
@@ -180,16 +182,7 @@ def _open(path: Path) -> Iterator[h5py.File]:
             yield file
         except InputError:
             raise
-        except (
-            LookupError,
-            ValueError,
-            TypeError,
-            AttributeError,
-            OSError,
-            RuntimeError,
-            SystemError,
-            MemoryError,
-        ) as error:
+        except _DAMAGE as error:
             raise InputError(f"{path}: the results are damaged ({error}); process the session again") from error
 
 
