@@ -17,6 +17,7 @@ import requests
 import schemathesis
 import uvicorn
 from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import seed as hypothesis_seed
 from hypothesis import strategies as st
 from hypothesis.errors import Unsatisfiable
 from ringdic.results.writer import write_results
@@ -78,15 +79,15 @@ def operations(address: str) -> list[APIOperation]:
 
 
 def test_no_request_of_the_described_form_or_near_it_fails(
-    served: str, scale: int, figures: Callable[[str, str, str], None]
+    served: str, scale: int, seed: int, figures: Callable[[str, str, str], None]
 ) -> None:
     statuses: Counter[int] = Counter()
     faults: list[str] = []
     with requests.Session() as session:
         for operation in operations(served):
-            _try(operation, GenerationMode.POSITIVE, served, session, EXAMPLES * scale, statuses, faults)
+            _try(operation, GenerationMode.POSITIVE, served, session, EXAMPLES * scale, seed, statuses, faults)
             if operation.body or operation.query:  # any text is a name in a path: there is nothing else to negate
-                _try(operation, GenerationMode.NEGATIVE, served, session, EXAMPLES * scale, statuses, faults)
+                _try(operation, GenerationMode.NEGATIVE, served, session, EXAMPLES * scale, seed, statuses, faults)
     assert faults == []
     assert statuses[200] > 0.1 * statuses.total(), "not everything ends with 404"
     figures("requests made from the OpenAPI document", str(statuses.total()), f"5xx: 0; {dict(statuses)}")
@@ -98,15 +99,17 @@ def _try(
     address: str,
     session: requests.Session,
     examples: int,
+    seed: int,
     statuses: Counter[int],
     faults: list[str],
 ) -> None:
     """Send requests of one operation, each as it is and with names that exist in its path."""
 
     @settings(
-        max_examples=examples, database=None, deadline=None, derandomize=True, phases=[Phase.generate],
+        max_examples=examples, database=None, deadline=None, phases=[Phase.generate],
         suppress_health_check=list(HealthCheck),
     )  # fmt: skip
+    @hypothesis_seed(seed)
     @given(
         case=operation.as_strategy(generation_mode=mode),
         real=st.fixed_dictionaries({name: st.sampled_from(names) for name, names in REAL.items()}),
