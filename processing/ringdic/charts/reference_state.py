@@ -16,8 +16,6 @@ from ringdic.charts.sharpness import edge_width
 from ringdic.correlation.repetition import find_repetition
 from ringdic.findings import Finding
 
-#: Names of the arrays that a reference state is stored as.
-REFERENCE_STATE = ("image_state", "speckle", "edge", "certain", "sized", "digest", "repetition")
 _KNOWN = 0.3  # of the textured places have a depth: with fewer, all textured places are looked at, background too
 _FEWEST = 12  # places with a depth, from which the size of the speckles is known
 _MOST = 0.6  # of these that must repeat: lamps in the background do

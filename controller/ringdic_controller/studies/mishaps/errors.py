@@ -7,10 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from ringdic.results.results import Results
+from ringdic_node.virtual_rig.lens import VirtualCamera
 from ringdic_node.virtual_rig.scenes import SolidSpecimen
 
+from ringdic_controller.studies.gallery.sample import SurfaceSample
 from ringdic_controller.studies.solid_errors import SolidErrors, Spread, StatedSpreads, rms
 
+_SAMPLE, _HARDLY = 5000, 0.01  # points of the whole surface, and share of them that is hardly anything
 SPREAD, BEYOND = 1.5, 1e-3  # what stated σ must keep: errors over σ (robust), share beyond 5 σ
 
 
@@ -53,6 +56,22 @@ def run_errors(results: Results, specimens: Sequence[SolidSpecimen]) -> RunError
         spread=spreads.displacement.robust,
         spreads=spreads,
     )
+
+
+def uncovered_shares(
+    results: Results, specimens: Sequence[SolidSpecimen], cameras: Sequence[VirtualCamera]
+) -> dict[str, float]:
+    """Share of the true surface that is not covered, 0 to 1, of what each camera and a second one see below 60°, by id.
+
+    specimens : the body at each step. cameras : all of them. The share is 1 for a camera that sees hardly anything
+    together with another; that of what any two cameras see has the id "".
+    """
+    sample = SurfaceSample.of(specimens[0], specimens[-1], cameras, _SAMPLE)
+    uncovered = ~sample.covered(results.vertices_ref, results.faces)
+    shares = {"": float(uncovered.mean()) if len(uncovered) else 1.0}
+    for camera, seen in zip(cameras, specimens[0].visible(cameras, sample.points, sample.normals), strict=True):
+        shares[camera.id] = float(uncovered[seen].mean()) if seen.sum() > _HARDLY * _SAMPLE else 1.0
+    return shares
 
 
 def _beyond(*spreads: Spread) -> float:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
@@ -14,6 +14,8 @@ FOLLOWED = 3.0  # times the errors of the calm row
 WRONG_SHARE, BEYOND_SHARE = 1e-3, 1e-3  # of the values: wrong by more than 1 mm, beyond 5 σ
 #: Codes of findings that say what is missing and list all that may help: they name no mishap by a word.
 LOSSES = ("area-unmeasured", "step-unmeasured")
+#: Codes of findings on what is not measured, which are no alarms in a calm row where the truth bears them out.
+NOT_MEASURED, UNCOVERED = ("area-unmeasured", "camera-unmatched"), 0.03
 COVERED = 0.9  # of the points that the calm row measures
 
 
@@ -44,6 +46,7 @@ class RunRecord:
 
     errors : against the truth, None where nothing was measured. findings : as JSON objects. steps : names of the
     captures of the specimen. refusal : the sentence by which it was refused. fault : whether the program failed.
+    uncovered : shares of the true surface that are not covered, by camera, and by "" of all, where they were asked for.
     """
 
     steps: tuple[str, ...]
@@ -52,6 +55,7 @@ class RunRecord:
     refusal: str = ""
     fault: bool = False
     verdict: str = ""
+    uncovered: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,7 @@ def judged_mishap(row: MishapRow, run: RunRecord, calm: RunRecord | None) -> Mis
     usual = () if calm is None or row.name == row.calm.name else calm.findings
     news = [each for each in run.findings if not _among(each, usual)]
     if row.expected is None:
-        return _judged_calm(row, run.errors, news, faults)
+        return _judged_calm(row, run, news, faults)
     naming = naming_findings(row.expected, news, run.steps)
     others = [each for each in news if each not in naming]
     codes = _codes(naming), _codes(others)
@@ -149,20 +153,32 @@ def _judged_refusal(row: MishapRow, run: RunRecord) -> MishapJudgement:
 
 
 def _judged_calm(
-    row: MishapRow, errors: RunErrors, findings: Sequence[dict[str, Any]], faults: Sequence[str]
+    row: MishapRow, run: RunRecord, findings: Sequence[dict[str, Any]], faults: Sequence[str]
 ) -> MishapJudgement:
-    """A calm row is measured without a word, as well as the calmest or within the stated σ."""
-    alarms = [
+    """A calm row is measured without a word but true ones, as well as the calmest or within the stated σ."""
+    assert run.errors is not None
+    wrong = [
         each for each in findings if not (row.tolerated and _has_word(row.tolerated, (each["code"], each["sentence"])))
     ]
+    alarms = [each for each in wrong if not _is_true(each, run)]
     if alarms:
         return MishapJudgement(Outcome.ALARM, "; ".join(each["sentence"] for each in alarms), others=_codes(alarms))
-    if row.calm.name == row.name and errors.wrong > WRONG_SHARE:
-        return MishapJudgement(Outcome.SILENT, f"{100 * errors.wrong:.1f} % of the points are off by more than 1 mm")
+    if row.calm.name == row.name and run.errors.wrong > WRONG_SHARE:
+        share = 100 * run.errors.wrong
+        return MishapJudgement(Outcome.SILENT, f"{share:.1f} % of the points are off by more than 1 mm")
     lost = any(fault.startswith("lost") for fault in faults)
-    if faults and (lost or not errors.holds_in_sigma):
+    if faults and (lost or not run.errors.holds_in_sigma):
         return MishapJudgement(Outcome.SILENT, "; ".join(faults))
+    if wrong:
+        reason = f"{100 * run.uncovered['']:.0f} % of what two cameras see are not covered"
+        return MishapJudgement(Outcome.LESS, reason, others=_codes(wrong))
     return MishapJudgement(Outcome.CALM, "; ".join(faults))
+
+
+def _is_true(finding: dict[str, Any], run: RunRecord) -> bool:
+    """Whether something was not measured, as a finding says, of what these cameras, or any two, see of the surface."""
+    concerned = finding["cameras"] or [""]
+    return finding["code"] in NOT_MEASURED and all(run.uncovered.get(id_, 0.0) > UNCOVERED for id_ in concerned)
 
 
 def _has_word(words: Sequence[str], texts: Iterable[str]) -> bool:

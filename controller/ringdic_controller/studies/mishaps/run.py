@@ -11,9 +11,10 @@ from ringdic.cli.console import say, show_table
 from ringdic.progress import Report
 from ringdic.settings import Settings
 
+from ringdic_controller.studies.gallery.rows import gallery_rig
 from ringdic_controller.studies.mishaps.catalogue import all_rows
-from ringdic_controller.studies.mishaps.errors import run_errors
-from ringdic_controller.studies.mishaps.judgement import RunRecord, judged_mishap
+from ringdic_controller.studies.mishaps.errors import run_errors, uncovered_shares
+from ringdic_controller.studies.mishaps.judgement import NOT_MEASURED, RunRecord, judged_mishap
 from ringdic_controller.studies.mishaps.measurement import Captures
 from ringdic_controller.studies.mishaps.rows import MishapRow, selected_rows
 from ringdic_controller.studies.mishaps.tables import AIMS, MishapEntry, outcome_counts, write_mishaps
@@ -83,8 +84,12 @@ class _Mishaps(RowStudy[MishapRow, MishapEntry]):
         if run.results is None:
             return RunRecord((), refusal=run.refusal, fault=run.fault), run.seconds
         steps, summary = run.results.steps, run.results.summary
-        errors = run_errors(run.results, row.specimens[: len(steps)])
-        return RunRecord(steps, errors, tuple(summary["findings"]), verdict=summary["verdict"]), run.seconds
+        errors, findings = run_errors(run.results, row.specimens[: len(steps)]), tuple(summary["findings"])
+        uncovered: dict[str, float] = {}
+        if row.expected is None and any(each["code"] in NOT_MEASURED for each in findings):
+            uncovered = uncovered_shares(run.results, row.specimens, gallery_rig(row.rig, self.scale, row.seed).cameras)
+        record = RunRecord(steps, errors, findings, verdict=summary["verdict"], uncovered=uncovered)
+        return record, run.seconds
 
     def _session(self, row: MishapRow) -> Path:
         """The session of a row; the stored calibration of its calm row goes with it, and is used where it fits."""

@@ -7,7 +7,7 @@ import pytest
 from ringdic.geometry.camera import Camera
 from ringdic.results.results import Results
 from ringdic_controller.studies.gallery.rows import MODERATE, gallery_rig
-from ringdic_controller.studies.mishaps.errors import run_errors
+from ringdic_controller.studies.mishaps.errors import run_errors, uncovered_shares
 from ringdic_controller.studies.mishaps.measurement import SHARES, motion_share, moving_specimens
 from ringdic_node.virtual_rig.bodies import upright_column
 from ringdic_node.virtual_rig.scenes import SolidSpecimen
@@ -58,6 +58,19 @@ def test_wrong_points_count_wherever_they_are_wrong_and_lost_ones_nowhere() -> N
     assert errors.measured == (4200, 4100, 4200)
     assert errors.shape_mm == pytest.approx(1.5 * np.sqrt(42 / 4200), rel=1e-6)
     assert not errors.holds_in_sigma  # 1 % of the points 75 σ off
+
+
+def test_what_is_not_covered_is_told_of_all_and_of_each_camera() -> None:
+    results, cameras = exact(), gallery_rig("arc4", 0.1).cameras
+    whole = uncovered_shares(results, SPECIMENS, cameras)
+    low = results.vertices_ref[results.faces, 2].max(axis=1) < 125.0
+    half = replace(results, faces=results.faces[low], pair=results.pair[low], sigma_lambda=None)
+    lower = uncovered_shares(half, SPECIMENS, cameras)
+    assert whole.keys() == lower.keys() == {"", *(camera.id for camera in cameras)}
+    for id_ in whole:
+        assert whole[id_] < 0.15  # the ends of the wall
+        assert 0.4 < lower[id_] < 0.7
+    assert uncovered_shares(results, SPECIMENS, cameras[:1]) == {"": 1.0, cameras[0].id: 1.0}
 
 
 @pytest.mark.parametrize(("factor", "holds"), [(1.0, True), (2.0, False)])

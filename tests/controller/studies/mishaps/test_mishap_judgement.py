@@ -67,6 +67,20 @@ def test_outcomes(row: MishapRow, errors: RunErrors, findings: list[Any], outcom
     assert judged_mishap(row, RunRecord(STEPS, errors, tuple(findings)), CALM).outcome is outcome
 
 
+def test_what_a_calm_row_says_of_unmeasured_surface_is_no_alarm_where_it_is_true() -> None:
+    said = (finding("area-unmeasured"), finding("camera-unmatched", cameras=("cam_02",)))
+    for uncovered, outcome in (
+        ({"": 0.1, "cam_02": 1.0}, Outcome.LESS),
+        ({"": 0.1, "cam_02": 0.01}, Outcome.ALARM),  # the camera sees what is covered
+        ({"": 0.01, "cam_02": 1.0}, Outcome.ALARM),
+        ({}, Outcome.ALARM),
+    ):
+        run = RunRecord(STEPS, GOOD, said, uncovered=uncovered)
+        assert judged_mishap(calm_row("arc4"), run, run).outcome is outcome
+    moved = RunRecord(STEPS, GOOD, (*said, finding(cameras=("cam_02",))), uncovered={"": 0.1, "cam_02": 1.0})
+    assert judged_mishap(calm_row("arc4"), moved, moved).outcome is Outcome.ALARM
+
+
 def test_a_wrong_result_with_five_sigma_outliers_is_not_within_sigma() -> None:
     outliers = replace(LARGER, beyond=0.002)
     assert judged_mishap(BUMP, RunRecord(STEPS, outliers), CALM).outcome is Outcome.SILENT
