@@ -38,6 +38,7 @@ _SPECKLES = 8.0  # half widths of the peak at zero, over which they are for the 
 _LEAST = 0.5  # standard deviation of such an image where there is a pattern
 _COVERED = 0.6  # of a window, that must lie in the region
 _FINE = 3.0  # px, half width of the peak at zero from which on the image is reduced by a half
+_MIDDLE = 1024  # px, side of the square in the middle by which this is decided
 _ROWS = 4  # every so many rows are enough for that half width
 
 Levels = NDArray[np.float32]
@@ -95,14 +96,17 @@ def find_repetition(image: Image, xy: Pixels, radius: int, region: Mask | None =
     image : (height, width) grey levels. xy : (n, 2) px, points that are matched. radius : px, of the subset. region :
     (height, width) bool, what belongs to the pattern; None for the whole image.
     """
-    grey = as_8_bit(image).astype(np.float32)
-    inside = np.ones(grey.shape, np.float32) if region is None else region.astype(np.float32)
+    corner, part = _extent(image.shape, region)
+    grey = as_8_bit(image[part]).astype(np.float32)
+    inside = np.ones(grey.shape, np.float32) if region is None else region[part].astype(np.float32)
     factor, even = 1, max(4 * radius, _LEVELLED)
-    narrow, wide = _half_widths(_levelled(grey, inside, even))
-    while narrow > _FINE and min(grey.shape) > 4 * _LEVELLED:
+    while min(grey.shape) > 4 * _LEVELLED:
+        middle = tuple(slice(max(0, side - _MIDDLE) // 2, (side + _MIDDLE) // 2) for side in grey.shape)
+        if _half_widths(_levelled(grey[middle], inside[middle], even // factor))[0] <= _FINE:
+            break
         grey, inside = _halved(grey), _halved(inside)
         factor *= 2
-        narrow, wide = _half_widths(_levelled(grey, inside, even // factor))
+    narrow, wide = _half_widths(_levelled(grey, inside, even // factor))
     level = _levelled(grey, inside, round(_SPECKLES * narrow))  # where an edge counts as little as the speckles
     # Area of the squared peak at zero, as of a normal distribution: the number of independent places of a window is its
     # area over this. A much longer peak is that of stripes.
@@ -111,15 +115,30 @@ def find_repetition(image: Image, xy: Pixels, radius: int, region: Mask | None =
     half = min(math.ceil(wanted), min(grey.shape) // 4)
     limit = _LIKENESS * max(wanted / half, 1.0)  # in a small image windows are smaller than wanted, and chance larger
     usable = _usable(level, inside, half)
-    found = []
-    for point in xy[even_sample(xy, _WINDOWS)]:
-        x, y = np.rint((point + 0.5) / factor - 0.5).astype(int)
-        one = _second_peak(level, usable, int(x), int(y), half, _REACH // factor)
-        if one is not None:
-            found.append((*point, one[0], *(factor * lag for lag in one[1:])))
-    rows = np.array(found, dtype=np.float64).reshape(-1, 5)
+    windows = xy[even_sample(xy, _WINDOWS)]
+    rows = np.zeros((0, 5))
+    for some in (windows[::2], windows[1::2]):
+        found = [rows]
+        for point in some:
+            x, y = np.rint((point - corner + 0.5) / factor - 0.5).astype(int)
+            one = _second_peak(level, usable, int(x), int(y), half, _REACH // factor)
+            if one is not None:
+                found.append(np.array([[*point, one[0], factor * one[1], factor * one[2]]]))
+        rows = np.concatenate(found)
+        if len(rows) >= _FEWEST and not (rows[:, 2] >= limit).any():  # no need to look at the others
+            break
     speckle = 2.0 * factor * math.sqrt(narrow * wide)
     return Repetition(rows[:, :2], rows[:, 2], rows[:, 3:], rows[:, 2] >= limit, speckle)
+
+
+def _extent(shape: tuple[int, ...], region: Mask | None) -> tuple[Pixels, tuple[slice, slice]]:
+    """First pixel (2,) of the smallest part of an image of a shape that holds a region, and this part as slices."""
+    whole = slice(0, shape[0]), slice(0, shape[1])
+    if region is None or not region.any():
+        return np.zeros(2), whole
+    rows, columns = (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))
+    corner = np.array([columns[0], rows[0]], dtype=np.float64)
+    return corner, (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
 
 
 def _levelled(grey: Levels, inside: Levels, side: int) -> Levels:
