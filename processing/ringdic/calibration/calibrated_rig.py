@@ -33,6 +33,7 @@ from ringdic.calibration.quality import (
     camera_quality,
     pair_quality,
 )
+from ringdic.compiled import source_digest
 from ringdic.errors import ComputationError, InputError
 from ringdic.findings import Finding
 from ringdic.session.folder import Capture, Session
@@ -104,8 +105,7 @@ def calibrate_rig(
             keys.append(key)
             done += 1
             progress(done / len(taking_part), f"camera {id_}")
-    distances = {each.id: each.distance_mm for each in session.rig.cameras if each.distance_mm is not None}
-    findings = (*findings, *contradictions(calibrated, session.rig.target, _expected(settings), distances))
+    findings = (*findings, *_contradictions(session, calibrated, keys, settings))
     if settings.method == "dlt":
         return _with_quality(session.rig, CalibratedRig(session.rig.target, calibrated, findings))
     progress(1.0, "all cameras together")
@@ -142,6 +142,26 @@ def _with_true_azimuths(
     azimuths = values["azimuths"]
     entries = (replace(c, azimuth_deg=azimuths.get(c.id, c.azimuth_deg)) for c in session.rig.cameras)
     return replace(session.rig, cameras=tuple(entries)), tuple(map(Finding.from_json, values["findings"]))
+
+
+def _contradictions(
+    session: Session, calibrated: dict[str, CameraCalibration], keys: list[str], settings: CalibrationGroup
+) -> tuple[Finding, ...]:
+    """What contradicts in the cameras' single calibrations; stored in the session's folder, and read from there again.
+
+    keys : of the single calibrations.
+    """
+    target, expected = session.rig.target, _expected(settings)
+    distances = {each.id: each.distance_mm for each in session.rig.cameras if each.distance_mm is not None}
+    # Another version of the program may find others.
+    digest = hashlib.sha256(f"{source_digest()} {keys} {target} {expected} {distances}".encode()).hexdigest()[:16]
+    path = session.path / "calibration" / f"contradictions-{digest}.json"
+    values = _stored(path)
+    if values is None:
+        found = contradictions(calibrated, target, expected, distances)
+        values = {"findings": [each.to_json() for each in found]}
+        _store(path, values)
+    return tuple(map(Finding.from_json, values["findings"]))
 
 
 def _with_quality(rig: Rig, ring: CalibratedRig) -> CalibratedRig:

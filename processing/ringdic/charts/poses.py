@@ -11,13 +11,17 @@ from numpy.typing import NDArray
 
 from ringdic.arrays import Floats, Indices, Pixels
 from ringdic.calibration.moved_cameras import CameraMotions, find_moved_cameras, still_cameras
+from ringdic.calibration.parameters import LENS, CameraParameters, projection_jacobians
 from ringdic.charts.chart import Chart
 from ringdic.errors import ComputationError
 from ringdic.geometry.camera import Camera
+from ringdic.geometry.triangulation import triangulate
 
 _MOST = 3000  # points of each chart that are used
 _SIGMA = 0.1  # px, largest standard deviation of a match that is used
 _FEATURE_SIGMA = 0.5  # px, of a feature
+_FEW = 500  # points that tell how far a pose's uncertainty moves the image
+_EXPLAINED = 2.0  # standard deviations of the calibration, within which a shift of an image is no camera's motion
 _FLOOR = 0.005  # px, of a match due to errors of the shape that warps are held at
 
 
@@ -40,9 +44,30 @@ def poses_of_charts(
         return still_cameras(cameras)
     px, sigma = (np.concatenate(parts, axis=1) for parts in zip(*observed, strict=True))
     try:
-        return find_moved_cameras(cameras, px, sigma, covariance)
+        motions = find_moved_cameras(cameras, px, sigma, covariance)
     except ComputationError:  # too few points to say
         return still_cameras(cameras)
+    within = covariance is not None and motions.moved.any() and is_within_calibration(motions, px, covariance)
+    return still_cameras(cameras) if within else motions
+
+
+def is_within_calibration(motions: CameraMotions, px: Pixels, covariance: Floats) -> bool:
+    """Whether the calibration's own uncertainty explains all motions: no camera need have moved.
+
+    The cameras' points may fix a pose better than the calibration did, above all along a plane. px : (C, n, 2) px, of
+    the points. covariance : (C, 6, 6) of the calibrated poses, rad and mm.
+    """
+    seen = np.isfinite(px).all(axis=2)
+    shared = np.flatnonzero(seen.sum(axis=0) >= 2)
+    some = shared[:: max(1, len(shared) // _FEW)]
+    xyz = triangulate(motions.cameras, px[:, some])
+    for c in np.flatnonzero(motions.moved):
+        at = xyz[seen[c, some] & np.isfinite(xyz).all(axis=1)]
+        slopes = projection_jacobians(CameraParameters.of(motions.cameras[c]), at)[1][:, :, LENS:]
+        variance = np.einsum("nri,ij,nrj->n", slopes, covariance[c], slopes)
+        if not len(at) or motions.effect[c] > _EXPLAINED * np.sqrt(variance.mean()):
+            return False
+    return True
 
 
 def motions_as_arrays(motions: CameraMotions) -> dict[str, NDArray]:
