@@ -29,6 +29,7 @@ _HARDLY = 0.1  # of the points of a step
 _COARSE = 0.42  # of a subset's width, from which on speckles are too large for it: it holds hardly two
 _SOFT = 1.8  # px, edges of a pattern that is out of focus; in focus they are 1.2 to 1.4
 _SOFTER = 1.3  # times as wide as those of the target
+_SOFTER_THAN_OTHERS = 1.15  # times as wide as those of the other cameras: by a blur of 0.7 px
 _FINE = 1.7  # px, below which pixels do not resolve speckles
 
 
@@ -117,9 +118,11 @@ class RunImages:
         # A stretch of the surface widens the reference's own blur too: the least stretched step counts.
         blur, limit, beside = -max(later, default=0.0), _BLUR_OF_REFERENCE, "its later images"
         if not blur > limit:
-            sizes = [one.speckle for one in self.references if one.certain]
-            own = self.references[c].speckle if self.references[c].certain else 0.0
-            excess = own**2 - float(np.median(sizes)) ** 2 if sizes else 0.0
+            known, own = [one for one in self.references if one.certain], self.references[c]
+            excess = own.speckle**2 - float(np.median([one.speckle for one in known])) ** 2 if own.certain else 0.0
+            # Speckles may be larger, or an edge of the body among them: a blur makes their edges wider too.
+            if known and own.edge < _SOFTER_THAN_OTHERS * float(np.median([one.edge for one in known])):
+                excess = 0.0
             blur, limit = float(np.sqrt(max(excess, 0.0) / _WIDTH)), _BLUR_OF_CAMERA
             beside = "those of the other cameras"
         if blur > limit:

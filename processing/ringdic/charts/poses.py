@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ringdic.arrays import Floats, Indices, Pixels
+from ringdic.arrays import Floats, Indices, Mask, Pixels
 from ringdic.calibration.moved_cameras import CameraMotions, find_moved_cameras, still_cameras
 from ringdic.calibration.parameters import LENS, CameraParameters, projection_jacobians
 from ringdic.charts.chart import Chart
@@ -57,7 +57,7 @@ def is_within_calibration(motions: CameraMotions, px: Pixels, covariance: Floats
     The cameras' points may fix a pose better than the calibration did, above all along a plane. px : (C, n, 2) px, of
     the points. covariance : (C, 6, 6) of the calibrated poses, rad and mm.
     """
-    seen = np.isfinite(px).all(axis=2)
+    seen: Mask = np.asarray(np.isfinite(px).all(axis=2))
     shared = np.flatnonzero(seen.sum(axis=0) >= 2)
     some = shared[:: max(1, len(shared) // _FEW)]
     xyz = triangulate(motions.cameras, px[:, some])

@@ -61,12 +61,14 @@ def test_a_reference_that_is_more_blurred_than_all_later_images_is_named_once() 
 
 def test_a_camera_out_of_focus_is_known_by_its_speckles() -> None:
     """A blur of σ px makes the autocorrelation of a normal pattern wider by 16 ln 2 σ² in its square."""
-    blurred = replace(REFERENCES[1], speckle=float(np.sqrt(16.0 + 16.0 * np.log(2.0) * 1.5**2)))
+    wide = float(np.sqrt(16.0 + 16.0 * np.log(2.0) * 1.5**2))
+    blurred = replace(REFERENCES[1], speckle=wide, edge=2.0)
     finding = only(replace(run_images(), references=(REFERENCES[0], blurred, REFERENCES[2])))
     assert (finding.code, finding.cameras, finding.step) == ("image-blurred", ("2",), STEPS[0])
     assert finding.value == pytest.approx(1.5, abs=0.01)
-    further = replace(REFERENCES[1], speckle=4.4)
-    assert replace(run_images(), references=(REFERENCES[0], further, REFERENCES[2])).findings() == []
+    further, sharp = replace(REFERENCES[1], speckle=4.4), replace(REFERENCES[1], speckle=wide, edge=1.35)
+    for other in (further, sharp):  # larger speckles with edges as sharp as the others' are no blur
+        assert replace(run_images(), references=(REFERENCES[0], other, REFERENCES[2])).findings() == []
 
 
 def test_cameras_that_are_all_out_of_focus_are_named_unless_the_target_is_no_sharper() -> None:
