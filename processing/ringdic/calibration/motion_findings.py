@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ringdic.calibration.moved_cameras import MOTION, MOVED_PX, UNEXPLAINED, CameraMotions
+from ringdic.calibration.moved_cameras import ADRIFT_PX, MOTION, MOVED_PX, UNEXPLAINED, CameraMotions
 from ringdic.calibration.parameters import POSE
 from ringdic.findings import Finding
 
@@ -49,8 +49,10 @@ def motion_findings(motions: Mapping[int, CameraMotions], steps: Sequence[str]) 
     """
     findings = [] if 0 not in motions else _since_calibration(motions[0], steps[0])
     later = {step: one for step, one in motions.items() if step and one.moved.any()}
-    unknown = [step for step, one in later.items() if one.unexplained]
-    findings += [_unknown(later[step], steps[step], "since the reference") for step in unknown]
+    unknown = [step for step, one in later.items() if one.unexplained or one.adrift]
+    for step in unknown:
+        say = _unknown if later[step].unexplained else _adrift
+        findings.append(say(later[step], steps[step], "since the reference"))
     known = {step: one for step, one in later.items() if step not in unknown}
     for step in [step for step, one in known.items() if _all_refocused(one)]:
         findings.append(_lenses(known.pop(step), steps[step], f"since the reference in {steps[step]}"))
@@ -82,9 +84,11 @@ def _since_calibration(motions: CameraMotions, reference: str) -> list[Finding]:
     """Findings on cameras that moved between the calibration and the reference."""
     if not motions.moved.any():
         return []
-    if motions.unexplained:
-        return [_unknown(motions, reference, "between the calibration and the reference")]
     when = "between the calibration and the reference"
+    if motions.unexplained:
+        return [_unknown(motions, reference, when)]
+    if motions.adrift:
+        return [_adrift(motions, reference, when)]
     if _all_refocused(motions):
         return [_lenses(motions, reference, when)]
     return [_followed(motions, int(c), reference, when) for c in np.flatnonzero(motions.moved)]
@@ -121,7 +125,7 @@ def _lenses(motions: CameraMotions, step: str, when: str) -> Finding:
     doubt = 100.0 * float(np.sqrt(np.mean(motions.covariance[np.ix_(at, at)])))
     sentence = (
         f"the lenses of all cameras were refocused {when}: their focal lengths changed by {changes}. Images tell the "
-        f"mean of these, and with it the size of the specimen, to {doubt:.2f} % only, which is part of the stated "
+        f"mean of these, and with it the size of the specimen, to {doubt:.2f} %, which is part of the stated "
         "standard deviations. Lock the focus, and calibrate again"
     )
     return Finding("lens-refocused", sentence, ids, step, float(np.nanmax(motions.effect)), MOVED_PX, "px")
@@ -143,3 +147,15 @@ def _unknown(motions: CameraMotions, step: str, when: str) -> Finding:
         "the same instant and each of its own camera, then calibrate again"
     )
     return Finding("camera-moved-unknown", sentence, ids, step, float(np.nanmax(motions.misfit)), UNEXPLAINED, "σ")
+
+
+def _adrift(motions: CameraMotions, step: str, when: str) -> Finding:
+    """A finding on cameras of which most moved, and far, so that none holds the world where it was."""
+    ids = tuple(motions.cameras[c].id for c in np.flatnonzero(motions.moved))
+    far = float(np.nanmax(motions.effect))
+    sentence = (
+        f"camera {', '.join(ids)} moved {when}, by up to {far:.1f} px in their images. So many moved that hardly any "
+        "holds the world where it was: lines of sight meet again, but size and form of the specimen may be wrong by "
+        f"more than is stated (limit {ADRIFT_PX:.0f} px). Fix the cameras, and calibrate again"
+    )
+    return Finding("camera-moved-unknown", sentence, ids, step, far, ADRIFT_PX, "px")

@@ -33,6 +33,8 @@ from ringdic.geometry.triangulation import reprojection_residuals, triangulate
 MOTION = POSE + 1
 #: Shift of a camera's image beyond which it has moved, or its lens was refocused, px.
 MOVED_PX = 0.06
+#: Shift of the images where all cameras moved, px, beyond which the motion of each is not known.
+ADRIFT_PX = 3.0
 _FOLLOWED_BY_TWO_PX = 1.0  # least motion that is followed with two cameras
 _FARTHEST_PX = 60.0  # greatest motion that is followed; more would be another image, not a bump
 #: Most points that are used, and fewest that are needed.
@@ -106,6 +108,12 @@ class CameraMotions:
             return True
         large = (np.nan_to_num(self.misfit) > UNEXPLAINED) & (np.nan_to_num(self.after) > _UNEXPLAINED_PX)
         return bool(large.any())
+
+    @property
+    def adrift(self) -> bool:
+        """Whether all cameras are free, and two at least moved farther than the smallest motion that fits will tell."""
+        free = self.freed[np.isfinite(self.effect)]
+        return len(free) > 2 and bool(free.all()) and int((np.nan_to_num(self.effect) > ADRIFT_PX).sum()) > 1
 
     @property
     def followed(self) -> bool:

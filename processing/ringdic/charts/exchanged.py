@@ -75,7 +75,7 @@ def confusion_findings(confused: Sequence[ConfusedImages], reference: str) -> li
         if turned:
             told |= {*turned}
             sentence = (
-                f"{reference}: the image of camera {' and '.join(turned)} is {kind}, as its features show. Turn it "
+                f"{reference}: the image of camera {', '.join(turned)} is {kind}, as its features show. Turn it "
                 "back, and process again"
             )
             findings.append(Finding("image-turned", sentence, tuple(turned), reference))

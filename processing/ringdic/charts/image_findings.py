@@ -27,8 +27,8 @@ _LOST = 0.15  # of a camera's points, that are worth a finding
 _TIMES = 3.0  # times as much as the lower quartile of all cameras
 _HARDLY = 0.1  # of the points of a step
 _COARSE = 0.42  # of a subset's width, from which on speckles are too large for it: it holds hardly two
-_SOFT = 1.8  # px, edges of a pattern that is out of focus; in focus they are 1.2 to 1.4
-_SOFTER = 1.3  # times as wide as those of the target
+_SOFT = 1.55  # px, edges of a pattern that is out of focus by a pixel and more; in focus they are 1.2 to 1.4
+_SOFTER = 1.25  # times as wide as those of the target
 _SOFTER_THAN_OTHERS = 1.15  # times as wide as those of the other cameras: by a blur of 0.7 px
 _FINE = 1.7  # px, below which pixels do not resolve speckles
 

@@ -16,16 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from ringdic.arrays import Floats, Vectors
+from ringdic.arrays import Floats
 from ringdic.calibration.calibrated_rig import CalibratedRig, calibrate_rig, control_points
-from ringdic.calibration.motion_findings import left_out_finding
 from ringdic.calibration.quality import ReconstructionError
 from ringdic.charts.depth_map import lattice_places
 from ringdic.charts.exchanged import confusion_findings, without_consequences
 from ringdic.charts.series import SurfaceSeries
 from ringdic.charts.sharpness import edge_width
 from ringdic.charts.surface import ReferenceSurface
-from ringdic.charts.tasks import ChartsJob, charts_job
 from ringdic.charts.unmeasured import places_of_arrays
 from ringdic.correlation.correlate import load_kernels
 from ringdic.errors import ComputationError, InputError
@@ -33,6 +31,8 @@ from ringdic.findings import Finding
 from ringdic.geometry.camera import Camera
 from ringdic.jobs import summary
 from ringdic.jobs.compiling import compile_once
+from ringdic.jobs.reference import ReferenceMatching
+from ringdic.jobs.task_runs import run_tasks
 from ringdic.progress import COMPILING, Report, Stages, silent
 from ringdic.results import noise_floor
 from ringdic.results.results import Results
@@ -42,17 +42,14 @@ from ringdic.results.writer import ResultsWriter, StepRecord, map_in_order
 from ringdic.session.folder import Capture, Session, new_run, open_session
 from ringdic.session.moments import moment_findings
 from ringdic.settings import CalibrationGroup, Settings
-from ringdic.tasks import Executor, LocalExecutor, Task, TaskReport, process_memory, read_output, tidy, work_folder
+from ringdic.tasks import Executor, LocalExecutor, process_memory, read_output, work_folder
 from ringdic.tasks.step_images import step_image
 
 Calibrate = Callable[[Session, CalibrationGroup, Callable[[float, str], None]], CalibratedRig]
 
 log = logging.getLogger(__name__)
 
-#: Times that the reference is matched where cameras moved so far, in px of the image, that matches were lost by it.
-_MOST_LOOKS, _LOOK_AGAIN_PX = 3, 0.3
 _TARGETS_LOOKED_AT, _PLACES_APART = 3, 32  # cameras, and px between the places, at which edges are measured
-_ABOUT_MM = 50.0  # about the middle of the rig, of points that the shift of images is told by
 
 _WEIGHTS = {"prepare": 0.03, "calibrate": 0.25, "correlate": 0.62, "triangulate": 0.04, "deform": 0.06}
 
@@ -137,18 +134,14 @@ def match_session(
     errors, left_out = _usable_pairs(session, rig, steps)
     work, executor = work_folder(session.path), executor or LocalExecutor()
     cameras = [each.camera for id_, each in rig.cameras.items() if id_ in steps[0].images]
-    reference = _Reference(session, rig, tuple(errors), steps, settings)
-    job, placed = reference.matched(cameras, stages, executor)
-    contradicting = job.motions.contradicting
-    if contradicting >= 0:  # as one that shows another instant: without it the others agree
-        left_out = (*left_out, left_out_finding(job.motions, steps[0].id))
-        del cameras[contradicting]
-        job, placed = reference.matched(cameras, stages, executor)
-    _run_tasks(job.later, job.tasks, work, stages, executor)
+    reference = ReferenceMatching(session, rig, tuple(errors), steps, settings)
+    matched = reference.agreeing(cameras, stages, executor)
+    job, cameras = matched.job, list(matched.calibrated)
+    run_tasks(job.later, job.tasks, work, stages, executor)
     stages.at("triangulate", 0.0)
     found = read_output(job.surface.output)
     series = SurfaceSeries(
-        session.rig.name, placed, reference.pairs_of(cameras), job.names, [step.id for step in steps],
+        session.rig.name, matched.placed, reference.pairs_of(cameras), job.names, [step.id for step in steps],
         ReferenceSurface.from_arrays(found), job.matches, settings, StepCache(work),
         places_of_arrays(cameras, found), found["unmatched"].tolist(), job.motions,
     )  # fmt: skip
@@ -160,55 +153,13 @@ def match_session(
     findings = (
         *rig.findings,
         *left_out,
+        *matched.findings,
         *confusion_findings(job.confused, steps[0].id),
         *moments,
         *images.findings(),
         *surface,
     )
     return SessionMatches(series, rig, errors, series.drift, series.agreement, findings)
-
-
-@dataclass(frozen=True)
-class _Reference:
-    """A session whose reference is to be matched. rig : calibrated. pairs : ids of neighbouring cameras that are used.
-
-    steps : the captures, the reference first.
-    """
-
-    session: Session
-    rig: CalibratedRig
-    pairs: tuple[tuple[str, str], ...]
-    steps: tuple[Capture, ...]
-    settings: Settings
-
-    def pairs_of(self, cameras: Sequence[Camera]) -> tuple[tuple[str, str], ...]:
-        """The pairs both of whose cameras are among some."""
-        ids = {camera.id for camera in cameras}
-        return tuple(pair for pair in self.pairs if ids.issuperset(pair))
-
-    def matched(
-        self, cameras: Sequence[Camera], stages: Stages, executor: Executor
-    ) -> tuple[ChartsJob, tuple[Camera, ...]]:
-        """Match the reference images of some cameras, again where these have moved so far that matches were lost.
-
-        Returns the tasks, those of later steps included, and the cameras as they stood at the reference.
-        """
-        bundle = self.rig.bundle
-        covariance = None if bundle is None else bundle.pose_covariance([camera.id for camera in cameras])
-        placed, work = tuple(cameras), work_folder(self.session.path)
-
-        def job_with(assumed: Sequence[Camera], placed: Sequence[Camera]) -> ChartsJob:
-            pairs = self.pairs_of(cameras)
-            return charts_job(self.session, cameras, pairs, self.steps, self.settings, covariance, assumed, placed)
-
-        for _ in range(_MOST_LOOKS):
-            assumed = placed
-            job = job_with(assumed, placed)
-            _run_tasks(job.at_reference, job.tasks, work, stages, executor)
-            placed = job.motions.moved_cameras
-            if _image_shift(assumed, placed, job.views.space.centre) < _LOOK_AGAIN_PX:
-                break
-        return job_with(assumed, placed), placed
 
 
 def _deform(
@@ -314,30 +265,3 @@ def _target_edge(session: Session, cameras: Sequence[Camera]) -> float:
             places = lattice_places(camera.size, _PLACES_APART, _PLACES_APART, None)
             edges.append(edge_width(step_image(images[camera.id], camera, again=False), places))
     return float(np.median(edges)) if edges else float("nan")
-
-
-def _image_shift(before: Sequence[Camera], after: Sequence[Camera], centre: Vectors) -> float:
-    """Greatest distance, px, by which points about a centre (3,) mm move in the images with the cameras."""
-    xyz = centre + _ABOUT_MM * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    shifts = [new.project(xyz) - old.project(xyz) for old, new in zip(before, after, strict=True)]
-    return float(np.linalg.norm(shifts, axis=2).max())
-
-
-def _run_tasks(tasks: Sequence[Task], whole: Sequence[Task], folder: Path, stages: Stages, executor: Executor) -> None:
-    """Run tasks and report their progress, then remove old outputs beyond the size limit of the work folder.
-
-    whole : all tasks of the job, of which these may be a part.
-    """
-    total_cost, first = sum(task.cost for task in whole), [task.key for task in whole].index(tasks[0].key)
-    began, cost, points = time.monotonic(), sum(task.cost for task in whole[:first]), 0
-
-    def report(task: Task, outcome: TaskReport, count: int, total: int) -> None:
-        nonlocal cost, points
-        cost += task.cost
-        points += outcome.points
-        rate = f"{points / max(time.monotonic() - began, 1e-3):,.0f} points/s" if points else ""
-        stages.at("correlate", cost / total_cost, f"{task.name} ({first + count} of {len(whole)})", rate)
-
-    stages.at("correlate", cost / total_cost)
-    executor.run(tasks, report)
-    tidy(folder, whole)

@@ -184,6 +184,19 @@ def test_lenses_that_were_all_refocused_are_named_and_the_scale_is_in_doubt() ->
     assert np.abs((motions.motion[:, 6] - 0.003) / sigma).max() < 4.0
 
 
+def test_cameras_that_were_set_up_again_are_not_followed_in_silence() -> None:
+    """All have moved by many pixels, so nothing tells where the world was."""
+    before = ring(4)
+    _, px = speckles(shaken(before, 40 * jitter(4, 26)), 0.01, 26)
+    motions = find_moved_cameras(before, px, 0.01)
+    assert motions.adrift
+    for step in (0, 2):
+        (finding,) = motion_findings({step: motions}, STEPS)
+        assert (finding.code, finding.step) == ("camera-moved-unknown", STEPS[step])
+        assert len(finding.cameras) > 1
+        assert "calibrate again" in finding.sentence
+
+
 def test_two_cameras_tell_of_their_motion_against_each_other() -> None:
     """Relative motion is known but for its scale, and which of the two cameras moved is not."""
     before = ring(2)
