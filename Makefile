@@ -41,7 +41,7 @@ lint: $(VENV)/.installed-test          ## style, types and the walls between the
 
 test: $(VENV)/.installed-test          ## style, types and the whole suite; the kernels are compiled meanwhile
 	$(BIN)/python -m ringdic.jobs.compiling & $(MAKE) --no-print-directory lint && wait && \
-	  $(BIN)/python -m pytest $(PYTEST)
+	  $(BIN)/python -m pytest -n 2 --dist loadfile $(PYTEST)
 
 fuzz: $(VENV)/.installed-test          ## 100 times as many hostile requests, messages and files as in the suite
 	RINGDIC_FUZZ=$${RINGDIC_FUZZ-100} $(BIN)/python -m pytest tests/fuzz

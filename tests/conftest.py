@@ -146,6 +146,18 @@ def figures(request: pytest.FixtureRequest) -> Callable[[str, str, str], None]:
     return report
 
 
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """A worker of several hands its figures on."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["figures"] = session.config.stash.get(_FIGURES, [])
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Take over the figures of a worker that ends."""
+    node.config.stash.setdefault(_FIGURES, []).extend(getattr(node, "workeroutput", {}).get("figures", []))
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     """The figures that tests measured, beside their bounds."""
     rows = config.stash.get(_FIGURES, [])
