@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from ringdic.arrays import Floats
 from ringdic.calibration.parameters import CameraParameters
-from ringdic.errors import ComputationError
+from ringdic.errors import ComputationError, InputError
 from ringdic.geometry.camera import Camera
+from ringdic.measure import synchrony_of_session
 from ringdic.measure.synchrony import TimeOffsets, time_offsets
+from ringdic.session.records import CameraRecord, CaptureRecord
 from scipy.spatial.transform import Rotation
 
 TIMES = np.concatenate([[0.0], 3.0 + 0.6 * np.arange(7)])
@@ -44,8 +50,8 @@ def moved(points: Floats, t: Floats) -> Floats:
     return turned + np.sin(phase) * [3.0, 12.0, 8.0] + (1 - np.cos(2 * phase)) * [1.0, -3.0, 2.0]
 
 
-def seen(offsets: Floats, seed: int, rolling: bool = False) -> TimeOffsets:
-    """What is found of cameras that expose so much later than planned, s."""
+def tracked(offsets: Floats, seed: int, rolling: bool = False) -> tuple[list[Camera], Floats, Floats]:
+    """Cameras as calibrated, points (n, 3), and tracks by cameras that expose so much later than planned, s."""
     random = np.random.default_rng(seed)
     true, calibrated = ring(len(offsets)), ring(len(offsets), random)
     points = body(300, random)
@@ -64,7 +70,13 @@ def seen(offsets: Floats, seed: int, rolling: bool = False) -> TimeOffsets:
     px += at_rest - px[0] + random.normal(0, 1e-9, px.shape)
     hidden = random.random(px.shape[1:3]) < 0.2
     px[:, hidden] = np.nan
-    return time_offsets(calibrated, px, np.hypot(NOISE, NOISE), TIMES, np.full(len(true), ROW) if rolling else None)
+    return calibrated, points, px
+
+
+def seen(offsets: Floats, seed: int, rolling: bool = False) -> TimeOffsets:
+    """What is found of cameras that expose so much later than planned, s."""
+    cameras, _, px = tracked(offsets, seed, rolling)
+    return time_offsets(cameras, px, np.hypot(NOISE, NOISE), TIMES, np.full(len(cameras), ROW) if rolling else None)
 
 
 @pytest.mark.parametrize("rolling", [False, True], ids=["global shutter", "rolling shutter"])
@@ -86,6 +98,52 @@ def test_a_single_camera_that_is_late_is_told_from_the_others():
     report = found.to_json()["cameras"]
     assert report["3"]["offset_ms"] == pytest.approx(6.0, abs=0.5)
     assert all(report[id_]["offset_ms"] == pytest.approx(-2.0, abs=0.5) for id_ in ("1", "2", "4"))
+
+
+@pytest.fixture
+def session(monkeypatch):
+    """A processed session whose third camera exposes 12 ms late, of which its node stamps 4 ms."""
+    cameras, points, px = tracked(np.array([0.0, 0.0, 0.012, 0.0]), 5)
+    fire = [round(1e9 * time) for time in TIMES]
+    steps = [f"{f + 1:04d}-specimen" for f in range(len(fire))]
+    records = [
+        CaptureRecord(
+            name, f + 1, "specimen", "s", "closed", fire_at_ns=at,
+            cameras={c.id: CameraRecord("ok", time_ns=at + 4_000_000 * (c.id == "3")) for c in cameras},
+        )
+        for f, (name, at) in enumerate(zip(steps, fire, strict=True))
+    ]  # fmt: skip
+    matches = [
+        SimpleNamespace(
+            cameras=(c.id,), vertex=np.arange(len(points)), px=px[:, [k]], sigma=np.full_like(px[:, [k]], 0.04)
+        )
+        for k, c in enumerate(cameras)
+    ]
+    results = SimpleNamespace(cameras=cameras, steps=steps, vertices_ref=points, matches=matches)
+    captures = [SimpleNamespace(id=record.capture_id, record=record) for record in records]
+    monkeypatch.setattr(synchrony_of_session, "newest_results", lambda session, run: session)
+    monkeypatch.setattr(synchrony_of_session, "read_results", lambda path: results)
+    monkeypatch.setattr(synchrony_of_session, "open_session", lambda path: SimpleNamespace(captures=captures))
+    return captures
+
+
+def test_a_session_tells_which_stamps_are_wrong(session):
+    report = synchrony_of_session.session_synchrony(Path("s"))
+    wrong = [line for line in report.lines() if line.endswith("the stamps are wrong")]
+    assert [line.split(":")[0] for line in wrong] == ["camera 1", "camera 2", "camera 3", "camera 4"]
+    third = report.to_json()["cameras"]["3"]
+    assert third["offset_ms"] == pytest.approx(9.0, abs=0.5)
+    assert third["stamped_ms"] == pytest.approx(3.0, abs=1e-6)
+
+
+def test_imported_images_need_the_time_between_their_steps(session):
+    for capture in session:
+        capture.record = replace(capture.record, fire_at_ns=None)
+    with pytest.raises(InputError, match="--period"):
+        synchrony_of_session.session_synchrony(Path("s"))
+    report = synchrony_of_session.session_synchrony(Path("s"), period_s=0.6)
+    assert report.to_json()["cameras"]["3"]["offset_ms"] == pytest.approx(9.0, abs=0.5)
+    assert report.to_json()["cameras"]["3"]["stamped_ms"] is None
 
 
 def test_a_body_at_rest_few_steps_and_few_points_are_refused_with_what_to_do():
