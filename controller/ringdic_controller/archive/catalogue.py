@@ -140,6 +140,13 @@ class Catalogue:
             raise KeyError(capture_id)
         return dict(json.loads(row["record"]))
 
+    def open_captures(self) -> list[tuple[str, str]]:
+        """Session and id of every capture whose record has not been closed."""
+        query = 'select session, id, record from captures where record like \'%"state": "open"%\''
+        with self._lock:
+            rows = self._db.execute(query).fetchall()
+        return [(row["session"], row["id"]) for row in rows if json.loads(row["record"])["state"] == "open"]
+
     def runs(self, name: str) -> list[dict[str, Any]]:
         """The processing runs of a session, oldest first: run, finished_at, summary; none for an unknown session."""
         query = "select run, finished_at, summary from runs where session = ? order by run"

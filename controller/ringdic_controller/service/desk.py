@@ -90,6 +90,7 @@ class Desk:
         """Add the archive's writer and the nodes, so that sessions can be created and captured."""
         self.sessions.archive, self.roster.nodes = archive, nodes
         if nodes is not None:
+            self.rounds.note_left_open(self.catalogue.open_captures())
             self.jobs.processing.warm()
         self.state.events.publish_snapshot()
 

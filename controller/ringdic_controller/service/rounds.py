@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from threading import Lock, Thread
 from typing import Any
@@ -160,6 +160,11 @@ class Rounds:
         finally:  # whatever became of its processing, the capture has closed
             self._change(new.id, state="closed", capture_id=record.capture_id)
 
+    def note_left_open(self, captures: Iterable[tuple[str, str]]) -> None:
+        """Note captures that an earlier controller left open, by session and capture id."""
+        with self._lock:
+            self._left_open.extend(captures)
+
     def close_left_open(self) -> list[tuple[str, str]]:
         """Close the captures whose record a disk did not take when their round ended, if it takes it now.
 
@@ -186,9 +191,10 @@ class Rounds:
     def _close(self, session: str, capture_id: str) -> None:
         assert self._sessions.archive is not None
         capture = self._sessions.archive.open(session).capture(capture_id)
-        entries = capture.record().cameras.items()
-        reason = "the archive could not be written when the capture ended"
-        capture.close({camera: reason for camera, entry in entries if entry.status == "pending"})
+        record = capture.record()
+        if record.state == "open":
+            reason = "the archive could not be written when the capture ended"
+            capture.close({camera: reason for camera, entry in record.cameras.items() if entry.status == "pending"})
 
     def _note_broken_off(self, new: Round, sentence: str) -> None:
         """End a round that the disk broke off, and remember its capture, if its record is there."""

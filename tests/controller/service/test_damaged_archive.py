@@ -340,6 +340,18 @@ def test_a_capture_that_a_full_disk_left_open_is_closed_when_there_is_room(
     assert {entry["reason"] for entry in entries} == {"the archive could not be written when the capture ended"}
 
 
+def test_a_capture_that_an_earlier_controller_left_open_is_closed_when_there_is_room(
+    tmp_path: Path, desk_of: Callable[..., Desk], full: Callable[[int | None], None]
+) -> None:
+    archive = Archive(tmp_path / "archive")
+    archive.create_session("limb", RIG).begin_capture("board", ["01", "02"])
+    full(errno.ENOSPC)
+    assert archive.close_unfinished("the controller was restarted") == []
+    desk = desk_of(lambda _: [], watch=0.05)
+    full(None)
+    until(lambda: desk.catalogue.capture("limb", "0001-board")["state"] == "closed")
+
+
 def until(condition: Callable[[], Any]) -> None:
     deadline = time.monotonic() + 20
     while not condition():
