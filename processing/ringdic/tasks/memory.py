@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ringdic.arrays import Image
-from ringdic.session.images import read_gray
+from ringdic.session.mosaic import read_level_gray
 
 T = TypeVar("T")
 
@@ -74,7 +74,7 @@ class Memory:
         """The grey levels, (height, width), of an image file; read again if the file has changed since."""
         stat = path.stat()
         key = (str(path), stat.st_size, stat.st_mtime_ns)
-        return self.get(key, lambda: read_gray(path), lambda image: int(image.nbytes))
+        return self.get(key, lambda: read_level_gray(path), lambda image: int(image.nbytes))
 
     def clear(self) -> None:
         """Drop all values."""

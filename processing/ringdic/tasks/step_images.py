@@ -9,7 +9,7 @@ from ringdic.arrays import Image
 from ringdic.errors import InputError
 from ringdic.geometry.camera import Camera
 from ringdic.session.folder import Capture, Session
-from ringdic.session.images import read_gray
+from ringdic.session.mosaic import read_level_gray
 from ringdic.tasks import file_digest, process_memory
 
 
@@ -19,7 +19,7 @@ def step_image(path: Path, camera: Camera, *, again: bool = True) -> Image:
     again : whether other tasks need it too, so that it is kept in memory.
     Raises InputError where its size is not the one at which the camera was calibrated.
     """
-    grey = process_memory.image(path) if again else read_gray(path)
+    grey = process_memory.image(path) if again else read_level_gray(path)
     width, height = camera.size
     if grey.shape != (height, width):
         raise InputError(
