@@ -82,13 +82,15 @@ class RunImages:
 
     def _focus(self) -> Iterator[Finding]:
         """Cameras that are out of focus, most of them, so that none can be held against the others."""
-        edge = float(np.median([one.edge for one in self.references]))
-        if not edge > _SOFT:
+        edges = [one.edge for one in self.references if one.sized]  # a background may well be out of focus
+        edge = float(np.nanmedian(edges)) if np.isfinite(edges).any() else 0.0
+        if edge < _SOFT:
             return
         target = self.target_edge()
         if edge < _SOFTER * target:  # the lenses, or the images, are no sharper
             return
-        cameras = tuple(id_ for id_, one in zip(self.cameras, self.references, strict=True) if one.edge > _SOFT)
+        known = zip(self.cameras, self.references, strict=True)
+        cameras = tuple(id_ for id_, one in known if one.sized and one.edge > _SOFT)
         sentence = (
             f"{self.steps[0]}: the edges of the pattern are {edge:.1f} px wide (median of the cameras; limit {_SOFT} "
             f"px), those of the target {target:.1f} px: the cameras are out of focus, or the pattern has soft edges. "

@@ -16,6 +16,8 @@ from ringdic.charts.sharpness import edge_width
 from ringdic.correlation.repetition import find_repetition
 from ringdic.findings import Finding
 
+#: Names of the arrays that a reference state is stored as.
+REFERENCE_STATE = ("image_state", "speckle", "edge", "certain", "sized", "digest", "repetition")
 _KNOWN = 0.3  # of the textured places have a depth: with fewer, all textured places are looked at, background too
 _FEWEST = 12  # places with a depth, from which the size of the speckles is known
 _MOST = 0.6  # of these that must repeat: lamps in the background do
@@ -57,7 +59,7 @@ class ReferenceState:
         return cls(
             image_state(image, image, places, np.zeros((len(places), 6))), speckle, certain, sized,
             tuple(found.findings(f"camera {camera}", (camera,))) if repeats else (), pixel_digest(image),
-            edge_width(image, places),
+            edge_width(image, known if sized else places),
         )  # fmt: skip
 
     def arrays(self) -> dict[str, NDArray]:

@@ -30,7 +30,7 @@ from ringdic.charts.matching import drop_masked, match_chart
 from ringdic.charts.patches import Patches
 from ringdic.charts.plane_sweep import DepthRange
 from ringdic.charts.poses import motions_as_arrays, motions_from_arrays, poses_of_charts
-from ringdic.charts.reference_state import ReferenceState
+from ringdic.charts.reference_state import REFERENCE_STATE, ReferenceState
 from ringdic.charts.surface import reference_surface
 from ringdic.charts.tracked_points import TrackedPoints, tracked_points
 from ringdic.charts.tracking import CameraMatches, match_in_two_passes, surface_grid
@@ -121,7 +121,7 @@ class ChartsJob:
     @property
     def confused(self) -> list[ConfusedImages]:
         """What is wrong with reference images that do not match, once the depth maps are computed."""
-        found = [read_output(task.output)["confused"].tolist() for task in self.maps]
+        found = [read_output(task.output, ("confused",))["confused"].tolist() for task in self.maps]
         return [ConfusedImages(kind, tuple(cameras)) for kind, *cameras in filter(None, found)]
 
     def matches(self, camera: int, step: int) -> CameraMatches | None:
@@ -143,7 +143,7 @@ class ChartsJob:
         steps : ids of the F captures. measured : (F,) share of the surface's points that each measured. radius : px.
         target_edge : function that returns the width, px, of the sharpest edges in the images of the target.
         """
-        references = tuple(ReferenceState.of_arrays(read_output(task.output)) for task in self.maps)
+        references = tuple(ReferenceState.of_arrays(read_output(task.output, REFERENCE_STATE)) for task in self.maps)
         states, digests = {}, {}
         for c, row in enumerate(self.steps):
             for step, task in enumerate(row, start=1):

@@ -78,6 +78,8 @@ def test_cameras_that_are_all_out_of_focus_are_named_unless_the_target_is_no_sha
     assert (finding.code, finding.cameras, finding.step, finding.value) == ("image-blurred", ("1", "2"), STEPS[0], 2.6)
     assert "those of the target 1.4 px" in finding.sentence
     assert replace(run_images(), references=soft, target_edge=lambda: 2.5).findings() == []
+    background = tuple(replace(one, certain=False, sized=False) for one in soft)
+    assert replace(run_images(), references=background).findings() == []
 
 
 def test_clipped_and_dark_images_are_named() -> None:
