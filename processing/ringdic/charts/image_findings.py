@@ -183,8 +183,8 @@ class RunImages:
         if lost and not causes:
             sentence = (
                 f"{name}, camera {camera}: {100 * state.lost:.0f} % of its points were lost (limit {100 * _LOST:.0f} "
-                f"%), {100 * usual:.0f} % in the better ones; check that it shows the specimen unobstructed, at this "
-                "step"
+                f"%), {100 * usual:.0f} % in the better ones; look whether something hides the specimen there, or "
+                "whether the image is of another step"
             )
             yield Finding("camera-lost-points", sentence, (camera,), name, 100 * state.lost, 100 * _LOST, "%")
 
@@ -213,25 +213,26 @@ class RunImages:
         return causes
 
     def _unmeasured(self, step: int, known: Mapping[int, ImageState]) -> Finding:
-        """The finding of a step at which hardly a point was measured, with the cause that most images show."""
+        """The finding of a step at which hardly a point was measured: its cause, where most of the images show one."""
         name, share = self.steps[step], float(self.measured[step])
         causes = {c: self._causes(c, state) for c, state in known.items()}
         codes = [each[0][0] for each in causes.values() if each]
         common = max(set(codes), key=codes.count) if codes else ""
         affected = [c for c, each in causes.items() if each and each[0][0] == common]
+        measured = f"{name}: {100 * share:.0f} % of the points were measured (limit {100 * _HARDLY:.0f} %)"
         if common and 2 * len(affected) >= len(known):
             worst = max(affected, key=lambda c: causes[c][0][2])
             cameras = tuple(self.cameras[c] for c in affected)
-            why = f"camera {' and '.join(cameras)}: {causes[worst][0][1]}"
-        else:
-            lost = ", ".join(f"{self.cameras[c]} {100 * state.lost:.0f} %" for c, state in known.items())
-            cameras = ()
-            why = (
-                "the images are as sharp and as bright as the reference, but its points were not found in them (lost: "
-                f"{lost}); check that the step shows the same specimen, and that it moved by less than 160 px"
+            code, sentence, value, limit, unit = causes[worst][0]
+            return Finding(
+                code, f"{measured}; camera {' and '.join(cameras)}: {sentence}", cameras, name, value, limit, unit
             )
-        sentence = f"{name}: {100 * share:.0f} % of the points were measured (limit {100 * _HARDLY:.0f} %); {why}"
-        return Finding("step-unmeasured", sentence, cameras, name, 100 * share, 100 * _HARDLY, "%")
+        lost = ", ".join(f"{self.cameras[c]} {100 * state.lost:.0f} %" for c, state in known.items())
+        why = (
+            "the images are as sharp and as bright as the reference, but its points were not found in them (lost: "
+            f"{lost}); check that the step shows the same specimen, and that it moved by less than 160 px"
+        )
+        return Finding("step-unmeasured", f"{measured}; {why}", (), name, 100 * share, 100 * _HARDLY, "%")
 
 
 def coarse_speckle(sizes: Sequence[float], radius: int) -> list[str]:

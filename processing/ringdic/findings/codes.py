@@ -66,5 +66,5 @@ CODES: dict[str, tuple[Verdict, str]] = {
     "camera-lost-points": (_LOOK, "a camera lost far more points at a step than the others"),
     # surface
     "area-unmeasured": (_LOOK, "textured area that two cameras see was not measured"),
-    "step-unmeasured": (_LOOK, "hardly a point was measured at a step"),
+    "step-unmeasured": (_LOOK, "hardly a point was measured at a step, and its images do not show why"),
 }

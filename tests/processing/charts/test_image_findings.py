@@ -139,7 +139,7 @@ def test_a_step_without_points_has_the_cause_that_most_images_show() -> None:
     images = run_images(**{f"c{c}s1": smeared for c in range(3)})
     measured = np.array([1.0, 0.02, 1.0])
     step = only(replace(images, measured=measured))
-    assert (step.code, step.cameras, step.step) == ("step-unmeasured", CAMERAS, STEPS[1])
+    assert (step.code, step.cameras, step.step) == ("image-blurred", CAMERAS, STEPS[1])
     assert "blurred by 2.0 px" in step.sentence
     assert "60°" in step.sentence
     elsewhere = run_images(**{f"c{c}s1": replace(CALM, matched=3) for c in range(3)})
