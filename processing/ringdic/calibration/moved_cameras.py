@@ -53,6 +53,7 @@ _SCREENED, _SCREENING_STEPS = 600, 5  # points, and steps of a fit, by which the
 _FREE_PX, _ALL_FREE_PX = 30.0, 1.0  # px, standard deviation of a motion where few cameras moved, and where most did
 _GAIN = 0.5  # squares of σ an observation, least gain by a motion; noise gives 0.3 on a patch of a hundred points
 _LOOSE_STEPS, _STEPS = 2, 14
+_BEGINNING = 1000  # points of the loose steps, after which all are used
 _SETTLED = 1e-3  # px, greatest motion in the image in the last step
 
 
@@ -168,8 +169,7 @@ def find_moved_cameras(
     fit = _Fit(cameras, px, sigma, known, most)
     none = np.zeros(len(cameras), dtype=bool)
     still = fit.information(none, none)
-    for _ in range(_LOOSE_STEPS):
-        fit.step(fit.information(~none, none, _UNKNOWN_PX))
+    fit.begin(fit.information(~none, none, _UNKNOWN_PX))
     fit.settle(lambda: still / (1.0 + fit.squares(still) / (_TAIL * POSE))[:, None, None] ** 2)
     motions = fit.motions()
     if not motions.moved.any():
@@ -245,6 +245,14 @@ class _Fit:
         self.scale, self._known, self._standing = 1.0, known, self._deviations()
         self._first, self.free = self.xyz, np.ones(len(cameras), dtype=bool)
         self.residuals = reprojection_residuals(cameras, self.xyz, self.px)
+
+    def begin(self, prior: Floats) -> None:
+        """Take the first steps with a part of the points. prior : (C, 7, 7) information matrices of the motions."""
+        part = self.thinned(_BEGINNING)
+        for _ in range(_LOOSE_STEPS):
+            part.step(prior)
+        self.motion = part.motion
+        self._triangulate()
 
     def restarted(self) -> _Fit:
         """A fit to the same points from the beginning."""
@@ -338,7 +346,7 @@ class _Fit:
             h[at] += np.einsum("nri,nr->ni", across, r)
             B[at, :, c] = across.transpose(0, 2, 1) @ A
         H += 1e-12 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        solved = np.linalg.solve(H, np.concatenate([B.reshape(n, 3, -1), h[..., None]], axis=2))
+        solved = np.linalg.inv(H) @ np.concatenate([B.reshape(n, 3, -1), h[..., None]], axis=2)
         flat = B.reshape(3 * n, -1).T
         N -= flat @ solved[..., :-1].reshape(3 * n, -1)
         size = 1 / np.sqrt(np.diag(N))
@@ -346,9 +354,13 @@ class _Fit:
         step = self.covariance @ (right.ravel() - flat @ solved[..., -1].ravel())
         self.motion = self.motion + step.reshape(count, MOTION)
         self.motion[:, POSE] = self.motion[:, POSE].clip(-_MOST_REFOCUSED, _MOST_REFOCUSED)
-        again = triangulate(self._moved(), self.px)  # as a step of the points too would diverge after large motions
-        self.xyz = np.where(np.isfinite(again), again, self.xyz)
+        self._triangulate()  # as a step of the points too would diverge after large motions
         return step.reshape(count, MOTION)
+
+    def _triangulate(self) -> None:
+        """Put the points where the cameras see them after their motions so far."""
+        again = triangulate(self._moved(), self.px)
+        self.xyz = np.where(np.isfinite(again), again, self.xyz)
 
     def _moved(self) -> list[Camera]:
         """The cameras after their motions so far."""

@@ -18,6 +18,7 @@ from ringdic.charts.blur import SQUARE_PX, blur_change
 from ringdic.correlation.seeds import even_sample
 
 _SQUARES = 20
+_CANDIDATES = 1000  # points, about, of which those of the squares are chosen
 _FEWEST = 12  # matched points from which the squares follow the material
 _ROWS = 16  # every so many rows of an image are enough to tell that it is another one
 
@@ -75,6 +76,7 @@ def image_state(reference: Image, image: Image, xy: Pixels, warp: Floats) -> Ima
     good = np.flatnonzero(np.isfinite(warp[:, :6]).all(axis=1))
     moved = len(good) >= _FEWEST
     index = good if moved else np.arange(len(xy))
+    index = index[:: max(1, len(index) // _CANDIDATES)]
     chosen = index[even_sample(xy[index], _SQUARES)] if len(index) else index
     first, second = _squares(reference, image, xy[chosen], warp[chosen, :6] if moved else np.zeros((len(chosen), 6)))
     if not len(first):

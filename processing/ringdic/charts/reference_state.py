@@ -91,7 +91,11 @@ class ReferenceState:
 
 def _about(places: Pixels, shape: tuple[int, ...], spacing: int) -> Mask:
     """The pixels of an image of a shape (height, width) about places (n, 2) px of a lattice of some spacing, px."""
-    region = np.zeros(shape, np.uint8)
-    column, row = np.rint(places).astype(int).T
-    region[row.clip(0, shape[0] - 1), column.clip(0, shape[1] - 1)] = 1
-    return np.asarray(cv2.dilate(region, np.ones((2 * spacing + 1,) * 2, np.uint8))) > 0
+    coarse = max(1, spacing // 8)  # px, to which their outline is exact
+    height, width = (-(-side // coarse) for side in shape)
+    region = np.zeros((height, width), np.uint8)
+    column, row = np.rint(places).astype(int).T // coarse
+    region[row.clip(0, height - 1), column.clip(0, width - 1)] = 1
+    wide = cv2.dilate(region, np.ones((2 * (spacing // coarse) + 1,) * 2, np.uint8))
+    whole = cv2.resize(wide, (coarse * width, coarse * height), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(whole[: shape[0], : shape[1]]) > 0

@@ -37,11 +37,13 @@ _LEVELLED = 64  # px at least over which mean and contrast are evened out
 _SPECKLES = 8.0  # half widths of the peak at zero, over which they are for the comparison
 _LEAST = 0.5  # standard deviation of such an image where there is a pattern
 _COVERED = 0.6  # of a window, that must lie in the region
-_FINE = 3.0  # px, half width of the peak at zero from which on the image is reduced by a half
-_MIDDLE = 1024  # px, side of the square in the middle by which this is decided
+_FINE = 2.0  # px, half width of the peak at zero from which on the image is reduced by a half
+_SIZED = 3.0  # px, half width of that peak up to which the size of the speckles is taken from it
+_MIDDLE = 640  # px, side of the square in the middle by which this is decided
 _ROWS = 4  # every so many rows are enough for that half width
 
 Levels = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -96,17 +98,23 @@ def find_repetition(image: Image, xy: Pixels, radius: int, region: Mask | None =
     image : (height, width) grey levels. xy : (n, 2) px, points that are matched. radius : px, of the subset. region :
     (height, width) bool, what belongs to the pattern; None for the whole image.
     """
+    if not len(xy):
+        return Repetition(xy, np.zeros(0), xy, np.zeros(0, bool), math.nan)
     corner, part = _extent(image.shape, region)
-    grey = as_8_bit(image[part]).astype(np.float32)
-    inside = np.ones(grey.shape, np.float32) if region is None else region[part].astype(np.float32)
-    factor, even = 1, max(4 * radius, _LEVELLED)
-    while min(grey.shape) > 4 * _LEVELLED:
-        middle = tuple(slice(max(0, side - _MIDDLE) // 2, (side + _MIDDLE) // 2) for side in grey.shape)
-        if _half_widths(_levelled(grey[middle], inside[middle], even // factor))[0] <= _FINE:
+    middle = xy[np.argmin(np.linalg.norm(xy - np.median(xy, axis=0), axis=1))] - corner  # one that is matched
+    grey = as_8_bit(image[part])
+    inside = np.ones(grey.shape, np.uint8) if region is None else region[part].view(np.uint8)
+    factor, even, speckle = 1, max(4 * radius, _LEVELLED), 0.0
+    while True:
+        about = _square(grey.shape, _scaled(middle, factor))
+        narrow, wide = _half_widths(_levelled(grey[about], inside[about], even // factor))
+        last = narrow <= _FINE or min(grey.shape) <= 4 * _LEVELLED
+        if not speckle and (narrow <= _SIZED or last):
+            speckle = 2.0 * factor * math.sqrt(narrow * wide)
+        if last:
             break
         grey, inside = _halved(grey), _halved(inside)
         factor *= 2
-    narrow, wide = _half_widths(_levelled(grey, inside, even // factor))
     level = _levelled(grey, inside, round(_SPECKLES * narrow))  # where an edge counts as little as the speckles
     # Area of the squared peak at zero, as of a normal distribution: the number of independent places of a window is its
     # area over this. A much longer peak is that of stripes.
@@ -120,14 +128,12 @@ def find_repetition(image: Image, xy: Pixels, radius: int, region: Mask | None =
     for some in (windows[::2], windows[1::2]):
         found = [rows]
         for point in some:
-            x, y = np.rint((point - corner + 0.5) / factor - 0.5).astype(int)
-            one = _second_peak(level, usable, int(x), int(y), half, _REACH // factor)
+            one = _second_peak(level, usable, *_scaled(point - corner, factor), half, _REACH // factor)
             if one is not None:
                 found.append(np.array([[*point, one[0], factor * one[1], factor * one[2]]]))
         rows = np.concatenate(found)
         if len(rows) >= _FEWEST and not (rows[:, 2] >= limit).any():  # no need to look at the others
             break
-    speckle = 2.0 * factor * math.sqrt(narrow * wide)
     return Repetition(rows[:, :2], rows[:, 2], rows[:, 3:], rows[:, 2] >= limit, speckle)
 
 
@@ -141,8 +147,22 @@ def _extent(shape: tuple[int, ...], region: Mask | None) -> tuple[Pixels, tuple[
     return corner, (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
 
 
-def _levelled(grey: Levels, inside: Levels, side: int) -> Levels:
+def _scaled(point: Pixels, factor: int) -> tuple[int, int]:
+    """The pixel (x, y) nearest to a point (2,) px of an image that was reduced by a factor."""
+    x, y = np.rint((point + 0.5) / factor - 0.5).astype(int)
+    return int(x), int(y)
+
+
+def _square(shape: tuple[int, ...], middle: tuple[int, int]) -> tuple[slice, slice]:
+    """The part of an image of a shape about a pixel (x, y) from which the speckles' size is told."""
+    at = (min(max(x - _MIDDLE // 2, 0), max(side - _MIDDLE, 0)) for x, side in zip(middle[::-1], shape, strict=True))
+    rows, columns = (slice(first, first + _MIDDLE) for first in at)
+    return rows, columns
+
+
+def _levelled(image: Bytes, region: Bytes, side: int) -> Levels:
     """An image of even mean and contrast over squares of some px, 0 outside the region, which is 1 inside."""
+    grey, inside = image.astype(np.float32), region.astype(np.float32)
     size = (2 * (side // 2) + 1,) * 2
 
     def mean(values: Levels) -> Levels:
@@ -154,11 +174,11 @@ def _levelled(grey: Levels, inside: Levels, side: int) -> Levels:
     return level
 
 
-def _halved(image: Levels) -> Levels:
+def _halved(image: Bytes) -> Bytes:
     """An image reduced by a half."""
     height, width = (side // 2 * 2 for side in image.shape)
     half = cv2.resize(image[:height, :width], (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-    return np.asarray(half, np.float32)
+    return np.asarray(half, np.uint8)
 
 
 def _half_widths(level: Levels) -> tuple[float, float]:
@@ -195,13 +215,13 @@ def _at_zero(first: float, second: float) -> float:
     return min(max((4.0 * first - second) / 3.0, 0.5), 1.0)
 
 
-def _usable(level: Levels, inside: Levels, half: int) -> Mask:
+def _usable(level: Levels, inside: Bytes, half: int) -> Mask:
     """About which pixels of an image, (height, width) bool, a window lies in the region, most of it, and has a pattern.
 
     half : px, half the side of the windows. Of a window without any, the ZNCC would be a quotient of rounding errors.
     """
     side = (2 * half + 1,) * 2
-    mean, square, covered = (cv2.blur(each, side) for each in (level, level * level, inside))
+    mean, square, covered = (cv2.blur(each, side) for each in (level, level * level, inside.astype(np.float32)))
     return np.asarray((covered >= _COVERED) & (square - mean * mean >= _LEAST**2))
 
 
