@@ -7,6 +7,8 @@ from datetime import UTC, datetime
 from threading import Lock
 from typing import Any, Protocol
 
+from ringdic.session.writer import CaptureWriter
+
 from ringdic_controller.archive.catalogue import Catalogue
 from ringdic_controller.service.refusals import NotFoundError, RefusedError
 
@@ -19,6 +21,9 @@ class SessionArchive(Protocol):
 
     def open(self, name: str) -> Any:
         """The writer of an existing session. Raises InputError if there is none."""
+
+    def capture(self, session: str, capture_id: str) -> CaptureWriter | None:
+        """The writer of a capture; None if there is none of these names."""
 
 
 class Sessions:
@@ -83,6 +88,22 @@ class Sessions:
         self._catalogue.refresh(name)
         return name
 
+    def writer(self, session: str, capture_id: str) -> CaptureWriter:
+        """The writer of an archived capture. Raises NotFoundError, or RefusedError where the archive is only shown."""
+        try:
+            self._catalogue.capture(session, capture_id)
+            inside = self._catalogue.file(session, "captures", capture_id, "capture.json") is not None
+        except KeyError as error:
+            raise no_capture(session, capture_id) from error
+        if not inside:
+            raise no_capture(session, capture_id)
+        if self.archive is None:
+            raise RefusedError("The controller only shows this archive, and changes nothing in it.")
+        writer = self.archive.capture(session, capture_id)
+        if writer is None:
+            raise no_capture(session, capture_id)
+        return writer
+
     def newest_step(self, session: str) -> dict[str, Any] | None:
         """The newest live step of a session: capture_id, archived_at, ready_at and the seconds between, or None.
 
@@ -106,3 +127,8 @@ class Sessions:
                 "seconds": None if seconds is None else round(seconds, 3),
             }
         return None
+
+
+def no_capture(session: str, capture_id: str) -> NotFoundError:
+    """The refusal of a request that names a capture which is not in its session."""
+    return NotFoundError(f"Session '{session}' has no capture '{capture_id}'.")

@@ -22,10 +22,11 @@ _EARLIER_WORDS = {"late": "delivered-late"}  # of a status in records of earlier
 #: What to do about a damaged session.
 REMEDY = "copy it back, or import the session again"
 _UNKNOWN = "unknown"
+LONGEST_NOTE = 2000  # characters of the note of a capture
 # Fields that are left out of the file where there is nothing to say, so that earlier records stay as they are.
 _OMITTED = (
     "settings", "settings_hash", "armed", "conflicts", "clock_offset_ns", "clock_error_ns", "clock_step_ns",
-    "row_time_ns", "skew_error_ns", "readout_ns", "frame_grid",
+    "row_time_ns", "skew_error_ns", "readout_ns", "frame_grid", "note",
 )  # fmt: skip
 
 R = TypeVar("R", bound="_Record")
@@ -225,7 +226,7 @@ class CaptureRecord(_Record):
     settings that were asked for, and their hash. skew_error_ns : bound of the skew's error from the cameras'
     clocks. readout_ns : time from the first to the last row of an image, of the slowest rolling shutter: within one
     image a moving body is seen over so long, whatever the skew. frame_grid : period, spread and each camera's
-    deviation, ns, of sensors that run freely.
+    deviation, ns, of sensors that run freely. note : what the operator noted of the capture.
     """
 
     capture_id: str
@@ -246,6 +247,7 @@ class CaptureRecord(_Record):
     skew_error_ns: int | None = None
     readout_ns: int | None = None
     frame_grid: Mapping[str, Any] = field(default_factory=dict)
+    note: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -322,6 +324,15 @@ class CaptureRecord(_Record):
         other = (entry.reason or "").removesuffix(_conflict_sentence(entry.conflicts)).removesuffix("; ")
         reason = "; ".join(part for part in (other, _conflict_sentence(conflicts)) if part)
         return self.with_entry(camera, replace(entry, conflicts=conflicts, reason=reason))
+
+    def with_note(self, note: str) -> CaptureRecord:
+        """The record with another note of the operator; an empty one removes it. SessionError where it is too long."""
+        note = note.strip()
+        if len(note) > LONGEST_NOTE:
+            raise SessionError(
+                f"the note of {self.capture_id} has {len(note)} characters; shorten it to {LONGEST_NOTE} at most"
+            )
+        return replace(self, note=note or None)
 
     def with_failure(self, camera: str, reason: str) -> CaptureRecord:
         """The record with the reason why a camera has no image; unchanged where its image is archived."""

@@ -405,6 +405,16 @@ class CaptureWriter:
             if changed is not record:
                 self._replace(changed)
 
+    def annotate(self, note: str) -> CaptureRecord:
+        """Replace the capture's note, and return its record; an empty note is removed.
+
+        Raises SessionError where the note is longer than `ringdic.session.records.LONGEST_NOTE` characters.
+        """
+        with self._lock:
+            record = self.record().with_note(note)
+            self._replace(record)
+        return record
+
     def close(self, failures: Mapping[str, str] | None = None) -> CaptureRecord:
         """End the capture and return its record.
 

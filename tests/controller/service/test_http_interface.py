@@ -316,3 +316,38 @@ def test_what_a_run_did_not_measure_is_told_by_reason_and_drawn_on_the_photograp
     assert np.ptp(drawn[20, 30].astype(int)) > 40
     assert np.ptp(drawn[5, 5].astype(int)) < 12
     assert processed.get(f"{address}/02").status_code == 404
+
+
+def test_a_note_of_a_capture_is_archived_told_to_who_follows_and_survives_the_close(client, desk, nodes) -> None:
+    client.post(f"{API}/sessions", json={"name": "limb"})
+    told: list[tuple[str, Any]] = []
+    desk.state.events.publish = lambda name, payload: told.append((name, payload))
+    nodes.gate.clear()
+    round_id = client.post(f"{API}/captures", json={"kind": "board"}).json()["id"]
+    address = f"{API}/sessions/limb/captures/0001-board"
+    until(lambda: client.get(address).status_code == 200)
+    told.clear()
+    answer = client.patch(address, json={"note": "the lamp flickers"})
+    assert (answer.status_code, answer.json()["note"]) == (200, "the lamp flickers")
+    assert ("capture", "the lamp flickers") in [(name, each["record"]["note"]) for name, each in told]
+    nodes.gate.set()
+    until(lambda: client.get(f"{API}/rounds/{round_id}").json()["state"] == "closed")
+    record = client.get(address).json()
+    assert (record["state"], record["note"]) == ("closed", "the lamp flickers")
+    assert "note" not in client.patch(address, json={"note": ""}).json()
+
+
+@pytest.mark.parametrize(
+    ("capture_id", "body", "status"),
+    [
+        ("0001-board", {"note": "x" * 2001}, 422),
+        ("0001-board", {"note": 5}, 422),
+        ("0001-board", {}, 422),
+        ("0002-board", {"note": "x"}, 404),
+    ],
+)
+def test_a_note_that_cannot_be_kept_is_refused(client, capture_id: str, body: Any, status: int) -> None:
+    client.post(f"{API}/sessions", json={"name": "limb"})
+    capture(client, "board")
+    assert client.patch(f"{API}/sessions/limb/captures/{capture_id}", json=body).status_code == status
+    assert "note" not in client.get(f"{API}/sessions/limb/captures/0001-board").json()

@@ -227,6 +227,10 @@ def test_the_page_works_under_its_own_policy(desk: Desk, served: str, watched: W
     while desk.rounds.running() is not None:
         assert time.monotonic() < deadline
         time.sleep(0.02)
+    watched.page.click("#captures summary")
+    watched.page.fill("#captures input", "a note & <b>more</b>")
+    watched.page.press("#captures input", "Enter")
+    expect(watched.page.locator("#captures summary")).to_contain_text("a note & <b>more</b>")
     watched.page.fill("#session-name", "second")
     watched.page.click("#session-create")
     expect(watched.page.locator("#session-select")).to_have_value("second")

@@ -158,3 +158,19 @@ def test_the_word_of_earlier_releases_for_an_image_delivered_late_is_read(tmp_pa
     file.write_text(json.dumps({**CAPTURE, "cameras": {"201": {"status": "late", "reason": "after the close"}}}))
     entry = read_capture_record(file).cameras["201"]
     assert (entry.status, entry.reason, entry.lacks_image) == ("delivered-late", "after the close", False)
+
+
+def test_a_note_is_kept_with_what_else_the_record_holds_and_an_empty_one_leaves_no_trace(tmp_path) -> None:
+    session = Archive(tmp_path).create_session("first", '[rig]\nname = "ring"\n[[cameras]]\nid = "201"\n')
+    capture = session.begin_capture("board", ["201"])
+    before = (capture.path / "capture.json").read_bytes()
+    capture.annotate("  lamp moved, µ\nsecond line ")
+    capture.fail("201", "no light")
+    assert read_capture_record(capture.path / "capture.json").note == "lamp moved, µ\nsecond line"
+    with pytest.raises(SessionError, match="2001 characters; shorten it to 2000"):
+        capture.annotate("x" * 2001)
+    assert capture.record().note == "lamp moved, µ\nsecond line"
+    other = session.begin_capture("board", ["201"])
+    other.annotate("one")
+    other.annotate(" ")
+    assert (other.path / "capture.json").read_bytes().count(b"note") == before.count(b"note") == 0

@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response, status
 from fastapi.responses import FileResponse
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 from ringdic.session.names import CaptureKind
+from ringdic.session.records import LONGEST_NOTE
 
 from ringdic_controller.service.desk import Desk
 from ringdic_controller.service.preview import preview_jpeg
@@ -16,6 +17,7 @@ from ringdic_controller.service.refusals import NotFoundError
 from ringdic_controller.service.rounds import Round
 from ringdic_controller.service.routes.desk import TheDesk
 from ringdic_controller.service.routes.etag import cache_headers, client_has
+from ringdic_controller.service.sessions import no_capture
 from ringdic_controller.service.turns import Turns
 
 router = APIRouter(tags=["captures"])
@@ -28,6 +30,12 @@ class NewCapture(BaseModel):
 
     kind: CaptureKind
     override: bool = False
+
+
+class CaptureChange(BaseModel):
+    """What the operator changes of a capture: its note."""
+
+    note: Annotated[str, Field(max_length=LONGEST_NOTE)]
 
 
 @router.post(
@@ -60,7 +68,15 @@ def read_capture(session: str, capture_id: str, desk: TheDesk) -> dict[str, Any]
     try:
         return desk.catalogue.capture(session, capture_id)
     except KeyError as error:
-        raise NotFoundError(f"Session '{session}' has no capture '{capture_id}'.") from error
+        raise no_capture(session, capture_id) from error
+
+
+@router.patch("/sessions/{session}/captures/{capture_id}", summary="Change the note of a capture")
+def change_capture(session: str, capture_id: str, change: CaptureChange, desk: TheDesk) -> dict[str, Any]:
+    """Replace what the operator noted of a capture, and return its record; an empty note is removed."""
+    desk.sessions.writer(session, capture_id).annotate(change.note)
+    desk.state.publish_capture(session, capture_id)
+    return read_capture(session, capture_id, desk)
 
 
 @router.get(

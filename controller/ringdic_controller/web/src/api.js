@@ -24,6 +24,7 @@ const withBody = (method) => async (address, body) => {
 
 export const post = withBody("POST");
 export const put = withBody("PUT");
+export const patch = withBody("PATCH");
 export const get = async (address) => (await request(address)).json();
 export const getText = async (address) => (await request(address)).text();
 export const getBytes = async (address) => (await request(address)).arrayBuffer();

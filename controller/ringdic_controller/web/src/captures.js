@@ -1,6 +1,6 @@
 // The capture buttons, and the list of captures with the outcome of every camera.
 
-import { post, url } from "./api.js";
+import { patch, post, url } from "./api.js";
 import { byId, clockTime, element, notice } from "./dom.js";
 import { state } from "./live.js";
 
@@ -111,6 +111,21 @@ function cameraCell(record, [id, entry]) {
   );
 }
 
+/** The note of a capture: stored when the field is left, or with Enter. */
+function noteField(record) {
+  const address = url("sessions", state.current, "captures", record.capture_id);
+  const store = async (event) => {
+    try {
+      notice("");
+      await patch(address, { note: event.target.value });
+    } catch (error) {
+      notice(error.message);
+    }
+  };
+  const attributes = { type: "text", maxlength: "2000", value: record.note ?? "", onchange: store };
+  return element("label", { class: "note" }, "Note ", element("input", attributes));
+}
+
 function captureItem(record, open) {
   const cameras = Object.entries(record.cameras);
   const dots = cameras.map(([id, { status, reason }]) =>
@@ -129,10 +144,12 @@ function captureItem(record, open) {
       element("span", { class: record.skew_exceeded ? "bad" : "muted" }, skew),
       element("time", { class: "muted", datetime: record.opened_at }, clockTime(record.opened_at)),
       record.override ? element("span", { class: "tag" }, "override") : null,
+      record.note ? element("span", { class: "muted" }, record.note) : null,
     ),
   );
   const fill = () => {
     if (box.open && box.children.length === 1) {
+      box.append(noteField(record));
       box.append(element("ol", { class: "cameras" }, ...cameras.map((camera) => cameraCell(record, camera))));
     }
   };
