@@ -16,6 +16,7 @@ from ringdic.results.reader import read_results, read_summary
 from ringdic.results.unmeasured import UnmeasuredPlaces
 from ringdic.results.writer import write_results
 from ringdic.session.folder import open_session
+from ringdic.session.load import load_document
 from ringdic_node import wire
 
 Named = Callable[[str, str], list[str]]
@@ -57,6 +58,10 @@ def test_the_tables_name_the_fields_of_session_records(session: Path, named: Nam
         for entry in record["cameras"].values():
             wanted = set(named("formats/session.md", "Entry of a camera"))
             assert wanted - of_cameras <= set(entry) <= wanted, path
+
+
+def test_the_table_names_the_fields_of_a_load(named: Named) -> None:
+    assert named("formats/session.md", "load.json") == list(load_document(()))
 
 
 @pytest.mark.parametrize("name", ["session.json", "captures/0001-board/capture.json"])

@@ -46,6 +46,7 @@ def application() -> typer.Typer:
     )
     app.callback()(_common_options)
     app.command("import")(import_command)
+    app.command("load")(load_command)
     app.command("process")(process_command)
     app.command("correlate")(correlate_command)
     app.command("export")(export_command)
@@ -86,6 +87,23 @@ def import_command(
         print_json({"session": str(session)})
     else:
         say(f"imported {source} as session {session}")
+
+
+def load_command(
+    session: Session,
+    table: Annotated[Path, typer.Argument(metavar="FILE.csv", help="Columns step or capture, and force [N], ….")],
+    replace: Annotated[bool, typer.Option("--replace", help="Replace values that are archived already.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Archive load channels, such as force and travel, beside the captures; tables and exports then have them."""
+    from ringdic.session.load_table import archive_load_table
+
+    stored = archive_load_table(table, session, replace=replace)
+    if as_json:
+        print_json({"captures": {id_: [channel.name for channel in channels] for id_, channels in stored.items()}})
+    else:
+        for id_, channels in stored.items():
+            say(f"{id_}: {', '.join(channel.name for channel in channels)}")
 
 
 def process_command(

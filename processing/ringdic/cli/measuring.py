@@ -39,8 +39,14 @@ class TableOutput:
     out: Out = None
     as_json: AsJson = False
 
-    def give(self, table: Table) -> None:
-        """Write the table, and its notes to standard error. Raises InputError where there is no folder for the file."""
+    def give(self, table: Table, session: Path) -> None:
+        """Write the table with the session's load, and its notes to standard error.
+
+        Raises InputError where there is no folder for the file, or the load is damaged.
+        """
+        from ringdic.measure.load import with_load
+
+        table = with_load(table, session)
         if self.out is not None:
             if not self.out.parent.is_dir():
                 raise InputError(f"{self.out.parent}: no such folder to write into")
@@ -79,7 +85,7 @@ def point_command(
     places = [nearest_place(mesh, xyz, within) for xyz in positions]
     places += [place_of_vertex(mesh, index) for index in vertex or ()]
     places += [place_of_face(mesh, index) for index in face or ()]
-    output.give(time_series(results, places, field or ()))
+    output.give(time_series(results, places, field or ()), session)
 
 
 @measure_app.command("extensometer")
@@ -100,7 +106,7 @@ def extensometer_command(
     ends = _numbers("--from", from_, 3), _numbers("--to", to, 3)
     results = choice.results(session)
     start, end = (nearest_place(results.results.mesh, xyz, within) for xyz in ends)
-    output.give(extensometer(results, start, end))
+    output.give(extensometer(results, start, end), session)
 
 
 @measure_app.command("section")
@@ -120,7 +126,7 @@ def section_command(
 
     cut = _cut(z, theta, plane)
     results = evaluation.results(session)
-    output.give(section(results, cut, field or ()))
+    output.give(section(results, cut, field or ()), session)
 
 
 @measure_app.command("region")
@@ -143,7 +149,7 @@ def region_command(
 
     part = _region(box, sphere, patch, faces)
     results = evaluation.results(session)
-    output.give(region_statistics(results, part, field or ()))
+    output.give(region_statistics(results, part, field or ()), session)
 
 
 @spread_options
@@ -159,7 +165,7 @@ def strain_command(
 
     results = choice.results(session)
     widths = window or [0.0, 3.0, 5.0, 8.0, 12.0]
-    output.give(window_study(results.results, widths, results.evaluation.previous))
+    output.give(window_study(results.results, widths, results.evaluation.previous), session)
 
 
 def _cut(z: float | None, theta: float | None, plane: str | None) -> Cut:

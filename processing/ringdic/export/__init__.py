@@ -8,7 +8,8 @@ mat      one file: DIC3DPPresults as MultiDIC makes   MATLAB, Octave
          it, and the arrays of the npz, from 1
 vtkhdf   one file, all steps and fields               ParaView
 vtp      a folder, one file a step and series.pvd     ParaView and other VTK readers
-csv      a folder, points and faces of each step      spreadsheets, R
+csv      a folder, points and faces of each step,     spreadsheets, R
+         and load.csv where a load was archived
 ply      a folder, one surface a step, with fields    MeshLab, CloudCompare
          and colours
 glb      a folder, one coloured surface a step        viewers, Blender (metres, y upwards)
@@ -25,7 +26,7 @@ of the calibration is unknown. Endings ``_noise`` and ``_calibration`` name the 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ringdic.errors import InputError
@@ -36,6 +37,7 @@ from ringdic.export.tables import export_csv
 from ringdic.export.vtk import export_vtkhdf, export_vtp
 from ringdic.results.evaluation import EvaluatedResults, Evaluation, evaluate_results
 from ringdic.session.folder import newest_results
+from ringdic.session.load import LoadSeries, load_series
 
 _WRITERS: dict[str, Callable[[EvaluatedResults, Path], None]] = {
     "npz": export_npz,
@@ -45,6 +47,12 @@ _WRITERS: dict[str, Callable[[EvaluatedResults, Path], None]] = {
     "csv": export_csv,
     "ply": export_ply,
     "glb": export_glb,
+}
+#: Formats that carry the load at the steps.
+_WITH_LOAD: dict[str, Callable[[EvaluatedResults, Path, Sequence[LoadSeries]], None]] = {
+    "npz": export_npz,
+    "mat": export_mat,
+    "csv": export_csv,
 }
 FOLDERS = ("vtp", "csv", "ply", "glb")
 _COLOURED: dict[str, Callable[[EvaluatedResults, Path, str], None]] = {"ply": export_ply, "glb": export_glb}
@@ -91,6 +99,7 @@ def export(
     out = Path(out)
     _check_place(out, format)
     results = evaluate_results(results_path, evaluation)
+    load = load_series([Path(session_path) / "captures" / step for step in results.steps])
     if format in _COLOURED:
         results.field(colour or DEFAULT_COLOUR)
     if format in FOLDERS:
@@ -98,15 +107,22 @@ def export(
         if format in _COLOURED:
             _COLOURED[format](results, out, colour or DEFAULT_COLOUR)
         else:
-            _WRITERS[format](results, out)
+            _write(results, out, format, load)
         return out
     partial = out.with_name(f".{out.name}.partial")  # a reader never sees half a file
     try:
-        _WRITERS[format](results, partial)
+        _write(results, partial, format, load)
         partial.replace(out)
     finally:
         partial.unlink(missing_ok=True)
     return out
+
+
+def _write(results: EvaluatedResults, out: Path, format: str, load: Sequence[LoadSeries]) -> None:
+    if format in _WITH_LOAD:
+        _WITH_LOAD[format](results, out, load)
+    else:
+        _WRITERS[format](results, out)
 
 
 def _check_place(out: Path, format: str) -> None:

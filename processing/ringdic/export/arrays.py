@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ringdic.results.evaluation import EvaluatedResults
+from ringdic.session.load import LoadSeries
 
 _SCALARS = ("lambda1", "lambda2", "J")
 
 
-def export_npz(results: EvaluatedResults, out: Path) -> None:
-    """Write all results into one npz file, with the arrays of :func:`arrays`."""
+def export_npz(results: EvaluatedResults, out: Path, load: Sequence[LoadSeries] = ()) -> None:
+    """Write all results into one npz file, with the arrays of :func:`arrays` and of :func:`load_arrays`."""
     with Path(out).open("wb") as file:  # given a name, savez would append a suffix to it
-        np.savez(file, **arrays(results))
+        np.savez(file, **arrays(results), **load_arrays(load))
 
 
 def arrays(results: EvaluatedResults) -> dict[str, Any]:
@@ -59,6 +61,17 @@ def arrays(results: EvaluatedResults) -> dict[str, Any]:
         **by_cameras,
         "pair": source.pair,
     }
+
+
+def load_arrays(load: Sequence[LoadSeries]) -> dict[str, Any]:
+    """The load at the steps: ``load`` (F, C), NaN where not known, and ``load_channels`` (C,), as ``force [N]``.
+
+    Empty without channels.
+    """
+    if not load:
+        return {}
+    values = np.array([series.values for series in load]).T
+    return {"load": values, "load_channels": np.array([series.heading for series in load])}
 
 
 def square(six: np.ndarray) -> np.ndarray:

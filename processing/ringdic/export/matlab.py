@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,9 @@ from scipy.io import savemat
 
 from ringdic.arrays import Floats
 from ringdic.errors import InputError
-from ringdic.export.arrays import arrays
+from ringdic.export.arrays import arrays, load_arrays
 from ringdic.results.evaluation import EvaluatedResults
+from ringdic.session.load import LoadSeries
 from ringdic.strain.deformation import Deformation
 from ringdic.strain.rigid_motion import RigidMotion
 from ringdic.strain.window import StrainWindow
@@ -23,14 +25,15 @@ log = logging.getLogger(__name__)
 _LARGEST = 2**31 - 2**20  # bytes of one variable of a level 5 file
 
 
-def export_mat(results: EvaluatedResults, out: Path) -> None:
+def export_mat(results: EvaluatedResults, out: Path, load: Sequence[LoadSeries] = ()) -> None:
     """Write a level 5 MAT file; indices in it count from 1.
 
     ``DIC3DPPresults`` is the structure that MultiDIC's post-processing makes and its plots read: Points3D, Faces, Disp,
     RBM, Deform and others as cells with one entry a step; fields with the ending ``_ARBM`` have the rigid motion
     removed; Deform_window holds the strain over the window if there is one. Deformation is in single precision. Beside
     it stand the arrays of the npz (`ringdic.export.arrays`), standard deviations among them, where ``faces`` and
-    ``pair`` count from 1 (0: a triangle joins two pairs), and ``steps`` and ``settings`` as text.
+    ``pair`` count from 1 (0: a triangle joins two pairs), ``steps`` and ``settings`` as
+    text, and the load at the steps where it is known.
 
     Raises InputError where a level 5 file cannot hold it.
     """
@@ -40,6 +43,9 @@ def export_mat(results: EvaluatedResults, out: Path) -> None:
     values["pair"] = np.asarray(source.pair, dtype=float) + 1
     values["steps"] = np.array(source.steps, dtype=object)
     values["settings"] = source.settings
+    values |= load_arrays(load)
+    if load:
+        values["load_channels"] = np.array([series.heading for series in load], dtype=object)
     values["DIC3DPPresults"] = post_processing(results)
     with Path(out).open("wb") as file:
         savemat(file, values, do_compression=True, oned_as="column")

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ringdic.results.evaluation import EvaluatedResults
+from ringdic.session.load import LoadSeries
 
 
-def export_csv(results: EvaluatedResults, out: Path) -> None:
+def export_csv(results: EvaluatedResults, out: Path, load: Sequence[LoadSeries] = ()) -> None:
     """Write ``STEP-points.csv`` and ``STEP-faces.csv`` for every step into the folder ``out``.
 
     The first line names the columns with their units; vertices count from 0; what was not measured is empty. The
     columns ``…_reference`` hold what the step is compared with. Each triangle has the centroid of its corners there
-    and the displacement of the centroid.
+    and the displacement of the centroid. ``load.csv`` has the load at each step, where there is any.
     """
+    if load:
+        _write_load(out / "load.csv", results.steps, load)
     for step, name in enumerate(results.steps):
         columns: dict[str, list[tuple[str, NDArray[np.generic]]]] = {"point": [], "face": []}
         faces, positions = results.results.faces, results.positions(step)
@@ -36,6 +40,14 @@ def export_csv(results: EvaluatedResults, out: Path) -> None:
             columns[entry.location].append((entry.name + unit, fields.scalar(entry).astype(np.float32)))
         _write(out / f"{name}-points.csv", columns["point"])
         _write(out / f"{name}-faces.csv", columns["face"])
+
+
+def _write_load(path: Path, steps: Sequence[str], load: Sequence[LoadSeries]) -> None:
+    lines = [",".join(("step", "capture", *(series.heading for series in load)))]
+    for step, name in enumerate(steps):
+        values = ("" if np.isnan(series.values[step]) else f"{series.values[step]:.9g}" for series in load)
+        lines.append(",".join((str(step), name, *values)))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _write(path: Path, columns: list[tuple[str, NDArray[np.generic]]]) -> None:

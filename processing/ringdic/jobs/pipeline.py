@@ -40,6 +40,8 @@ from ringdic.results.series import StepCache
 from ringdic.results.uncertainty import StepUncertainty, camera_covariance
 from ringdic.results.writer import ResultsWriter, StepRecord, map_in_order
 from ringdic.session.folder import Capture, Session, new_run, open_session
+from ringdic.session.json_values import json_value
+from ringdic.session.load import load_series
 from ringdic.session.moments import moment_findings
 from ringdic.settings import CalibrationGroup, Settings
 from ringdic.tasks import Executor, LocalExecutor, process_memory, read_output, work_folder
@@ -174,6 +176,7 @@ def _deform(
     known = camera_covariance(matches.rig.bundle, series.motions_at(0))
     uncertainty = None if known is None else StepUncertainty(series.reference, known)
     written = [k for k, step in enumerate(steps) if step.kind != "static"]
+    load = load_series([steps[k].folder for k in written])
     reference = series.reference
     if uncertainty is not None:
         reference = uncertainty.complete(reference, reference.deformation(0))
@@ -204,6 +207,8 @@ def _deform(
             settings.accept,
         )  # fmt: skip
         values["noise_floor"] = noise_floor.noise_floor(at_rest) if at_rest else None
+        if load:
+            values["load"] = json_value(load)
         values["seconds"] = round(time.monotonic() - began, 2)
         file.finish(matches.calibration, values)
     return values

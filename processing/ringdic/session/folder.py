@@ -9,6 +9,7 @@
         0001-board/               NNNN-kind, see `ringdic.session.names`
           capture.json            the record, see `ringdic.session.records`: per camera status, file, SHA-256, times,
                                   exposure, metadata
+          load.json               optional: force, travel, … at the capture, see `ringdic.session.load`
           201.pgm …               one image per camera, the camera's bytes unchanged
         0002-target/ …
         0003-specimen/ …          the first specimen capture is the reference, the others are the steps
@@ -35,6 +36,7 @@ from uuid import uuid4
 
 from ringdic.errors import InputError
 from ringdic.session.files import leads_out
+from ringdic.session.load import LoadChannel, read_load
 from ringdic.session.names import CAPTURE_KINDS, split_capture_id
 from ringdic.session.records import REMEDY, CaptureRecord, SessionError, read_capture_record, read_session_record
 from ringdic.session.rig import Rig, read_rig
@@ -57,6 +59,11 @@ class Capture:
     folder: Path
     images: dict[str, Path]
     record: CaptureRecord
+
+    @property
+    def load(self) -> tuple[LoadChannel, ...]:
+        """The load channels archived beside the capture, read from its folder. Raises SessionError if damaged."""
+        return read_load(self.folder)
 
 
 @dataclass(frozen=True)

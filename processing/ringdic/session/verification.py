@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ringdic.errors import InputError
 from ringdic.session.files import PARTIAL, checksum
+from ringdic.session.load import LOAD_FILE, read_load
 from ringdic.session.names import split_capture_id
 from ringdic.session.records import CameraRecord, CaptureRecord, SessionError, read_capture_record, read_session_record
 
@@ -70,6 +71,10 @@ def verify_session(session: Path) -> Verification:
                 faults[image] = (
                     f"{image}: the image of camera {camera} in {record.capture_id} {fault}; copy it back from a backup"
                 )
+        try:
+            read_load(folder)
+        except SessionError as error:
+            faults[folder / LOAD_FILE] = str(error)
         notes.extend(_strays(folder, record))
     return Verification(session, images, size, faults, tuple(notes))
 
@@ -104,7 +109,7 @@ def _image_fault(image: Path, entry: CameraRecord) -> str | None:
 
 
 def _strays(folder: Path, record: CaptureRecord) -> Iterator[str]:
-    named = {entry.file for _, entry in _images(record)} | {"capture.json"}
+    named = {entry.file for _, entry in _images(record)} | {"capture.json", LOAD_FILE}
     for path in sorted(folder.iterdir()):
         if path.name.startswith(PARTIAL):
             yield f"{path}: left by an interrupted write; the controller removes it"

@@ -23,6 +23,7 @@ from typing import Any
 
 from ringdic.errors import InputError
 from ringdic.session.files import PARTIAL, leads_out, link, place, replace_json
+from ringdic.session.load import LOAD_FILE, LoadChannel, load_document, read_load, with_channel
 from ringdic.session.names import CAPTURE_KINDS, capture_id, checked_name, split_capture_id
 from ringdic.session.records import (
     REMEDY,
@@ -414,6 +415,18 @@ class CaptureWriter:
             record = self.record().with_note(note)
             self._replace(record)
         return record
+
+    def store_load(self, channel: LoadChannel, *, replace: bool = False) -> tuple[LoadChannel, ...]:
+        """Archive a load channel beside the capture, and return all that it has; other channels stay.
+
+        Raises LoadConflictError where a channel of this name has other values, unless `replace` says to replace them.
+        """
+        with self._lock:
+            before = read_load(self.path)
+            channels = with_channel(before, channel, replace=replace)
+            if channels != before:
+                replace_json(self.path / LOAD_FILE, load_document(channels))
+        return channels
 
     def close(self, failures: Mapping[str, str] | None = None) -> CaptureRecord:
         """End the capture and return its record.

@@ -351,3 +351,21 @@ def test_a_note_that_cannot_be_kept_is_refused(client, capture_id: str, body: An
     capture(client, "board")
     assert client.patch(f"{API}/sessions/limb/captures/{capture_id}", json=body).status_code == status
     assert "note" not in client.get(f"{API}/sessions/limb/captures/0001-board").json()
+
+
+def test_a_load_channel_is_archived_and_other_values_need_a_word(client) -> None:
+    client.post(f"{API}/sessions", json={"name": "limb"})
+    capture(client, "specimen")
+    address = f"{API}/sessions/limb/captures/0001-specimen/load"
+    assert client.get(address).json() == []
+    force = {"name": "force", "unit": "N", "values": 12.5}
+    travel = {"name": "travel", "unit": "mm", "values": [[10**18, 1], [10**18 + 5, 2.5]]}
+    assert client.put(address, json=force).json() == [force]
+    assert client.put(address, json=travel).json() == client.put(address, json=force).json() == [force, travel]
+    refused = client.put(address, json={**force, "values": 13})
+    assert (refused.status_code, "force" in refused.json()["detail"]) == (409, True)
+    assert client.get(address).json() == [force, travel]
+    assert client.put(address, json={**force, "values": 13, "replace": True}).json()[0]["values"] == 13
+    for wrong in ("12", [[1.5, 2]], [[2, 1], [1, 1]], [], [[1]], True, None):
+        assert client.put(address, json={**force, "values": wrong}).status_code == 422, wrong
+    assert client.put(address.replace("0001", "0002"), json=force).status_code == 404

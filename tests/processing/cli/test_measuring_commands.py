@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -143,3 +144,16 @@ def test_what_cannot_be_measured_is_refused_in_a_sentence(session: Path, words: 
     assert result.exception.exit_code == InputError.exit_code
     assert said in str(result.exception)
     assert result.stdout == ""
+
+
+def test_each_load_channel_is_a_column_of_the_tables(session: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(session, tmp_path / "session"))
+    for name, force in (("a", 0.0), ("c", 30.5)):
+        (copy / "captures" / name).mkdir(parents=True)
+        channel = {"name": "force", "unit": "N", "values": force}
+        (copy / "captures" / name / "load.json").write_text(json.dumps({"schema": 1, "channels": [channel]}))
+    words = ("measure", "point", copy, "--vertex", 7, "--vertex", 9, "--field", "lambda2")
+    assert [row["load_force [N]"] for row in table(*words)] == ["0", "", "30.5"] * 2
+    assert "load channel 'force' is not known at b" in ringdic(*words).stderr
+    length = table("measure", "extensometer", copy, "--from", "57,-5,95", "--to", "57,7,100")
+    assert [row["load_force [N]"] for row in length] == ["0", "", "30.5"]

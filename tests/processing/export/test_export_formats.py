@@ -2,6 +2,8 @@
 
 import base64
 import csv
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -435,3 +437,21 @@ def test_a_step_in_which_everything_was_lost_is_lost_and_no_error(tmp_path: Path
     row = next(row for row in read_summary(run / "results.h5")["fields"] if row["name"] == "lambda2")
     assert row["range"] is None
     assert row["steps"][1] is None
+
+
+def test_the_load_at_the_steps_is_exported(session: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(session, tmp_path / "session"))
+    folder = copy / "captures" / STEPS[1]
+    folder.mkdir(parents=True)
+    channels = [{"name": "force", "unit": "N", "values": 12.5}, {"name": "cycle", "unit": "", "values": 3}]
+    (folder / "load.json").write_text(json.dumps({"schema": 1, "channels": channels}), encoding="utf-8")
+    expected = [[np.nan, np.nan], [12.5, 3.0]]
+    with np.load(export(copy, "npz")) as arrays:
+        np.testing.assert_array_equal(arrays["load"], expected)
+        assert list(arrays["load_channels"]) == ["force [N]", "cycle"]
+    read = loadmat(export(copy, "mat"), simplify_cells=True)
+    np.testing.assert_array_equal(read["load"], expected)
+    assert list(read["load_channels"]) == ["force [N]", "cycle"]
+    table = pandas.read_csv(export(copy, "csv") / "load.csv")
+    assert list(table["capture"]) == list(STEPS)
+    np.testing.assert_array_equal(table[["force [N]", "cycle"]], expected)

@@ -8,12 +8,13 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response, status
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, Field
+from ringdic.session.load import LoadChannel, LoadConflictError, read_load
 from ringdic.session.names import CaptureKind
 from ringdic.session.records import LONGEST_NOTE
 
 from ringdic_controller.service.desk import Desk
 from ringdic_controller.service.preview import preview_jpeg
-from ringdic_controller.service.refusals import NotFoundError
+from ringdic_controller.service.refusals import NotFoundError, RefusedError
 from ringdic_controller.service.rounds import Round
 from ringdic_controller.service.routes.desk import TheDesk
 from ringdic_controller.service.routes.etag import cache_headers, client_has
@@ -21,6 +22,7 @@ from ringdic_controller.service.sessions import no_capture
 from ringdic_controller.service.turns import Turns
 
 router = APIRouter(tags=["captures"])
+Reading = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 _SHA256 = re.compile(r"[0-9a-f]{64}")  # no other text of a record goes into a header
 _PREVIEWS = Turns("previews are asked for", at_once=2, waiting=14)  # each holds a whole image in memory
 
@@ -36,6 +38,18 @@ class CaptureChange(BaseModel):
     """What the operator changes of a capture: its note."""
 
     note: Annotated[str, Field(max_length=LONGEST_NOTE)]
+
+
+class SentLoad(BaseModel):
+    """One load channel: a single value, or [time in ns since the Unix epoch, value] in order of time.
+
+    With ``replace`` it replaces other values of the channel that are archived.
+    """
+
+    name: str
+    unit: str = ""
+    values: Reading | list[tuple[Annotated[int, Field(strict=True)], Reading]]
+    replace: bool = False
 
 
 @router.post(
@@ -77,6 +91,29 @@ def change_capture(session: str, capture_id: str, change: CaptureChange, desk: T
     desk.sessions.writer(session, capture_id).annotate(change.note)
     desk.state.publish_capture(session, capture_id)
     return read_capture(session, capture_id, desk)
+
+
+@router.get("/sessions/{session}/captures/{capture_id}/load", summary="The load channels of a capture")
+def read_capture_load(session: str, capture_id: str, desk: TheDesk) -> list[dict[str, Any]]:
+    """The load channels archived beside a capture, each with name, unit and values; none if there are none."""
+    read_capture(session, capture_id, desk)
+    return [channel.to_json() for channel in read_load(desk.catalogue.path(session) / "captures" / capture_id)]
+
+
+@router.put("/sessions/{session}/captures/{capture_id}/load", summary="Archive a load channel beside a capture")
+def store_load(session: str, capture_id: str, sent: SentLoad, desk: TheDesk) -> list[dict[str, Any]]:
+    """Archive one load channel and return all of the capture.
+
+    409 if other values of this channel are archived, unless ``replace`` is true.
+    """
+    values = sent.values if isinstance(sent.values, float) else tuple(sent.values)
+    channel = LoadChannel(sent.name, sent.unit, values)
+    writer = desk.sessions.writer(session, capture_id)
+    try:
+        channels = writer.store_load(channel, replace=sent.replace)
+    except LoadConflictError as error:
+        raise RefusedError(f"{error}: send it again with 'replace'") from error
+    return [each.to_json() for each in channels]
 
 
 @router.get(
