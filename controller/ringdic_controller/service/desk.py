@@ -5,6 +5,7 @@ Locks. Each part has at most one, private to it, and they are taken in two store
     LiveState._lock        a part's state is read and published
         Sessions._lock     the selection
         Rounds._lock       the capture rounds
+        Sequences._lock    the sequences of captures
         Catalogue._lock    the tables of sessions, captures and runs
         Jobs._lock         the queue of jobs
         EventStream._lock  the followers
@@ -32,6 +33,7 @@ from ringdic_controller.service.processing import SessionProcessing
 from ringdic_controller.service.refusals import RefusedError
 from ringdic_controller.service.roster import CameraNodes, NodeRoster
 from ringdic_controller.service.rounds import Round, Rounds
+from ringdic_controller.service.sequences import CaptureSequence, Sequences
 from ringdic_controller.service.sessions import SessionArchive, Sessions
 
 logger = logging.getLogger(__name__)
@@ -40,9 +42,10 @@ logger = logging.getLogger(__name__)
 class Desk:
     """Sessions, capture rounds, processing and live state of one archive; safe to use from several threads.
 
-    Requests go to its parts: `sessions`, `rounds`, `processing`, `jobs`, `catalogue`, `roster`, `state`. The desk joins
-    them: it creates and selects sessions with regard to the round under way, and passes every change on to whoever
-    follows the state. Until `connect` has added the archive's writer and the nodes, it only shows.
+    Requests go to its parts: `sessions`, `rounds`, `sequences`, `processing`, `jobs`, `catalogue`, `roster`, `state`.
+    The desk joins them: it creates and selects sessions with regard to the round or sequence under way, and passes
+    every change on to whoever follows the state. Until `connect` has added the archive's writer and the nodes, it only
+    shows.
 
     Parameters
     ----------
@@ -78,9 +81,10 @@ class Desk:
         self.roster = NodeRoster(rig_toml)
         self.sessions = Sessions(self.catalogue, rig_toml, clock)
         self.rounds = Rounds(self.sessions, self.roster, self._publish_round, self._publish_and_process_capture)
+        self.sequences = Sequences(self.rounds, self._publish_sequence)
         self.jobs = Jobs(root / ".jobs", processing, lambda job: self.state.publish_job(job))
         self.processing = SessionProcessing(self.sessions, self.catalogue, self.jobs, live, quiet)
-        self.state = LiveState(self.catalogue, self.roster, self.sessions, self.rounds, self.jobs)
+        self.state = LiveState(self.catalogue, self.roster, self.sessions, self.rounds, self.sequences, self.jobs)
         self.jobs.processing.on_change = self.state.publish_processing
         self._closing = Event()
         self._watcher = Thread(target=self._watch, args=(watch,), name="folders", daemon=True)
@@ -97,6 +101,7 @@ class Desk:
     def close(self) -> None:
         """End the jobs and the watch over the folder."""
         self._closing.set()
+        self.sequences.close()
         self.jobs.close()
         self._watcher.join(5)
 
@@ -135,12 +140,19 @@ class Desk:
         running = self.rounds.running()
         if running is not None and running.session != session:
             raise RefusedError("A capture is under way; choose another session when it has closed.")
+        sequence = self.sequences.newest()
+        if sequence is not None and sequence.state == "running" and sequence.session != session:
+            raise RefusedError("A sequence of captures is under way; choose another session when it has ended.")
 
     def _publish_round(self, changed: Round) -> None:
         self.state.publish_round(changed.id)
         self.state.publish_rig()
         if changed.ended:
             self.state.publish_sessions()
+
+    def _publish_sequence(self, changed: CaptureSequence) -> None:
+        self.state.publish_sequence(changed.id)
+        self.state.publish_rig()
 
     def _publish_and_process_capture(self, closed: Round, capture_id: str) -> None:
         self.state.publish_capture(closed.session, capture_id)

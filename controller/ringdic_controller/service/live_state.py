@@ -13,6 +13,7 @@ from ringdic_controller.jobs.jobs import Job, Jobs
 from ringdic_controller.service.events import EventStream
 from ringdic_controller.service.roster import NodeRoster
 from ringdic_controller.service.rounds import Rounds
+from ringdic_controller.service.sequences import Sequences
 from ringdic_controller.service.sessions import Sessions
 
 logger = logging.getLogger(__name__)
@@ -28,20 +29,28 @@ class LiveState:
     """
 
     def __init__(
-        self, catalogue: Catalogue, roster: NodeRoster, sessions: Sessions, rounds: Rounds, jobs: Jobs
+        self,
+        catalogue: Catalogue,
+        roster: NodeRoster,
+        sessions: Sessions,
+        rounds: Rounds,
+        sequences: Sequences,
+        jobs: Jobs,
     ) -> None:
         self._catalogue = catalogue
         self._roster = roster
         self._sessions = sessions
         self._rounds = rounds
+        self._sequences = sequences
         self._jobs = jobs
         self.events = EventStream(self.snapshot)
         self._lock = Lock()  # held while a part's state is read and published
 
     def snapshot(self) -> dict[str, Any]:
-        """The whole state: rig, sessions, the current one with its captures, runs and live step, jobs, round."""
+        """The whole state: rig, sessions, the current one with captures, runs and live step, jobs, round, sequence."""
         sessions = self._sessions.summaries()
         current = self._sessions.current()
+        newest_sequence = self._sequences.newest()
         newest_round = self._rounds.newest()  # under way or not: how it ended stays to be read
         return {
             "rig": self.rig(),
@@ -53,6 +62,7 @@ class LiveState:
             "processing": self._warmth(),
             "jobs": [asdict(job) for job in self._jobs.list()[:_SHOWN_JOBS]],
             "round": None if newest_round is None else asdict(newest_round),
+            "sequence": None if newest_sequence is None else asdict(newest_sequence),
         }
 
     def rig(self) -> dict[str, Any]:
@@ -81,6 +91,10 @@ class LiveState:
     def publish_round(self, round_id: str) -> None:
         """Publish the state of a capture round."""
         self._publish("round", lambda: asdict(self._rounds.get(round_id)))
+
+    def publish_sequence(self, sequence_id: str) -> None:
+        """Publish the state of a sequence of captures."""
+        self._publish("sequence", lambda: asdict(self._sequences.get(sequence_id)))
 
     def publish_capture(self, session: str, capture_id: str) -> None:
         """Publish a capture's record, read from its folder; do nothing if there is no folder yet."""

@@ -17,10 +17,16 @@ from ringdic_controller.service.sessions import Sessions
 
 logger = logging.getLogger(__name__)
 
+_UNDER_WAY = "A capture is under way; wait until it has closed."
+_RESERVED = "A sequence of captures is under way; wait until it has ended, or cancel it."
+
 
 @dataclass(frozen=True)
 class Round:
-    """One capture round: ``state`` is arming, open (the capture's record exists), closed or refused."""
+    """One capture round: ``state`` is arming, open (the capture's record exists), closed or refused.
+
+    sequence : id of the sequence that it belongs to.
+    """
 
     id: str
     session: str
@@ -29,6 +35,7 @@ class Round:
     state: str = "arming"
     capture_id: str | None = None
     error: str | None = None
+    sequence: str | None = None
 
     @property
     def ended(self) -> bool:
@@ -62,7 +69,8 @@ class Rounds:
         self._roster = roster
         self._on_change = on_change
         self._on_archived = on_archived
-        self._lock = Lock()  # guards the two below
+        self._lock = Lock()  # guards the three below
+        self._reserved = False  # by a sequence, which alone captures then
         self._rounds: dict[str, Round] = {}  # oldest first
         self._left_open: list[tuple[str, str]] = []  # session and id of captures whose record could not be closed
 
@@ -88,7 +96,9 @@ class Rounds:
         if self._roster.nodes is None or self._roster.rig is None:
             return "The controller runs without a rig: it shows sessions but cannot capture."
         if self.running() is not None:
-            return "A capture is under way; wait until it has closed."
+            return _UNDER_WAY
+        if self.reserved():
+            return _RESERVED
         if self._sessions.current() is None:
             return "There is no session yet; create one first."
         return None
@@ -105,11 +115,56 @@ class Rounds:
 
         Raises RefusedError if nothing can be captured now, InputError for an unknown kind.
         """
+        session = self._checked(kind, override)
+        new = self._new(session, kind, override, None)
+        Thread(target=self._capture, args=(new,), name=f"capture-{new.id}", daemon=True).start()
+        return new
+
+    def reserve(self, kind: str, *, override: bool = False) -> str:
+        """Reserve all captures for a sequence, until `release`; returns the session that they go to.
+
+        Refused as `begin` is, and while another sequence is under way.
+        """
+        session = self._checked(kind, override)
+        with self._lock:
+            self._refuse_second(False)
+            self._reserved = True
+        return session
+
+    def reserved(self) -> bool:
+        """Whether a sequence has reserved all captures."""
+        with self._lock:
+            return self._reserved
+
+    def release(self) -> None:
+        """Let others capture again, after a sequence."""
+        with self._lock:
+            self._reserved = False
+
+    def take_reserved(self, session: str, kind: str, *, override: bool, sequence: str) -> Round:
+        """Take a capture of the sequence that has reserved them; blocks to the round's end, and returns it.
+
+        Raises RefusedError where a camera is missing, unless `override`.
+        """
+        self._refuse_missing(override)
+        new = self._new(session, kind, override, sequence)
+        self._capture(new)
+        return self.get(new.id)
+
+    def _checked(self, kind: str, override: bool) -> str:
+        """The session that a capture can go to now. Raises RefusedError or InputError."""
         if kind not in CAPTURE_KINDS:
             raise InputError(f"'{kind}' is no kind of capture; use {', '.join(CAPTURE_KINDS)}")
         refusal = self.refusal()
         if refusal:
             raise RefusedError(refusal)
+        self._refuse_missing(override)
+        session = self._sessions.current()
+        if session is None:  # it was taken away meanwhile
+            raise RefusedError("There is no session yet; create one first.")
+        return session
+
+    def _refuse_missing(self, override: bool) -> None:
         missing = self._roster.missing()
         if missing and not override:
             raise RefusedError(
@@ -117,15 +172,14 @@ class Rounds:
                 if len(missing) == 1
                 else f"Cameras {', '.join(missing)} are not connected; start their nodes, or capture without them."
             )
-        session = self._sessions.current()
-        assert session is not None
+
+    def _new(self, session: str, kind: str, override: bool, sequence: str | None) -> Round:
+        """A new round that is under way. Raises RefusedError where another is, or a sequence has reserved them."""
         with self._lock:
-            if self._running() is not None:
-                raise RefusedError("A capture is under way; wait until it has closed.")
-            new = Round(f"r{1 + len(self._rounds)}", session, kind, override)
+            self._refuse_second(sequence is not None)
+            new = Round(f"r{1 + len(self._rounds)}", session, kind, override, sequence=sequence)
             self._rounds[new.id] = new
         self._on_change(new)
-        Thread(target=self._capture, args=(new,), name=f"capture-{new.id}", daemon=True).start()
         return new
 
     def note_open(self, session: str, capture_id: str) -> None:
@@ -220,3 +274,9 @@ class Rounds:
     def _running(self) -> Round | None:
         newest = self._newest()
         return None if newest is None or newest.ended else newest
+
+    def _refuse_second(self, of_sequence: bool) -> None:
+        if self._running() is not None:
+            raise RefusedError(_UNDER_WAY)
+        if self._reserved and not of_sequence:
+            raise RefusedError(_RESERVED)

@@ -13,7 +13,7 @@ from fastapi.testclient import TestClient
 from ringdic_controller.archive import catalogue
 from ringdic_controller.jobs import children, jobs
 from ringdic_controller.jobs.children import WarmChild
-from ringdic_controller.service import events, live_state, rounds, sessions
+from ringdic_controller.service import events, live_state, rounds, sequences, sessions
 from ringdic_controller.service.app import create_app
 from ringdic_controller.service.desk import Desk
 
@@ -74,7 +74,7 @@ def record(monkeypatch: pytest.MonkeyPatch) -> LockRecord:
     def watched(make: Callable[[], Any], name: str) -> Callable[[], WatchedLock]:
         return lambda: WatchedLock(make(), name, record)
 
-    for module in (children, events, live_state, rounds, sessions):
+    for module in (children, events, live_state, rounds, sequences, sessions):
         monkeypatch.setattr(module, "Lock", watched(threading.Lock, module.__name__.rsplit(".", 1)[1]))
     monkeypatch.setattr(catalogue, "RLock", watched(threading.RLock, "catalogue"))
     monkeypatch.setattr(jobs, "Condition", lambda: threading.Condition(WatchedLock(threading.Lock(), "jobs", record)))
@@ -118,14 +118,16 @@ def test_a_session_takes_locks_in_one_order_only(
         for kind in ("board", "target", "specimen", "specimen", "specimen"):
             begun = client.post(f"{API}/captures", json={"kind": kind}).json()["id"]
             until(lambda: desk.rounds.get(begun).ended)  # noqa: B023
+        client.post(f"{API}/captures", json={"kind": "target", "count": 2})
+        until(lambda: desk.sequences.get("s1").state == "ended")
         until(lambda: desk.catalogue.runs("limb"))
         client.post(f"{API}/jobs/{client.post(f'{API}/jobs', json={'session': 'limb'}).json()['id']}/cancel")
         client.put(f"{API}/sessions/current", json={"name": "limb"})
         until(lambda: all(job.finished for job in desk.jobs.list()))
     desk.close()
-    parts = {"catalogue", "children", "events", "jobs", "live_state", "rounds", "sessions"}
+    parts = {"catalogue", "children", "events", "jobs", "live_state", "rounds", "sequences", "sessions"}
     assert record.taken == parts, "every part's lock was taken"
-    below = {(OUTER, part) for part in ("catalogue", "events", "rounds", "sessions")}
+    below = {(OUTER, part) for part in ("catalogue", "events", "rounds", "sequences", "sessions")}
     assert record.pairs >= below, "a state is read and published with the outer lock held"
     assert {outer for outer, _ in record.pairs} == {OUTER}, "with any other lock held, none is taken"
     assert OUTER not in {inner for _, inner in record.pairs}, "the outer lock is taken by threads that hold none"

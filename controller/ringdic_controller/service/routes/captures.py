@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response, status
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, Field
+from ringdic.errors import InputError
 from ringdic.session.load import LoadChannel, LoadConflictError, read_load
 from ringdic.session.names import CaptureKind
 from ringdic.session.records import LONGEST_NOTE
@@ -18,6 +19,7 @@ from ringdic_controller.service.refusals import NotFoundError, RefusedError
 from ringdic_controller.service.rounds import Round
 from ringdic_controller.service.routes.desk import TheDesk
 from ringdic_controller.service.routes.etag import cache_headers, client_has
+from ringdic_controller.service.sequences import LONGEST_PAUSE, MOST_ROUNDS, CaptureSequence
 from ringdic_controller.service.sessions import no_capture
 from ringdic_controller.service.turns import Turns
 
@@ -28,10 +30,15 @@ _PREVIEWS = Turns("previews are asked for", at_once=2, waiting=14)  # each holds
 
 
 class NewCapture(BaseModel):
-    """Kind of a capture to begin; with ``override`` cameras that are missing or not armed are left out as failed."""
+    """Kind of a capture to begin; with ``override`` cameras that are missing or not armed are left out as failed.
+
+    With ``count`` it is a sequence of so many, one every ``every_s`` seconds; 0 is a burst, as fast as rounds go.
+    """
 
     kind: CaptureKind
     override: bool = False
+    count: Annotated[int | None, Field(ge=1, le=MOST_ROUNDS)] = None
+    every_s: Annotated[float | None, Field(ge=0, le=LONGEST_PAUSE, allow_inf_nan=False)] = None
 
 
 class CaptureChange(BaseModel):
@@ -54,13 +61,32 @@ class SentLoad(BaseModel):
 
 @router.post(
     "/captures",
-    response_model=Round,
+    response_model=Round | CaptureSequence,
     status_code=status.HTTP_202_ACCEPTED,
-    summary="Begin a capture in the current session",
+    summary="Begin a capture, or a sequence of captures, in the current session",
 )
-def begin_capture(new: NewCapture, desk: TheDesk) -> dict[str, Any]:
-    """Begin a capture round and return it; ``/rounds/{id}`` and the live events show its progress. 409 if refused."""
-    return asdict(desk.rounds.begin(new.kind, override=new.override))
+def begin_capture(new: NewCapture, desk: TheDesk) -> Round | CaptureSequence:
+    """Begin a capture round, or with ``count`` a sequence of them, and return it.
+
+    ``/rounds/{id}``, ``/sequences/{id}`` and the live events show its progress. 409 if refused.
+    """
+    if new.count is not None:
+        return desk.sequences.begin(new.kind, new.count, new.every_s or 0.0, override=new.override)
+    if new.every_s is not None:
+        raise InputError("'every_s' is of a sequence; give its number of rounds as 'count'")
+    return desk.rounds.begin(new.kind, override=new.override)
+
+
+@router.get("/sequences/{sequence_id}", response_model=CaptureSequence, summary="State of a sequence of captures")
+def read_sequence(sequence_id: str, desk: TheDesk) -> dict[str, Any]:
+    """One sequence: its state, the captures that have closed, and the rounds that were missed, with reasons."""
+    return asdict(desk.sequences.get(sequence_id))
+
+
+@router.post("/sequences/{sequence_id}/cancel", response_model=CaptureSequence, summary="Cancel a sequence")
+def cancel_sequence(sequence_id: str, desk: TheDesk) -> dict[str, Any]:
+    """Begin no further round of a sequence, and return it; a round that is under way goes to its end."""
+    return asdict(desk.sequences.cancel(sequence_id))
 
 
 @router.get("/rounds/{round_id}", response_model=Round, summary="State of a capture round")
