@@ -57,7 +57,9 @@ def _calibrated(session: Session, settings: CalibrationGroup, progress: Callable
     """The calibrated rig, cached in memory as long as its images and settings stay the same."""
     captures = [capture for capture in session.captures if capture.kind in ("board", "target")]
     rig = (session.path / "rig.toml").read_text(encoding="utf-8")
-    key = digest("live calibration", str(session.path), rig, settings, [each.record for each in captures])
+    key = digest(
+        "live calibration", str(session.path), rig, settings, [(each.id, each.record.cameras) for each in captures]
+    )
     return process_memory.get(key, lambda: calibrate_rig(session, settings, progress), lambda _: _RIG_BYTES)
 
 

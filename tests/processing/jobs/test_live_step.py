@@ -1,15 +1,19 @@
 """One step at once: the same positions as the whole run's, which then has that much less to do."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from ringdic.errors import InputError
+from ringdic.jobs import live_step
 from ringdic.jobs.live_step import process_step
 from ringdic.jobs.pipeline import process_session
 from ringdic.progress import Progress
 from ringdic.results.reader import read_field, read_results
 from ringdic.session.folder import live_results
+from ringdic.session.load import LoadChannel
+from ringdic.session.writer import Archive
 from ringdic.settings import load_settings
 from ringdic.tasks import LocalExecutor, OnTaskEnd, Task, TaskReport
 
@@ -31,14 +35,21 @@ class Counted:
         LocalExecutor(1).run(tasks, tell)
 
 
-def test_the_reference_and_each_step_are_made_once_and_the_whole_run_uses_them(session: Path) -> None:
+def test_the_reference_and_each_step_are_made_once_and_the_whole_run_uses_them(
+    session: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     counted = Counted()
     reference, middle, last = (f"000{k}-specimen" for k in (6, 7, 8))
     shape = read_results(process_step(session, reference, SETTINGS, executor=counted) / "results.h5")
     maps, charts = ([f"{what} {id_}" for id_ in ("cam_01", "cam_02")] for what in ("depth of camera", "chart of"))
     assert counted.made == [*maps, *charts, "poses of the cameras", "surface"]
     assert shape.steps == (reference,)
-    live = process_step(session, last, SETTINGS, executor=counted)
+    archived = Archive(session.parent).open(session.name)
+    archived.capture("0001-board").annotate("a note changes nothing that is computed")
+    archived.capture(last).store_load(LoadChannel("force", "N", 12.5))
+    with monkeypatch.context() as without:
+        without.delattr(live_step, "calibrate_rig")
+        live = process_step(session, last, SETTINGS, executor=counted)
     assert counted.made[6:] == [f"camera {id_}, {last}" for id_ in ("cam_01", "cam_02")]
     found = read_results(live / "results.h5")
     assert found.steps == (reference, last)
@@ -47,6 +58,8 @@ def test_the_reference_and_each_step_are_made_once_and_the_whole_run_uses_them(s
 
     run = read_results(process_session(session, SETTINGS, executor=counted) / "results.h5")
     assert counted.made[8:] == [f"camera {id_}, {middle}" for id_ in ("cam_01", "cam_02")]
+    known = [{"name": "force", "unit": "N", "values": [None, None, 12.5]}]
+    assert json.loads((session / "results" / "0001" / "summary.json").read_text())["load"] == known
     by_place = {tuple(place): k for k, place in enumerate(run.vertices_ref)}
     same = [(k, by_place[tuple(place)]) for k, place in enumerate(found.vertices_ref) if tuple(place) in by_place]
     assert len(same) > 0.98 * len(run.vertices_ref)
