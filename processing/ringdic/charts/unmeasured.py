@@ -1,7 +1,8 @@
 """Textured places of the reference images that the surface does not cover, and why.
 
 The lattice of each camera's depth map is compared with the measured triangles as the camera sees them. A place without
-a depth is taken to lie on the plane of the nearest place that has one: its area is an estimate.
+a depth is taken to lie on the plane of the nearest place that has one: its area is an estimate. Its normal turns on as
+those of the places with a depth do there, as on a rod, whose sides soon are seen squarely by one camera only.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ from ringdic.results.unmeasured import UncountedPlace, UnmeasuredPlaces
 
 _COVERED = 0.5  # share of a place's cell under measured triangles
 _FARTHEST = 3.0  # steps of the lattice over which the plane of a known place is extended
+_AROUND, _NEAR = 9, 4.5  # places with a depth that tell how the normals turn, and steps of the lattice to the farthest
+_STIFF = 0.5  # square of the steps of the lattice, by which a turn that few places tell is held small
 _BEHIND = 3.0  # steps of the lattice, in mm on the surface, by which something hidden lies behind the surface
 _BENT = 0.15  # by which the cosine of incidence of a surface may fall beyond its last known depth, at the limit 10°
 _STEEPEST = 0.2  # least cosine of incidence by which an area is divided
@@ -153,6 +156,28 @@ class _Lattice:
         extended = np.clip(extended, 0.8 * inverse, 1.25 * inverse)
         return Patches(px, extended, slope, flat), own >= 0
 
+    def normals(self, index: Indices, patches: Patches) -> Points:
+        """Unit normals (n, 3) of the surface about cells: they turn on from the nearest places that have a depth.
+
+        index : (n, 2) columns and rows. patches : of these cells, as from :meth:`patches`.
+        """
+        places, flat = self.map.patches, patches.normals(self.camera)
+        turning = np.flatnonzero(self.known[tuple(index.T)] < 0)
+        if len(places.px) < _AROUND or not len(turning):
+            return flat
+        tree, spacing = cKDTree(places.px), self.map.spacing
+        distance, near = tree.query(places.px[tree.query(patches.px[turning])[1]], _AROUND)
+        first, weight = near[:, 0], distance < _NEAR * spacing
+        known = places.normals(self.camera)
+        steps = weight[..., None] * (places.px[near] - places.px[first, None]) / spacing
+        square = np.einsum("nki,nkj->nij", steps, steps) + _STIFF * np.eye(2)
+        turn = np.linalg.solve(square, np.einsum("nki,nkj->nij", steps, known[near] - known[first, None]))
+        offset = (patches.px[turning] - places.px[first]) / spacing
+        offset *= np.minimum(1.0, _FARTHEST / np.maximum(np.linalg.norm(offset, axis=1, keepdims=True), 1e-9))
+        out = known[first] + np.einsum("ni,nij->nj", offset, turn)
+        flat[turning] = out / np.linalg.norm(out, axis=1, keepdims=True)
+        return flat
+
     def shows(self, xyz: Points, margin_mm: Floats) -> tuple[Mask, Mask]:
         """At which points (n, 3) mm this camera has an unmeasured place, and at which one that is counted.
 
@@ -207,7 +232,7 @@ def _of_camera(k: int, lattices: Sequence[_Lattice], lost: Sequence[Indices], li
     spacing = own.map.spacing
     index = np.argwhere(own.bare)
     patches, known = own.patches(index)
-    normals = patches.normals(own.camera)
+    normals = own.normals(index, patches)
     points = patches.points(own.camera, STENCIL[:5])
     xyz = points[:, 0]
     one_px = np.linalg.norm(np.cross(points[:, 1] - points[:, 2], points[:, 3] - points[:, 4]), axis=1) / 4.0

@@ -19,6 +19,7 @@ ACROSS, UP = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 NORMAL = np.cross(ACROSS, UP)
 SIDE = 60.0  # mm, half the plate's side
 SPACING = 9
+ROD = 40.0  # mm, its radius
 
 
 def calibrated(camera) -> Camera:
@@ -57,6 +58,39 @@ def depth_map(camera: Camera, hidden=lambda a, b: np.zeros(a.shape, bool)) -> De
 
 
 NOTHING_LOST = np.zeros((0, 4), np.int64)
+
+
+def rolled(xyz: np.ndarray) -> np.ndarray:
+    """The plate rolled about a rod."""
+    a, b = on_plate(xyz)
+    turn = (a / ROD)[:, None]
+    return MIDDLE + ROD * ((np.cos(turn) - 1.0) * NORMAL + np.sin(turn) * ACROSS) + b[:, None] * UP
+
+
+def map_of_rod(camera: Camera, bare) -> DepthMap:
+    """The exact map of the rolled plate, without depths where it is bare."""
+    axis = MIDDLE - ROD * NORMAL
+
+    def hit(at):
+        rays, start = camera.ray(at), camera.centre - axis
+        across = rays * [1.0, 1.0, 0.0]
+        middle, square = -np.sum(across * start, axis=1), np.sum(across**2, axis=1)
+        root = middle**2 - square * (start[0] ** 2 + start[1] ** 2 - ROD**2)
+        with np.errstate(invalid="ignore"):
+            return camera.centre + rays * ((middle - np.sqrt(root)) / square)[:, None]
+
+    grid = [np.arange(SPACING, side - SPACING, SPACING) for side in camera.size]
+    px = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, 2).astype(float)
+    shifts = ([0, 0], [1, 0], [-1, 0], [0, 1], [0, -1])
+    whole = np.all([np.isfinite(hit(px + shift)).all(axis=1) for shift in shifts], axis=0)
+    px = px[whole & (abs(hit(px)[:, 2] - MIDDLE[2]) < SIDE)]
+    off = hit(px) - axis
+    known = px[~bare(ROD * np.arctan2(off @ ACROSS, off @ NORMAL), off @ UP)]
+    inverse = [1.0 / depths(camera, hit(known + shift)) for shift in shifts]
+    slope = np.stack([inverse[1] - inverse[2], inverse[3] - inverse[4]], axis=1) / 2.0
+    n = len(known)
+    patches = Patches(known, inverse[0], slope, np.zeros((n, 3)))
+    return DepthMap(SPACING, patches, np.full(n, 1e-6), px, np.ones(len(px), bool), 1.0)
 
 
 def surface(hole, lost_at=NOTHING_LOST) -> ReferenceSurface:
@@ -144,6 +178,23 @@ def test_what_one_camera_alone_shows_is_not_counted_but_listed() -> None:
 def test_what_only_one_camera_sees_squarely_enough_is_oblique() -> None:
     found = areas(unmeasured([depth_map(camera) for camera in CAMERAS], surface(window), incidence=25.0))
     assert list(found["by_reason"]) == ["oblique"]
+
+
+def test_the_sides_of_a_rod_are_oblique_but_a_hole_in_its_front_counts() -> None:
+    """Beyond 14° of its front nothing is known, and from 35° on one of the cameras sees it at over 65°."""
+    squarely = 0.01 * 2 * 2 * SIDE * ROD * np.radians(35.0 - 14.0)
+    counted = []
+    for half in (0.0, 10.0):
+
+        def bare(a, b, half=half):
+            return (abs(a) > ROD * np.radians(14.0)) | ((abs(a) < half) & (abs(b) < 30.0))
+
+        plate = surface(bare)
+        measured = replace(plate, xyz=rolled(plate.xyz))
+        found = areas(unmeasured([map_of_rod(camera, bare) for camera in CAMERAS], measured))
+        counted.append(found["total_cm2"] - found["by_reason"].get("oblique", 0.0))
+    assert 0.0 < counted[0] < squarely
+    assert counted[1] - counted[0] > 0.9 * 12.0
 
 
 def test_a_surface_behind_a_hole_does_not_cover_it() -> None:
