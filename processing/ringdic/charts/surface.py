@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, dataclass, fields
@@ -21,6 +22,7 @@ from ringdic.geometry.camera import Camera
 from ringdic.geometry.outliers import LostPoint, grid_neighbours, surface_outliers
 from ringdic.merging import SurfacePart, merge, side_by_side
 from ringdic.mesh.mesh import Mesh, used_vertices
+from ringdic.results.unmeasured import BY_CODE
 
 _BEND = 0.2  # spacings by which a point lies off the middle of its neighbours on a surface bent as sharply as a finger
 _LONGEST = 4.0  # median edges, of a triangle beyond which it joins two surfaces
@@ -81,13 +83,13 @@ def reference_surface(
     sigma_max : px, greatest standard deviation of an accepted match.
     heuristic : of the merging, or none to leave the charts one over the other.
 
-    Raises ComputationError where no chart gave a triangle.
+    Raises ComputationError where no chart gave a triangle: why most points were lost.
     """
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         measured = list(pool.map(lambda chart: _measure(cameras, chart, step, sigma_max), charts))
     parts = [SurfacePart(one.xyz, one.faces, one.c_ls) for one in measured]
     if not any(len(part.faces) for part in parts):
-        raise ComputationError("no two cameras share a textured surface")
+        raise ComputationError(f"no two cameras share a textured surface: {_losses(measured)}")
     merged = merge(parts, heuristic) if heuristic != "none" else side_by_side(parts)
     number = np.full(sum(len(one.xyz) for one in measured) + 1, -1, np.int64)
     number[merged.vertex] = np.arange(len(merged.vertex))
@@ -212,6 +214,16 @@ def _status(chart: Chart, px: Pixels, xyz: Points) -> NDArray[np.int8]:
     views = np.isfinite(px[1:, :, 0]).any(axis=0)
     reason = np.where(matched, np.where(views, LostPoint.RESIDUAL, LostPoint.UNCERTAIN), why)
     return np.where(lost, reason, 0).astype(np.int8)
+
+
+def _losses(charts: Sequence[_MeasuredChart]) -> str:
+    """Why most points of charts without any triangle were lost, and what helps."""
+    codes = [code for one in charts for code in one.lost[:, 3].tolist()]
+    if not codes:
+        return "no camera has places with a depth that another one sees"
+    status, most = Counter(codes).most_common(1)[0]
+    reason = BY_CODE[status]
+    return f"{len(codes)} points were lost, {most} of them because: {reason.sentence}; {reason.remedy}"
 
 
 def _without_steps(xyz: Points, faces: NDArray[np.int32]) -> Indices:

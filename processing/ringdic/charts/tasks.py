@@ -354,7 +354,7 @@ def surface_task(
             raise ComputationError("no point of the surface was measured by two cameras")
     except ComputationError as error:
         coarse = coarse_speckle([float(one["speckle"]) for one in depths], radius)
-        raise ComputationError(f"{error}: {'; '.join(filter(None, [*coarse, *why]))}") from error
+        raise ComputationError("; ".join(filter(None, [str(error), *coarse, *why]))) from error
     places = unmeasured_places(cameras, maps, surface, settings.incidence_deg, views.space.centre)
     return {**surface.arrays(), **arrays_of_places(places), "unmatched": np.array(why)}
 

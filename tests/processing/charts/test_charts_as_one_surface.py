@@ -141,5 +141,8 @@ def test_a_view_that_contradicts_the_others_is_dropped_and_two_that_do_are_no_po
 def test_charts_without_a_match_are_refused() -> None:
     lost = chart(0, 1, 500, 850, 0.0)
     lost.px[1], lost.status[1] = np.nan, 3
-    with pytest.raises(ComputationError, match="no two cameras share a textured surface"):
+    likeness = rf"share a textured surface: {len(lost.xy)} points were lost, .* the images do not look alike; focus"
+    with pytest.raises(ComputationError, match=likeness):
         reference_surface(CAMERAS, [lost], STEP, 0.05)
+    with pytest.raises(ComputationError, match="share a textured surface: no camera has places with a depth"):
+        reference_surface(CAMERAS, [], STEP, 0.05)
