@@ -172,6 +172,7 @@ def test_the_cameras_unrest_is_reported(ways: dict[str, Results]) -> None:
     drift = ways["paper's way"].summary["drift_px"]["201"]
     np.testing.assert_allclose(drift, [-0.13, -0.24, -0.35], atol=0.05)  # measured minus projected
     for way, results in ways.items():
+        assert results.summary["verdict"] != "do not use", way
         moved = [each for each in results.summary["findings"] if each["code"] in ("camera-moved", "camera-drift")]
         assert any(results.steps[2] in each["sentence"] for each in moved), way
 

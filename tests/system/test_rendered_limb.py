@@ -116,6 +116,7 @@ def material(results: Results, truth: Truth) -> tuple[np.ndarray, np.ndarray, np
 
 def test_all_cameras_and_pairs_take_part(results: Results, shared_data: Path, way: Way, figures) -> None:
     centres = np.load(shared_data / "rendered_ring" / "limb" / "target_truth.npz")["projected_px"]
+    assert results.summary["verdict"] != "do not use"
     assert len(results.cameras) == 12
     ids = [camera.id for camera in results.cameras]
     neighbours = {frozenset(pair) for pair in zip(ids, ids[1:] + ids[:1], strict=True)}
