@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -238,9 +239,10 @@ class RunImages:
 def coarse_speckle(sizes: Sequence[float], radius: int) -> list[str]:
     """The sentence about speckles that are too large for the subsets, if they are.
 
-    sizes : px, of the speckles in each camera. radius : px, of the subsets.
+    sizes : px, of the speckles in each camera, NaN where it is not known. radius : px, of the subsets.
     """
-    size, width = float(np.median(sizes)), 2 * radius + 1
+    known = [size for size in sizes if math.isfinite(size)]
+    size, width = float(np.median(known)) if known else 0.0, 2 * radius + 1
     if size <= _COARSE * width:
         return []
     return [

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ringdic.charts.image_findings import RunImages
+from ringdic.charts.image_findings import RunImages, coarse_speckle
 from ringdic.charts.image_state import ImageState
 from ringdic.charts.reference_state import REFERENCE_STATE, ReferenceState
 from ringdic.findings import Finding, Verdict
@@ -155,6 +155,12 @@ def test_speckles_that_do_not_suit_the_subset_or_the_pixels_are_named(size: floa
     assert (finding.code, finding.value) == (code, size)
     background = tuple(replace(one, certain=False, sized=False) for one in references)
     assert replace(run_images(), references=background).findings() == []
+
+
+def test_speckles_of_unknown_size_are_not_called_coarse() -> None:
+    assert coarse_speckle([np.nan, np.nan], 20) == []
+    (sentence,) = coarse_speckle([30.0, np.nan, 30.0], 20)
+    assert "30.0 px wide" in sentence
 
 
 def test_the_state_of_a_reference_survives_its_storage() -> None:
