@@ -337,7 +337,7 @@ def test_what_was_not_measured_is_told_by_reason_and_shown_on_the_photographs(pa
         ["the images do not look alike: 0.7 cm²", "the lines of sight miss one another: 0.5 cm²"]
     )
     expect(part.locator("figcaption")).to_have_text(["01"])
-    shown = "document.querySelector('#unmeasured-pictures img').naturalWidth > 0"
+    shown = "document.querySelector('#unmeasured-pictures img')?.naturalWidth > 0"
     station.until(lambda: page.evaluate(shown), "the picture")
 
 
