@@ -21,8 +21,6 @@ from ringdic_controller.rig.frame_grid import off_grid
 
 log = logging.getLogger(__name__)
 
-log = logging.getLogger(__name__)
-
 TRIGGER_ANSWER_TIMEOUT = 5.0
 INVENTORY_TIMEOUT = 5.0
 HEARTBEAT = 0.02
