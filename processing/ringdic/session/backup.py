@@ -14,7 +14,7 @@ from pathlib import Path
 from uuid import uuid4
 
 from ringdic.errors import InputError
-from ringdic.session.files import PARTIAL, checksum, copy_file
+from ringdic.session.files import PARTIAL, copy_file, same_content
 from ringdic.session.verification import session_folders, verify_session
 
 _COMPUTED = ("calibration", "work", "live")
@@ -72,7 +72,7 @@ def _back_up_session(session: Path, copy: Path) -> SessionBackup:
         if path in damaged:
             continue
         try:
-            if target.is_file() and _alike(path, target):
+            if target.is_file() and same_content(path, target):
                 held += 1
             elif target.exists() and path.suffix != ".json" and path.name not in ("rig.toml", "settings.toml"):
                 faults.append(f"{target}: the backup holds another file of this name; it is kept, compare the two")
@@ -95,10 +95,6 @@ def _kept_files(session: Path) -> Iterator[Path]:
         if path.is_file() and not any((session / Path(*parts[: i + 1])).is_symlink() for i in range(len(parts))):
             files.append(path)
     yield from sorted(files, key=lambda path: (path.suffix == ".json", path))
-
-
-def _alike(path: Path, copy: Path) -> bool:
-    return path.stat().st_size == copy.stat().st_size and checksum(path) == checksum(copy)
 
 
 def removable_sessions(archive: Path, backup: Path, older_than_days: float) -> tuple[tuple[Path, str], ...]:
@@ -129,7 +125,7 @@ def _reason_to_stay(session: Path, copy: Path, files: list[Path]) -> str:
         target = copy / path.relative_to(session)
         if not target.is_file():
             return f"the backup lacks {path.relative_to(session)}; run 'ringdic archive backup' first"
-        if not _alike(path, target):
+        if not same_content(path, target):
             return f"the backup's {path.relative_to(session)} is another one; compare the two"
     return ""
 

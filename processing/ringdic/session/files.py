@@ -51,19 +51,25 @@ def checksum(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def same_content(path: Path, other: Path) -> bool:
+    """Whether two files hold the same bytes; both are read where their sizes agree."""
+    filecmp.clear_cache()  # which goes by size and time of the files, and a damaged file may have both
+    return filecmp.cmp(path, other, shallow=False)
+
+
 def copy_file(source: Path, path: Path) -> None:
     """Copy a file with its times, durably, and read the copy back; a file of that name is replaced.
 
     Raises OSError where the copy is not what was read.
     """
-    aside = path.with_name(f"{PARTIAL}{path.name}-{os.getpid()}-{threading.get_ident()}")
+    aside = _aside(path)
     try:
         with open(source, "rb") as original, open(aside, "wb") as copy:
             shutil.copyfileobj(original, copy, _PIECE)
             copy.flush()
             os.fsync(copy.fileno())
         shutil.copystat(source, aside)
-        if not filecmp.cmp(source, aside, shallow=False):
+        if not same_content(source, aside):
             raise OSError(errno.EIO, "what was read back is not what was written; check the disk")
         os.replace(aside, path)
     finally:
@@ -91,9 +97,14 @@ def leads_out(folder: Path, path: Path) -> bool:
     return os.path.commonpath([whole, os.path.realpath(path)]) != whole
 
 
+def _aside(path: Path) -> Path:
+    """The name under which this thread writes a file before it is renamed to its own."""
+    return path.with_name(f"{PARTIAL}{path.name}-{os.getpid()}-{threading.get_ident()}")
+
+
 def _write_aside(path: Path, content: bytes) -> Path:
     """Write a file under a temporary name; nothing is left of one that the disk does not take."""
-    aside = path.with_name(f"{PARTIAL}{path.name}-{os.getpid()}-{threading.get_ident()}")
+    aside = _aside(path)
     try:
         with open(aside, "wb") as file:
             file.write(content)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import socket
 import threading
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, NoReturn
 
 import pytest
 import uvicorn
@@ -19,10 +19,10 @@ Guests = Any  # the fixture's class
 
 
 @pytest.fixture
-def address(guests: Guests) -> Iterator[str]:
+def address(guests: Guests, skip_or_fail: Callable[[str], NoReturn]) -> Iterator[str]:
     """The page of the guests, on a free port of loopback."""
     if not (STATIC / "index.html").is_file():
-        pytest.skip("the page is not built")
+        skip_or_fail("the page is not built")
     app = create_app(guests.desk, access=guests.access)
     server = uvicorn.Server(uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1))
     with socket.create_server(("127.0.0.1", 0)) as listener:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -19,35 +20,14 @@ from ringdic.session.verification import verify_session
 from ringdic.session.writer import Archive
 from typer.testing import CliRunner
 
-RIG = """[rig]
-name = "ring"
-[target]
-kind = "dot-cylinder"
-radius_mm = 30.0
-rows = 8
-row_spacing_mm = 11.0
-first_row_z_mm = 12.0
-columns = 9
-column_spacing_mm = 12.5
-dot_size_mm = 4.0
-[board]
-kind = "checkerboard"
-squares = [7, 10]
-square_mm = 9.0
-[[cameras]]
-id = "201"
-azimuth_deg = 0.0
-[[cameras]]
-id = "202"
-azimuth_deg = 30.0
-"""
+RigText = Callable[[str, Sequence[str]], str]
 MOMENTS = (1000, 2000, 3000)
 
 
 @pytest.fixture
-def session(tmp_path: Path) -> Path:
+def session(tmp_path: Path, rig_toml: RigText) -> Path:
     """Three specimen captures, exposed at `MOMENTS` ± 100 ns; the last has no image, and only its planned moment."""
-    writer = Archive(tmp_path).create_session("pull", RIG)
+    writer = Archive(tmp_path).create_session("pull", rig_toml("ring", ["201", "202"]))
     for moment in MOMENTS:
         capture = writer.begin_capture("specimen", ["201", "202"], fire_at_ns=moment if moment == 3000 else 5)
         for camera, apart in (("201", -100), ("202", 100)) if moment < 3000 else ():

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import shutil
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -16,28 +17,7 @@ from ringdic.session.records import ImageDescription
 from ringdic.session.verification import verify_session
 from ringdic.session.writer import Archive
 
-RIG = """[rig]
-name = "ring"
-[target]
-kind = "dot-cylinder"
-radius_mm = 30.0
-rows = 8
-row_spacing_mm = 11.0
-first_row_z_mm = 12.0
-columns = 9
-column_spacing_mm = 12.5
-dot_size_mm = 4.0
-[board]
-kind = "checkerboard"
-squares = [7, 10]
-square_mm = 9.0
-[[cameras]]
-id = "201"
-azimuth_deg = 0.0
-[[cameras]]
-id = "202"
-azimuth_deg = 30.0
-"""
+RigText = Callable[[str, Sequence[str]], str]
 DAY = 86_400
 
 
@@ -46,11 +26,11 @@ def image(camera: str, number: int) -> bytes:
 
 
 @pytest.fixture
-def archive(tmp_path: Path) -> Path:
+def archive(tmp_path: Path, rig_toml: RigText) -> Path:
     """Two sessions of two captures by two cameras."""
     writer = Archive(tmp_path / "archive")
     for name in ("first", "second"):
-        session = writer.create_session(name, RIG)
+        session = writer.create_session(name, rig_toml("ring", ["201", "202"]))
         for number in (1, 2):
             capture = session.begin_capture("specimen", ["201", "202"], fire_at_ns=number, tolerance_ns=1000)
             for camera in ("201", "202"):
